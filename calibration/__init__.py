@@ -1,0 +1,1 @@
+"""The mathematics of where things are: flange fit, rigid solvers, verification."""

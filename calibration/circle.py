@@ -1,0 +1,154 @@
+"""Robust geometric circle fit in the plane, with an honest covariance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.errors import CircleFitError
+
+Array = NDArray[np.float64]
+
+_TUKEY = 4.685  # 95 % efficient on Gaussian noise
+_MAD = 1.4826  # median absolute deviation -> standard deviation of a Gaussian
+
+
+@dataclass(frozen=True)
+class CircleFit:
+    """A circle and what is known of it: centre (2,) and radius in m, covariance (3, 3) of (cx, cy, r) in m^2."""
+
+    center: Array
+    radius: float
+    covariance: Array
+    rms: float
+    inliers: NDArray[np.bool_]
+
+
+def fit_circle(
+    points: Array,
+    *,
+    sigma: Array | None = None,
+    radius: float | None = None,
+    radius_bounds: tuple[float, float] | None = None,
+    initial: tuple[Array, float] | None = None,
+    noise_floor: float = 1e-6,
+    hypotheses: int = 200,
+    seed: int = 0,
+) -> CircleFit:
+    """Fit a circle to (N, 2) points [m] by minimising the orthogonal distance, resisting up to 40 % outliers.
+
+    ``sigma`` (N,) are relative standard deviations of the points along the radius; the common scale is estimated from the
+    residuals. ``radius`` fixes the radius, ``radius_bounds`` limits the search for a start. ``initial`` is a start
+    (centre, radius) that makes the random search unnecessary. ``noise_floor`` [m] is the least scale believed.
+    Raises CircleFitError when there are fewer than 5 points or they do not fix a circle.
+    Method: least median of squares on seeded triples, then Gauss-Newton on the geometric residual with Tukey weights.
+    """
+    p = np.asarray(points, dtype=float)
+    if p.ndim != 2 or p.shape[1] != 2 or len(p) < 5:
+        raise CircleFitError(f"A circle needs at least 5 points in the plane; {len(p)} were given.")
+    if not np.isfinite(p).all():
+        raise CircleFitError("The points of a circle must be finite numbers; remove NaN before fitting.")
+    s = np.ones(len(p)) if sigma is None else np.asarray(sigma, dtype=float)
+    s = s / np.median(s)
+    origin = np.median(p, axis=0)
+    q = p - origin
+    c, r = (
+        _start(q, s, radius, radius_bounds, hypotheses, seed) if initial is None else (initial[0] - origin, initial[1])
+    )
+    r = radius if radius is not None else r
+    free = 3 if radius is None else 2
+    weight = np.ones(len(q))
+    scale = noise_floor
+    for _ in range(30):
+        d = q - c
+        rho = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
+        e = (rho - r) / s
+        scale = max(_MAD * float(np.median(np.abs(e))), noise_floor)
+        t = e / (_TUKEY * scale)
+        weight = np.where(np.abs(t) < 1.0, (1.0 - t**2) ** 2, 0.0)
+        J = -np.column_stack([d / rho[:, None], np.ones(len(q))])[:, :free] / s[:, None]
+        N = J.T @ (weight[:, None] * J)
+        if np.linalg.cond(N) > 1e9:
+            raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
+        step = np.linalg.solve(N, -J.T @ (weight * e))
+        c = c + step[:2]
+        r = r + (float(step[2]) if free == 3 else 0.0)
+        if float(np.linalg.norm(step)) < 1e-3 * noise_floor + 1e-10:
+            break
+    d = q - c
+    rho = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
+    e = (rho - r) / s
+    inliers = np.abs(e) < _TUKEY * scale
+    used = int(inliers.sum())
+    if used < max(5, free + 2) or not np.isfinite(e).all() or r <= 0:
+        raise CircleFitError("No circle agrees with enough of the points.")
+    return CircleFit(
+        c + origin,
+        float(r),
+        _covariance(d, rho, e, s, scale, free),
+        float(np.sqrt(np.mean((e * s)[inliers] ** 2))),
+        inliers,
+    )
+
+
+def _covariance(d: Array, rho: Array, e: Array, s: Array, scale: float, free: int) -> Array:
+    """Sandwich covariance of an M-estimate (Huber 1981, eq. 7.6.2) with Tukey's psi; (3, 3), zero row for a fixed radius."""
+    t = e / (_TUKEY * scale)
+    inside = np.abs(t) < 1.0
+    psi = np.where(inside, e * (1.0 - t**2) ** 2, 0.0)
+    dpsi = np.where(inside, (1.0 - t**2) * (1.0 - 5.0 * t**2), 0.0)
+    J = np.column_stack([d / rho[:, None], np.ones(len(d))])[:, :free] / s[:, None]
+    n = len(d)
+    mean_dpsi = max(float(dpsi.mean()), 0.2)
+    variance = float(psi @ psi) / max(n - free, 1) / mean_dpsi**2
+    full = np.zeros((3, 3))
+    full[:free, :free] = variance * np.linalg.inv(J.T @ J)
+    return full
+
+
+def _start(
+    q: Array, s: Array, radius: float | None, bounds: tuple[float, float] | None, hypotheses: int, seed: int
+) -> tuple[Array, float]:
+    """Best of seeded triples by the least 60th percentile of the residual."""
+    rng = np.random.default_rng(seed)
+    index = rng.integers(0, len(q), size=(hypotheses, 3))
+    a, b, c = q[index[:, 0]], q[index[:, 1]], q[index[:, 2]]
+    ab, ac = b - a, c - a
+    det = 2.0 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    extent = float(np.ptp(q, axis=0).max())
+    ok = np.abs(det) > 1e-3 * extent**2
+    ab, ac, a, det = ab[ok], ac[ok], a[ok], det[ok]
+    n1, n2 = (ab**2).sum(axis=1), (ac**2).sum(axis=1)
+    u = np.column_stack([ac[:, 1] * n1 - ab[:, 1] * n2, ab[:, 0] * n2 - ac[:, 0] * n1]) / det[:, None]
+    centers, radii = a + u, np.linalg.norm(u, axis=1)
+    if radius is not None:
+        bounds = (0.8 * radius, 1.25 * radius)
+    if bounds is not None:
+        keep = (radii > bounds[0]) & (radii < bounds[1])
+        centers, radii = centers[keep], radii[keep]
+    if len(radii) == 0:
+        raise CircleFitError("The points do not fix a circle of the expected radius.")
+    sample = q if len(q) <= 600 else q[np.linspace(0, len(q) - 1, 600).astype(int)]
+    sigma = s if len(q) <= 600 else s[np.linspace(0, len(q) - 1, 600).astype(int)]
+    error = np.abs(np.linalg.norm(sample[None] - centers[:, None], axis=2) - radii[:, None]) / sigma
+    k = int(0.6 * error.shape[1])
+    best = int(np.argmin(np.partition(error, k, axis=1)[:, k]))
+    return centers[best], float(radii[best])
+
+
+def fuse(centers: list[Array], covariances: list[Array]) -> tuple[Array, Array]:
+    """Covariance-weighted mean of concentric centres (k of (m,), (m, m)); inflated where they disagree beyond chance.
+
+    Returns the fused centre (m,) and its covariance (m, m). The inflation is the Birge ratio (reduced chi-square, never
+    below one): two rims that are not concentric say how much a centre may be trusted.
+    """
+    information = [np.linalg.inv(c) for c in covariances]
+    total = np.linalg.inv(sum(information[1:], information[0]))
+    mean = total @ sum((i @ c for i, c in zip(information[1:], centers[1:], strict=True)), information[0] @ centers[0])
+    dof = (len(centers) - 1) * len(mean)
+    if dof == 0:
+        return mean, total
+    chi2 = sum(float((c - mean) @ i @ (c - mean)) for c, i in zip(centers, information, strict=True))
+    return mean, total * max(1.0, chi2 / dof)

@@ -1,0 +1,236 @@
+"""A calibration dataset folder: poses, clouds and pairs, read with every number checked and every refusal named."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.clouds import SUFFIXES, CloudError, find_cloud, read_cloud
+from weldcal.calibration.dataset_header import DatasetHeader
+from weldcal.calibration.errors import DatasetError
+
+Array = NDArray[np.float64]
+
+UNITS = {"m": 1.0, "mm": 1e-3}
+CONFIGURATIONS = ("eye_on_base",)
+_REACH_M = (0.001, 10.0)  # distances from the base that a robot flange can have
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A centre already found: camera point (3,) m and the robot's pose of the feature (rotation identity where not given)."""
+
+    id: str
+    X_BR: RigidTransform
+    p_CR: Array
+    has_orientation: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A dataset, checked. ``poses`` maps id to X_BF; ``clouds`` maps id to file; ``refused`` lists (id, reason)."""
+
+    folder: Path
+    header: DatasetHeader
+    poses: dict[str, RigidTransform]
+    clouds: dict[str, Path]
+    pairs: tuple[Pair, ...]
+    refused: tuple[tuple[str, str], ...]
+    hashes: dict[str, str]
+
+    @property
+    def X_FR(self) -> RigidTransform:
+        """Pose of the calibration feature in the flange frame."""
+        f = self.header.feature_in_flange
+        return RigidTransform(_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
+
+    def cloud(self, id: str) -> tuple[Array, tuple[str, ...]]:
+        """Points of one cloud in metres, (N, 3) or organised (H, W, 3), with remarks. Raises CloudError with the reason."""
+        points, remarks = read_cloud(self.clouds[id])
+        return points * UNITS[self.header.units.clouds], remarks
+
+
+def load_dataset(folder: Path) -> Dataset:
+    """Read and check a dataset folder (dataset.yaml, and poses.csv with clouds/, or pairs.csv).
+
+    Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown unit
+    or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses whose size shows
+    the wrong unit. A cloud without a pose is an error; a pose without a cloud is refused by name; clouds themselves are read later.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise DatasetError(
+            f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."
+        )
+    header = _header(folder / "dataset.yaml")
+    hashes = {"dataset.yaml": _sha256(folder / "dataset.yaml")}
+    scale = UNITS[header.units.poses]
+    if (folder / "poses.csv").is_file():
+        hashes["poses.csv"] = _sha256(folder / "poses.csv")
+        poses = _poses(folder / "poses.csv", scale)
+        clouds, refused = _match(folder / "clouds", poses)
+        if not clouds:
+            raise DatasetError(
+                f"No pose in '{folder.name}/poses.csv' has a cloud in clouds/; name the files after the ids, for example {next(iter(poses), 'pose01')}.pcd."
+            )
+        hashes.update({f"clouds/{path.name}": _sha256(path) for path in clouds.values()})
+        return Dataset(folder, header, poses, clouds, (), refused, hashes)
+    if (folder / "pairs.csv").is_file():
+        hashes["pairs.csv"] = _sha256(folder / "pairs.csv")
+        return Dataset(
+            folder, header, {}, {}, _pairs(folder / "pairs.csv", scale, UNITS[header.units.clouds]), (), hashes
+        )
+    raise DatasetError(
+        f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz."
+    )
+
+
+def _header(path: Path) -> DatasetHeader:
+    if not path.is_file():
+        raise DatasetError(
+            f"'{path.parent.name}' has no dataset.yaml; add one with schema, robot, flange, scanner, configuration and units."
+        )
+    try:
+        header: DatasetHeader = yaml_load_typed(schema=DatasetHeader, filename=str(path), defaults=DatasetHeader())
+    except Exception as e:
+        # pydrake raises whatever its YAML reader meets; the first line names the key
+        raise DatasetError(f"'{path.name}' cannot be read as a dataset description: {str(e).splitlines()[0]}") from e
+    if header.schema != 1:
+        raise DatasetError(f"'{path.name}' says schema {header.schema}; this software reads schema 1.")
+    for name, unit in (("clouds", header.units.clouds), ("poses", header.units.poses)):
+        if unit not in UNITS:
+            raise DatasetError(f"'{path.name}' gives the unit '{unit}' for {name}; write m or mm.")
+    if header.configuration not in CONFIGURATIONS:
+        raise DatasetError(
+            f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles {', '.join(CONFIGURATIONS)}."
+        )
+    return header
+
+
+def _rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream, skipinitialspace=True)
+            names = [n.strip() for n in reader.fieldnames or []]
+            rows = [
+                {(k or "").strip(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
+                for row in reader
+            ]
+    except (UnicodeDecodeError, csv.Error) as e:
+        raise DatasetError(f"'{path.name}' is not a CSV text file.") from e
+    missing = [c for c in required if c not in names]
+    if missing:
+        raise DatasetError(
+            f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}; the header is {','.join(required)}."
+        )
+    if not rows:
+        raise DatasetError(f"'{path.name}' holds no poses below its header.")
+    seen: set[str] = set()
+    for row in rows:
+        if not row["id"] or Path(row["id"]).name != row["id"]:
+            raise DatasetError(f"'{path.name}' has a row whose id '{row['id']}' is empty or no plain name.")
+        if row["id"] in seen:
+            raise DatasetError(f"'{path.name}' gives the id '{row['id']}' twice; keep one row for each scan.")
+        seen.add(row["id"])
+    return rows
+
+
+def _numbers(row: dict[str, str], columns: tuple[str, ...], path: Path) -> list[float]:
+    out = []
+    for c in columns:
+        try:
+            value = float(row[c])
+        except ValueError:
+            raise DatasetError(
+                f"'{path.name}' has '{row[c]}' in column {c} of '{row['id']}'; a number is needed."
+            ) from None
+        if not np.isfinite(value):
+            raise DatasetError(
+                f"'{path.name}' has {row[c]} in column {c} of '{row['id']}'; remove the row or give a finite number."
+            )
+        out.append(value)
+    return out
+
+
+def _quaternion(wxyz: list[float], where: str) -> RotationMatrix:
+    norm = float(np.linalg.norm(wxyz))
+    if not abs(norm - 1.0) < 1e-3:
+        raise DatasetError(
+            f"The quaternion of '{where}' has the length {norm:.4f}; a rotation needs length 1 (order qw, qx, qy, qz)."
+        )
+    return RotationMatrix(Quaternion(np.asarray(wxyz) / norm))
+
+
+def _check_reach(points: Array, path: Path, unit: str) -> None:
+    reach = float(np.median(np.linalg.norm(points, axis=1)))
+    if reach > _REACH_M[1] or reach < _REACH_M[0]:
+        other = "mm" if unit == "m" else "m"
+        raise DatasetError(
+            f"The positions in '{path.name}' lie {reach:.4g} m from the robot's base, which no arm reaches: they look like {other}; correct units in dataset.yaml."
+        )
+
+
+def _poses(path: Path, scale: float) -> dict[str, RigidTransform]:
+    columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
+    poses = {}
+    for row in _rows(path, ("id", *columns)):
+        v = _numbers(row, columns, path)
+        poses[row["id"]] = RigidTransform(_quaternion(v[3:], row["id"]), scale * np.array(v[:3]))
+    _check_reach(np.array([X.translation() for X in poses.values()]), path, "m" if scale == 1.0 else "mm")
+    return poses
+
+
+def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ...]:
+    base, camera, turn = (
+        tuple(f"base_{c}" for c in "xyz"),
+        tuple(f"camera_{c}" for c in "xyz"),
+        tuple(f"base_q{c}" for c in "wxyz"),
+    )
+    pairs = []
+    for row in _rows(path, ("id", *base, *camera)):
+        v = _numbers(row, base + camera, path)
+        has = all(row.get(c) for c in turn)
+        R = _quaternion(_numbers(row, turn, path), row["id"]) if has else RotationMatrix()
+        pairs.append(
+            Pair(row["id"], RigidTransform(R, scale_base * np.array(v[:3])), scale_camera * np.array(v[3:]), has)
+        )
+    _check_reach(np.array([p.X_BR.translation() for p in pairs]), path, "m" if scale_base == 1.0 else "mm")
+    spread_B = np.array([p.X_BR.translation() for p in pairs])
+    spread_C = np.array([p.p_CR for p in pairs])
+    a, b = (float(np.median(np.linalg.norm(s - np.median(s, axis=0), axis=1))) for s in (spread_B, spread_C))
+    if min(a, b) > 0.0 and not 0.02 < a / b < 50.0:
+        raise DatasetError(
+            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in millimetres; correct units in dataset.yaml."
+        )
+    return tuple(pairs)
+
+
+def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Path], tuple[tuple[str, str], ...]]:
+    if not folder.is_dir():
+        raise DatasetError(f"'{folder.parent.name}' has poses but no folder clouds/; add one cloud for each pose.")
+    clouds: dict[str, Path] = {}
+    refused: list[tuple[str, str]] = []
+    for id in poses:
+        try:
+            clouds[id] = find_cloud(folder, id)
+        except CloudError as e:
+            refused.append((id, e.reason))
+    orphans = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES and p.stem not in poses]
+    if orphans:
+        names = ", ".join(p.name for p in orphans[:5])
+        raise DatasetError(
+            f"'poses.csv' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or take the cloud away."
+        )
+    return clouds, tuple(refused)
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,35 @@
+"""dataset.yaml as typed data: what the files of a calibration dataset hold, and in which units."""
+
+# no `from __future__ import annotations` here: pydrake's YAML reader needs the field types themselves, not their names
+
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Units:
+    """Length units of the files: ``m`` or ``mm``."""
+
+    clouds: str = "m"
+    poses: str = "m"
+
+
+@dataclass
+class Feature:
+    """Pose of the flange-like feature in the flange frame: position m and quaternion wxyz; identity for a bare flange."""
+
+    xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass
+class DatasetHeader:
+    """dataset.yaml, as written."""
+
+    schema: int = 0
+    robot: str = ""
+    flange: str = ""
+    scanner: str = ""
+    configuration: str = ""
+    units: Units = field(default_factory=Units)
+    note: str = ""
+    feature_in_flange: Feature = field(default_factory=Feature)

@@ -1,0 +1,45 @@
+"""Named refusals of the calibration room: each says in one sentence what to change."""
+
+from __future__ import annotations
+
+from weldcal.models.errors import InputError, WeldcalError
+
+
+class FlangeNotFound(WeldcalError):
+    """No flange of the asked standard in a cloud; ``reason`` is the sentence without the cloud's name."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+class CircleFitError(WeldcalError):
+    """A circle cannot be fitted to these points."""
+
+
+class PlaneFitError(WeldcalError):
+    """A plane cannot be fitted to these points."""
+
+
+class TooFewPoses(InputError):
+    """Fewer usable poses than a calibration needs."""
+
+
+class CoplanarPoses(InputError):
+    """The flange centres lie in one plane (or on one line)."""
+
+
+class RepeatedPoses(InputError):
+    """The same place was scanned again and again."""
+
+
+class InconsistentPoses(InputError):
+    """No rigid transform explains enough of the poses."""
+
+
+class DatasetError(InputError):
+    """A dataset folder cannot be used as it is."""
+
+
+class UnreachableScanner(WeldcalError):
+    """No flange pose exists that the arm can take and the scanner can see."""

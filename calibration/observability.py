@@ -1,0 +1,106 @@
+"""What a set of poses can and cannot tell: diversity the solution needs, and errors that would stay hidden in it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
+from weldcal.calibration.rigid import skew
+
+Array = NDArray[np.float64]
+
+SAME_PLACE_M = 0.002
+MIN_DEPTH_M = 0.002
+MIN_DEPTH_SHARE = 0.01
+HIDDEN_BIAS_M = 0.0005
+
+
+def check_diversity(
+    p_B: Array, has_normal: NDArray[np.bool_], *, min_poses: int = 4, allow_coplanar: bool = False
+) -> None:
+    """Refuse sets of flange centres (n, 3) m that do not fix a calibration by the paper's rule (four, not coplanar).
+
+    ``min_poses`` and ``allow_coplanar`` relax the rule where face normals are used too (at least two poses, then).
+    Raises TooFewPoses, RepeatedPoses (fewer than ``min_poses`` distinct places, 2 mm apart) and CoplanarPoses (rms
+    distance from the best plane under 2 mm or under 1 % of the extent). Source: paper, after Eq. (12).
+    """
+    n = len(p_B)
+    if n < min_poses:
+        raise TooFewPoses(
+            f"A calibration needs at least {min_poses} usable poses whose flange centres do not lie in one plane; there {'is' if n == 1 else 'are'} {n}: add poses."
+        )
+    distinct: list[Array] = []
+    for p in p_B:
+        if all(float(np.linalg.norm(p - q)) > SAME_PLACE_M for q in distinct):
+            distinct.append(p)
+    if len(distinct) < min_poses:
+        raise RepeatedPoses(
+            f"The {n} poses repeat only {len(distinct)} place{'s' if len(distinct) > 1 else ''} (within 2 mm); scan the flange at {min_poses} or more different places."
+        )
+    if allow_coplanar or n < 3:
+        return
+    spread = np.linalg.svd(p_B - p_B.mean(axis=0), compute_uv=False) / np.sqrt(n)
+    limit = max(MIN_DEPTH_M, MIN_DEPTH_SHARE * float(spread[0]))
+    if spread[1] < limit:
+        raise CoplanarPoses(
+            f"The {n} flange centres lie on one line; move the flange sideways and towards the scanner between scans."
+        )
+    if spread[2] < limit:
+        raise CoplanarPoses(
+            f"The {n} flange centres lie in one plane (within {1e3 * spread[2]:.1f} mm rms); move the flange towards and away from it between scans."
+        )
+
+
+def hidden_bias_sigma(poses: list[RigidTransform], sigma_position_m: float) -> Array:
+    """Standard deviation (3,) m, along x, y, z of the feature frame R, with which the poses would show a constant bias of the centre.
+
+    The bias b (in R) and the camera pose are estimated together: p_B + R_BR b = X_BC p_C; infinite where no pose differs in
+    orientation, because the bias then is a mere shift of the camera.
+    """
+    p = np.array([X.translation() for X in poses])
+    rows = np.concatenate(
+        [
+            np.concatenate([-skew(p - p.mean(axis=0)), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2),
+            -np.array([X.rotation().matrix() for X in poses]),
+        ],
+        axis=2,
+    ).reshape(-1, 9)
+    rows[:, :3] /= max(float(np.abs(p - p.mean(axis=0)).max()), 1e-6)
+    information = rows.T @ rows / max(sigma_position_m, 1e-9) ** 2
+    pose, cross, bias = information[:6, :6], information[:6, 6:], information[6:, 6:]
+    schur = bias - cross.T @ np.linalg.pinv(pose, rcond=1e-10) @ cross
+    values, vectors = np.linalg.eigh(schur)
+    variance = np.where(values > 1e-9 * float(np.trace(bias)), 1.0 / np.maximum(values, 1e-30), np.inf)
+    share = vectors**2
+    with np.errstate(invalid="ignore"):
+        terms = np.where(share > 1e-6, share * variance, 0.0)
+    return np.asarray(np.sqrt(terms.sum(axis=1)))
+
+
+def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float, normals: bool) -> tuple[str, ...]:
+    """Sentences naming the errors that these poses cannot show; empty when there are none worth naming."""
+    if len(poses) < 2:
+        return ("Everything but the flange itself: one pose gives no second look.",)
+    # a calibration that fits to a few micrometres still cannot see a bias with a lever of a few degrees
+    sigma = hidden_bias_sigma(poses, max(sigma_position_m, 5e-5))
+    axes = [name for name, s in zip("xyz", sigma, strict=True) if not s < HIDDEN_BIAS_M]
+    out = []
+    if axes:
+        turn = max(
+            float(
+                np.arccos(
+                    np.clip((np.trace(poses[0].rotation().matrix().T @ X.rotation().matrix()) - 1.0) / 2.0, -1.0, 1.0)
+                )
+            )
+            for X in poses
+        )
+        out.append(
+            f"A constant bias of the flange centre in the flange frame along {', '.join(axes)} (equally a TCP offset): "
+            f"the flange turned by only {np.degrees(turn):.1f} degrees between poses, so it would pass as a shift of the camera."
+        )
+    out.append("A rotation of the flange about its own axis: a circle does not show it.")
+    if not normals:
+        out.append("The tilt of the flange: only centres are given, no face normals.")
+    return tuple(out)

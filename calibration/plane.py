@@ -1,0 +1,120 @@
+"""Robust plane fit: local seeded hypotheses, then Tukey-weighted least squares."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from weldcal.calibration.errors import PlaneFitError
+
+Array = NDArray[np.float64]
+
+_TUKEY = 4.685
+_MAD = 1.4826
+
+
+@dataclass(frozen=True)
+class PlaneFit:
+    """A plane: a point on it (3,) m, unit normal (3,), rms of the inliers m, their number, sigma of the normal rad."""
+
+    point: Array
+    normal: Array
+    rms: float
+    n_inliers: int
+    normal_sigma: float
+
+
+def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, noise_floor: float = 2e-5) -> PlaneFit:
+    """Refine a plane (point, normal) on (N, 3) points [m]; only those within ``tolerance`` [m] of the start take part.
+
+    Raises PlaneFitError when fewer than 10 points remain or they lie on a line.
+    """
+    p0, n = start
+    distance = (points - p0) @ n
+    use = points[np.abs(distance) < tolerance]
+    if len(use) < 10:
+        raise PlaneFitError("Fewer than 10 points lie near the plane.")
+    # about the centroid: raw coordinates 0.5 m away would cost digits in the scatter matrix
+    origin = use.mean(axis=0)
+    use = use - origin
+    q = use[:: max(1, len(use) // 2500)]
+    d = q @ n
+    w = np.ones(len(q))
+    mean, values, scale = np.zeros(3), np.ones(3), tolerance
+    for _ in range(10):
+        total = float(w.sum())
+        if total < 5.0:
+            raise PlaneFitError("Too few points agree on a plane.")
+        mean = (w @ q) / total
+        centred = q - mean
+        values, vectors = np.linalg.eigh((centred * w[:, None]).T @ centred / total)
+        if values[1] < 1e-12:
+            raise PlaneFitError("The points lie on a line.")
+        previous, n = n, vectors[:, 0] * np.sign(vectors[:, 0] @ n or 1.0)
+        settled = float(np.linalg.norm(n - previous)) < 1e-5
+        if settled and len(q) == len(use):
+            break
+        if settled:
+            q = use  # a part of the points found the plane; all of them make it precise
+        d = (q - mean) @ n
+        scale = max(_MAD * float(np.median(np.abs(d))), noise_floor)
+        w = np.maximum(1.0 - (d / (_TUKEY * scale)) ** 2, 0.0) ** 2
+    d = (q - mean) @ n
+    inside = np.abs(d) < _TUKEY * scale
+    count = int(inside.sum())
+    rms = float(np.sqrt(np.mean(d[inside] ** 2)))
+    normal_sigma = rms / np.sqrt(max(count - 3, 1)) * float(np.sqrt(0.5 / values[1] + 0.5 / values[2]))
+    return PlaneFit(origin + mean, n, rms, count, normal_sigma)
+
+
+def local_planes(
+    points: Array, *, reach: float, tolerance: float, seed: int, hypotheses: int = 300, keep: int = 8, sample: int = 900
+) -> list[tuple[Array, Array, int]]:
+    """Distinct plane hypotheses (seed point (3,), unit normal (3,), score) in a cloud (N, 3) m, best supported first.
+
+    The three points of a hypothesis lie within ``reach`` of each other and only support within ``reach`` counts: a small
+    face is not drowned by a large table. Deterministic for a seed.
+    """
+    rng = np.random.default_rng(seed)
+    cloud = points if len(points) <= sample else points[rng.choice(len(points), sample, replace=False)]
+    n = len(cloud)
+    if n < 12:
+        return []
+    i = rng.integers(0, n, hypotheses)
+    half = hypotheses // 2
+    tree = cKDTree(cloud)
+    pick = np.empty((hypotheses, 2), dtype=int)
+    # close triples stay on a small face; wide ones stand noise better
+    for rows, share in ((slice(0, half), 0.03), (slice(half, hypotheses), 0.15)):
+        k = max(12, min(n, int(share * n)))
+        neighbours = tree.query(cloud[i[rows]], k=k)[1]
+        column = rng.integers(1, k, size=(len(neighbours), 2))
+        pick[rows] = np.take_along_axis(neighbours, column, axis=1)
+    a, b, c = cloud[i], cloud[pick[:, 0]], cloud[pick[:, 1]]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    ok = length > 1e-4 * reach**2
+    if not ok.any():
+        return []
+    normal, a = normal[ok] / length[ok, None], a[ok]
+    center = cloud.mean(axis=0)
+    x, s = cloud - center, a - center
+    near = (x**2).sum(axis=1) - 2.0 * s @ x.T < reach**2 - (s**2).sum(axis=1)[:, None]
+    distance = np.abs(normal @ x.T - (normal * s).sum(axis=1)[:, None])
+    score = (near & (distance < tolerance)).sum(axis=1)
+    chosen: list[tuple[Array, Array, int]] = []
+    for h in np.argsort(-score, kind="stable"):
+        same = any(
+            abs(float(m @ normal[h])) > 0.985
+            and abs(float((a[h] - q) @ m)) < 2.0 * tolerance
+            and float(np.linalg.norm(a[h] - q)) < reach
+            for q, m, _ in chosen
+        )
+        if not same:
+            chosen.append((a[h], normal[h], int(score[h])))
+        if len(chosen) == keep:
+            break
+    return chosen

@@ -1,0 +1,296 @@
+"""Which flange poses to scan: reachable, clear, in view, and the ones that tell most about where the camera is."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
+from weldcal.calibration.errors import UnreachableScanner
+from weldcal.calibration.rigid import exp_rotation, skew
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
+from weldcal.models.arms.urdf import Capsule
+from weldcal.models.errors import InputError
+from weldcal.models.scanners import ScannerPreset
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """Limits and weights of the planner; m and rad.
+
+    ``theta_max_rad``: largest angle between face normal and line of sight (paper, section 2.1.4). ``table_z_m``: height of
+    the table in B; ``margin_m`` above it. ``image_margin``: share of the image kept free at each side, and of the working
+    range at each end, for an uncertain X_BC. ``feature_radius_m``: outer radius of the flange or ring. ``max_travel_rad``: farthest
+    any joint may go from the start. The sigmas weigh positions and normals in the information.
+    """
+
+    seed: int = 0
+    theta_max_rad: float = float(np.radians(30.0))
+    table_z_m: float = 0.0
+    margin_m: float = 0.03
+    image_margin: float = 0.08
+    feature_radius_m: float = 0.0315
+    scanner_clearance_m: float = 0.12
+    self_clearance_m: float = 0.01
+    max_travel_rad: float = 2.2
+    min_sigma: float = 0.05
+    min_spacing_m: float = 0.03
+    sigma_position_m: float = 1e-4
+    sigma_normal_rad: float = 1e-3
+    candidates: int = 80
+    max_trials: int = 3000
+    work_point_B: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedPose:
+    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR; ``gain`` in log determinant of the information of X_BC,
+    and ``sigma_m``, the predicted standard deviation (3-D) of a scanned point at the work point once this pose is in."""
+
+    X_BF: RigidTransform
+    q: Array
+    X_BR: RigidTransform
+    gain: float
+    sigma_m: float
+
+
+def plan_calibration_poses(
+    arm: ArmModel,
+    X_FR: RigidTransform,
+    X_BC_guess: RigidTransform,
+    scanner: ScannerPreset,
+    n: int = 12,
+    *,
+    q_start: Array,
+    config: PlannerConfig | None = None,
+    tool: Sequence[Capsule] = (),
+) -> list[PlannedPose]:
+    """Plan ``n`` (>= 4) flange poses, most telling first: greedy D-optimal on the information of X_BC about the work point.
+
+    A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued. ``tool``
+    are capsules in the frame F that must clear the table and must not hide the feature. Deterministic for ``config.seed``.
+    Raises UnreachableScanner, one sentence naming the commonest obstacle, when fewer than ``n`` poses exist or they do
+    not span space, and InputError for n < 4.
+    """
+    if n < 4:
+        raise InputError("A calibration needs at least 4 poses: ask for 4 or more.")
+    config = config or PlannerConfig()
+    pool, why = _candidates(arm, X_FR, X_BC_guess, scanner, q_start, config, tool)
+    chosen = _greedy(pool, [], n, X_BC_guess, config)
+    if len(chosen) < n:
+        raise UnreachableScanner(_explain(why, len(chosen), n))
+    p = np.array([c.X_BR.translation() for c in chosen])
+    if float(np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[2]) / np.sqrt(n) < 0.004:
+        raise UnreachableScanner(
+            "The poses that the arm can take before the scanner lie in one plane; move the scanner closer to the arm."
+        )
+    return chosen
+
+
+def next_best_pose(
+    arm: ArmModel,
+    X_FR: RigidTransform,
+    X_BC: RigidTransform,
+    scanner: ScannerPreset,
+    taken: Sequence[RigidTransform],
+    *,
+    q_start: Array,
+    config: PlannerConfig | None = None,
+    tool: Sequence[Capsule] = (),
+) -> PlannedPose:
+    """The pose that adds most to the feature poses X_BR already scanned (``taken``); same limits and errors as above."""
+    config = config or PlannerConfig()
+    pool, why = _candidates(arm, X_FR, X_BC, scanner, q_start, config, tool)
+    chosen = _greedy(pool, list(taken), 1, X_BC, config)
+    if not chosen:
+        raise UnreachableScanner(_explain(why, 0, 1))
+    return chosen[0]
+
+
+def predicted_sigma(
+    feature_poses: Sequence[RigidTransform], X_BC: RigidTransform, config: PlannerConfig | None = None
+) -> float:
+    """Predicted standard deviation (3-D, m) at the work point after scanning the given feature poses X_BR; inf if open."""
+    config = config or PlannerConfig()
+    work = _work_point(config, X_BC, list(feature_poses))
+    total = sum((_information(X, X_BC, work, config) for X in feature_poses), np.zeros((9, 9)))
+    return _sigma_at_work(total)
+
+
+def _candidates(
+    arm: ArmModel,
+    X_FR: RigidTransform,
+    X_BC: RigidTransform,
+    scanner: ScannerPreset,
+    q_start: Array,
+    config: PlannerConfig,
+    tool: Sequence[Capsule],
+) -> tuple[list[PlannedPose], Counter[str]]:
+    rng = np.random.default_rng(config.seed)
+    bodies = arm_bodies(arm, tool)
+    X_RF = X_FR.inverse()
+    reach = float(np.abs(arm.stack[:, :3, 3]).sum())
+    pool: list[PlannedPose] = []
+    why: Counter[str] = Counter()
+    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    ring_R = np.vstack(
+        [config.feature_radius_m * np.column_stack([np.cos(angles), np.sin(angles), 0.0 * angles]), np.zeros((1, 3))]
+    )
+    span = scanner.far_m - scanner.near_m
+    near, far = scanner.near_m + config.image_margin * span, scanner.far_m - config.image_margin * span
+    for _ in range(config.max_trials):
+        if len(pool) >= config.candidates:
+            break
+        X_CR = _random_feature(rng, scanner, near, far, config)
+        if X_CR is None:
+            why["the flange does not fit into the scanner's field of view"] += 1
+            continue
+        X_BR = X_BC @ X_CR
+        X_BF = X_BR @ X_RF
+        if (
+            float(np.linalg.norm(X_BF.translation())) > reach
+            or float(X_BR.translation()[2]) < config.table_z_m + config.margin_m
+        ):
+            low = float(X_BR.translation()[2]) < config.table_z_m + config.margin_m
+            why["the table is in the way" if low else "the scanner's working range is out of the arm's reach"] += 1
+            continue
+        q = nearest_solution(arm, X_BF, q_start)
+        if q is None:
+            why["the scanner's working range is out of the arm's reach"] += 1
+            continue
+        reason = _refuse(arm, q, X_BC, X_BR, ring_R, bodies, q_start, config)
+        if reason is not None:
+            why[reason] += 1
+            continue
+        pool.append(PlannedPose(X_BF, q, X_BR, 0.0, float("inf")))
+    return pool, why
+
+
+def _random_feature(
+    rng: np.random.Generator, scanner: ScannerPreset, near: float, far: float, config: PlannerConfig
+) -> RigidTransform | None:
+    z = rng.uniform(near, far)
+    radius = config.feature_radius_m
+    limits = []
+    for f, c, size in ((scanner.fx, scanner.cx, scanner.width), (scanner.fy, scanner.cy, scanner.height)):
+        free = config.image_margin * size
+        low, high = (free - c) / f * z + radius, (size - 1 - free - c) / f * z - radius
+        if low >= high:
+            return None
+        limits.append(rng.uniform(low, high))
+    p = np.array([*limits, z])
+    sight = -p / np.linalg.norm(p)
+    # uniform over the cap of directions within theta_max of the line of sight
+    tilt = float(np.arccos(rng.uniform(np.cos(config.theta_max_rad), 1.0)))
+    side = np.cross(sight, [1.0, 0.0, 0.0])
+    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight).matrix() @ (side / np.linalg.norm(side))
+    normal = exp_rotation(tilt * side).matrix() @ sight
+    x = np.cross([0.0, 1.0, 0.0], normal)
+    x /= np.linalg.norm(x)
+    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal])) @ RotationMatrix.MakeZRotation(
+        rng.uniform(-np.pi, np.pi)
+    )
+    return RigidTransform(R, p)
+
+
+def _refuse(
+    arm: ArmModel,
+    q: Array,
+    X_BC: RigidTransform,
+    X_BR: RigidTransform,
+    ring_R: Array,
+    bodies: list[Body],
+    q_start: Array,
+    config: PlannerConfig,
+) -> str | None:
+    """Why this posture will not do, or None."""
+    if float(np.abs(q - q_start).max()) > config.max_travel_rad:
+        return "the joints would have to travel too far from the start posture"
+    if sigma_min(jacobian(arm, q)) < config.min_sigma:
+        return "the arm would stand in a singularity"
+    frames = link_frames(arm, q)
+    if lowest_point(bodies, frames) < config.table_z_m + config.margin_m:
+        return "the table is in the way"
+    if self_distance(bodies, frames) < config.self_clearance_m:
+        return "the arm would touch itself"
+    eye = np.asarray(X_BC.translation())
+    ring_B = (X_BR @ ring_R.T).T
+    hidden, near_eye = occludes(bodies, frames, eye, ring_B)
+    if near_eye < config.scanner_clearance_m:
+        return "the arm would come too close to the scanner"
+    return "the arm hides the flange from the scanner" if hidden else None
+
+
+def _information(X_BR: RigidTransform, X_BC: RigidTransform, work: Array, config: PlannerConfig) -> Array:
+    """Information (9, 9) of one sighting on [rotation about the work point; translation; centre bias in R]."""
+    lever = X_BR.translation() - work
+    R = X_BR.rotation().matrix()
+    J_p = np.hstack([-skew(lever), np.eye(3), -R])
+    J_n = np.hstack([-skew(R[:, 2]), np.zeros((3, 6))])
+    return np.asarray(J_p.T @ J_p / config.sigma_position_m**2 + J_n.T @ J_n / config.sigma_normal_rad**2)
+
+
+def _work_point(config: PlannerConfig, X_BC: RigidTransform, poses: list[RigidTransform]) -> Array:
+    if config.work_point_B is not None:
+        return np.array(config.work_point_B)
+    return np.mean([X.translation() for X in poses], axis=0) if poses else np.asarray(X_BC.translation())
+
+
+def _sigma_at_work(information: Array) -> float:
+    values = np.linalg.eigvalsh(information)
+    if values[0] < 1e-9 * values[-1]:
+        return float("inf")
+    return float(np.sqrt(np.trace(np.linalg.inv(information)[3:6, 3:6])))
+
+
+def _greedy(
+    pool: list[PlannedPose], taken: list[RigidTransform], n: int, X_BC: RigidTransform, config: PlannerConfig
+) -> list[PlannedPose]:
+    if not pool:
+        return []
+    work = _work_point(config, X_BC, taken + [c.X_BR for c in pool])
+    # what is believed before the first scan: weak, so that four poses already span space; the bias is known to about 1 mm
+    prior = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
+    total = prior + sum((_information(X, X_BC, work, config) for X in taken), np.zeros((9, 9)))
+    gains = [_information(c.X_BR, X_BC, work, config) for c in pool]
+    places = [np.asarray(X.translation()) for X in taken]
+    chosen: list[PlannedPose] = []
+    free = set(range(len(pool)))
+    while len(chosen) < n and free:
+        now = _value(total)
+        best, best_value = -1, -np.inf
+        for k in sorted(free):
+            p = pool[k].X_BR.translation()
+            if any(float(np.linalg.norm(p - o)) < config.min_spacing_m for o in places):
+                continue
+            value = _value(total + gains[k])
+            if value > best_value:
+                best, best_value = k, value
+        if best < 0:
+            break
+        free.remove(best)
+        total = total + gains[best]
+        places.append(np.asarray(pool[best].X_BR.translation()))
+        c = pool[best]
+        chosen.append(PlannedPose(c.X_BF, c.q, c.X_BR, best_value - now, _sigma_at_work(total)))
+    return chosen
+
+
+def _value(information: Array) -> float:
+    """Log determinant of the information of X_BC with the bias marginalised out."""
+    A, B, D = information[:6, :6], information[:6, 6:], information[6:, 6:]
+    return float(np.linalg.slogdet(A - B @ np.linalg.solve(D, B.T))[1])
+
+
+def _explain(why: Counter[str], found: int, wanted: int) -> str:
+    reason = why.most_common(1)[0][0] if why else "the poses found lie too close together"
+    amount = "No pose" if found == 0 else f"Only {found} of {wanted} poses"
+    return f"{amount} of the flange can be scanned, most often because {reason}; move the scanner or correct its guessed pose."

@@ -1,0 +1,247 @@
+"""A calibration as a file: what was found, how well, from which data; written whole or not at all, and read back."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.rigid import rotation_vector
+from weldcal.models.errors import InputError
+
+Array = NDArray[np.float64]
+
+RESULT_FILE = "calibration.yaml"
+
+
+@dataclass(frozen=True)
+class PoseRecord:
+    """One pose: whether it was used, its residual and held-out error (mm), tilts (deg); reason where it was refused."""
+
+    id: str
+    used: bool
+    reason: str = ""
+    residual_mm: float | None = None
+    held_out_mm: float | None = None
+    tilt_deg: float | None = None
+    held_out_tilt_deg: float | None = None
+
+
+@dataclass(frozen=True)
+class IcpRecord:
+    """Algorithm 1's own figure at one verification pose: six numbers at the flange centre, and what it does not see."""
+
+    id: str
+    method: str
+    rotation_deg: tuple[float, ...]
+    translation_mm: tuple[float, ...]
+    translation_norm_mm: float
+    unseen: tuple[str, ...]
+    true_error_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """All that calibration.yaml holds. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin."""
+
+    X_BC: RigidTransform
+    covariance: Array
+    held_out_mm: dict[str, float]
+    tilt_deg: dict[str, float | None]
+    poses: tuple[PoseRecord, ...]
+    icp: tuple[IcpRecord, ...] = ()
+    unobservable: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    robot: str = ""
+    flange: str = ""
+    scanner: str = ""
+    sigma_position_mm: float = 0.0
+    sigma_normal_deg: float = 0.0
+    seed: int = 0
+    data_hashes: dict[str, str] = field(default_factory=dict)
+    scanner_correction: dict[str, Any] | None = None
+    software: str = ""
+
+
+def software_version() -> str:
+    """Name and version of this software, for the record."""
+    try:
+        return f"weldcal {version('weldcal')}"
+    except PackageNotFoundError:
+        return "weldcal (not installed)"
+
+
+def matrix4(X: RigidTransform) -> list[list[float]]:
+    """4 x 4 homogeneous matrix as nested lists."""
+    return [[float(v) for v in row] for row in X.GetAsMatrix4()]
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file so that a reader sees the old file or the whole new one, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        Path(name).chmod(0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def save_result(result: CalibrationResult, folder: Path) -> Path:
+    """Write ``calibration.yaml`` in ``folder``; returns its path."""
+    q = result.X_BC.rotation().ToQuaternion().wxyz()
+    document = {
+        "schema": 1,
+        "software": result.software or software_version(),
+        "robot": result.robot,
+        "flange": result.flange,
+        "scanner": result.scanner,
+        "configuration": "eye_on_base",
+        "X_BC": {
+            "matrix": matrix4(result.X_BC),
+            "xyz": [float(v) for v in result.X_BC.translation()],
+            "wxyz": [float(v) for v in q],
+        },
+        "covariance": {
+            "order": "rotation (rad) then translation (m), on the base side about the camera origin",
+            "matrix": [[float(v) for v in row] for row in result.covariance],
+        },
+        "scanner_correction": result.scanner_correction,
+        "held_out_mm": result.held_out_mm,
+        "tilt_deg": result.tilt_deg,
+        "sigma_position_mm": result.sigma_position_mm,
+        "sigma_normal_deg": result.sigma_normal_deg,
+        "icp": [_plain(asdict(r)) for r in result.icp],
+        "unobservable": list(result.unobservable),
+        "warnings": list(result.warnings),
+        "poses": [_plain(asdict(r)) for r in result.poses],
+        "seed": result.seed,
+        "data_sha256": dict(result.data_hashes),
+    }
+    path = folder / RESULT_FILE
+    write_atomically(
+        path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=160, allow_unicode=True)
+    )
+    return path
+
+
+def load_result(path: Path) -> CalibrationResult:
+    """Read a calibration.yaml (or the folder that holds it).
+
+    Raises InputError when it is missing, not a calibration, or its rotation is not orthonormal.
+    """
+    path = Path(path)
+    path = path / RESULT_FILE if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
+    try:
+        d = yaml.safe_load(path.read_text(encoding="utf-8"))
+        M = np.array(d["X_BC"]["matrix"], dtype=float)
+        covariance = np.array(d["covariance"]["matrix"], dtype=float)
+        schema = d["schema"]
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, UnicodeDecodeError) as e:
+        raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.") from e
+    if schema != 1 or M.shape != (4, 4) or covariance.shape != (6, 6) or not np.isfinite(M).all():
+        raise InputError(f"'{path.name}' is not a calibration result of schema 1; run 'weldcal calibrate' again.")
+    if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0:
+        raise InputError(f"The rotation in '{path.name}' is not orthonormal; the file was changed by hand.")
+    return CalibrationResult(
+        X_BC=RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3]),
+        covariance=covariance,
+        held_out_mm=dict(d.get("held_out_mm") or {}),
+        tilt_deg=dict(d.get("tilt_deg") or {}),
+        poses=tuple(PoseRecord(**r) for r in d.get("poses") or []),
+        icp=tuple(
+            IcpRecord(**{k: tuple(v) if isinstance(v, list) else v for k, v in r.items()}) for r in d.get("icp") or []
+        ),
+        unobservable=tuple(d.get("unobservable") or ()),
+        warnings=tuple(d.get("warnings") or ()),
+        robot=str(d.get("robot", "")),
+        flange=str(d.get("flange", "")),
+        scanner=str(d.get("scanner", "")),
+        sigma_position_mm=float(d.get("sigma_position_mm", 0.0)),
+        sigma_normal_deg=float(d.get("sigma_normal_deg", 0.0)),
+        seed=int(d.get("seed", 0)),
+        data_hashes=dict(d.get("data_sha256") or {}),
+        scanner_correction=d.get("scanner_correction"),
+        software=str(d.get("software", "")),
+    )
+
+
+def export_urdf(X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame") -> str:
+    """A URDF/xacro snippet: fixed joint from the controller's base frame to the scanner's optical frame."""
+    roll, pitch, yaw = X_BC.rotation().ToRollPitchYaw().vector()
+    x, y, z = X_BC.translation()
+    return (
+        f'<link name="{child}"/>\n<joint name="{parent}_to_{child}" type="fixed">\n'
+        f'  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
+        f'  <origin xyz="{x:.9f} {y:.9f} {z:.9f}" rpy="{roll:.9f} {pitch:.9f} {yaw:.9f}"/>\n</joint>\n'
+    )
+
+
+def export_ros2(X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame") -> str:
+    """The command line of ROS 2's static transform publisher."""
+    x, y, z = X_BC.translation()
+    qw, qx, qy, qz = _wxyz(X_BC)
+    return (
+        f"ros2 run tf2_ros static_transform_publisher --x {x:.9f} --y {y:.9f} --z {z:.9f} "
+        f"--qx {qx:.9f} --qy {qy:.9f} --qz {qz:.9f} --qw {qw:.9f} --frame-id {parent} --child-frame-id {child}\n"
+    )
+
+
+def export_ur_pose(X_BC: RigidTransform) -> str:
+    """A URScript pose: position m and rotation vector rad."""
+    return "p[" + ", ".join(f"{v:.9f}" for v in (*X_BC.translation(), *rotation_vector(X_BC.rotation()))) + "]\n"
+
+
+def export_json(result: CalibrationResult) -> str:
+    """X_BC and covariance for other programs."""
+    qw, qx, qy, qz = _wxyz(result.X_BC)
+    return json.dumps(
+        {
+            "parent": "base",
+            "child": "scanner_optical_frame",
+            "X_BC": matrix4(result.X_BC),
+            "xyz": [float(v) for v in result.X_BC.translation()],
+            "quaternion_wxyz": [qw, qx, qy, qz],
+            "covariance_rotation_translation": np.asarray(result.covariance).tolist(),
+        },
+        indent=2,
+    )
+
+
+def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
+    """Write every export into ``folder``; returns the paths."""
+    files = {
+        "scanner.urdf.xacro": export_urdf(result.X_BC),
+        "static_transform.sh": export_ros2(result.X_BC),
+        "ur_pose.script": export_ur_pose(result.X_BC),
+        "X_BC.json": export_json(result),
+    }
+    for name, text in files.items():
+        write_atomically(folder / name, text)
+    return tuple(folder / name for name in files)
+
+
+def _wxyz(X: RigidTransform) -> tuple[float, float, float, float]:
+    q: Quaternion = X.rotation().ToQuaternion()
+    return float(q.w()), float(q.x()), float(q.y()), float(q.z())
+
+
+def _plain(record: dict[str, Any]) -> dict[str, Any]:
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in record.items()}

@@ -1,0 +1,56 @@
+"""Closed-form rigid transform between two point sets (and directions): the paper's Eq. (10) to (12)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+Array = NDArray[np.float64]
+
+
+def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidTransform:
+    """X_BC minimising the weighted sum of |p_B - X_BC p_C|^2 for points (N, 3) m, N >= 3; scale fixed to 1.
+
+    Source: paper, Eq. (10)-(12) (Umeyama 1991 with c = 1). With Sigma = U D V^T, R = U S V^T, and S = diag(1, 1, det(U V^T)) keeps R
+    a rotation, also for coplanar points, where det(Sigma) of Eq. (12) is zero. Raises ValueError for collinear points,
+    which leave a rotation open.
+    """
+    w = np.ones(len(p_B)) if weights is None else np.asarray(weights, dtype=float)
+    w = w / w.sum()
+    mean_B, mean_C = w @ p_B, w @ p_C
+    U, D, Vt = np.linalg.svd((p_B - mean_B).T @ (w[:, None] * (p_C - mean_C)))
+    if D[1] < 1e-12 * max(float(D[0]), 1e-30) or D[0] == 0.0:
+        raise ValueError("collinear points do not fix a rotation")
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return RigidTransform(RotationMatrix(R), mean_B - R @ mean_C)
+
+
+def fit_rotation(u_B: Array, u_C: Array) -> RotationMatrix:
+    """R_BC minimising the sum of |u_B - R_BC u_C|^2 for vectors (N, 3); two that are not parallel suffice."""
+    U, _, Vt = np.linalg.svd(u_B.T @ u_C)
+    return RotationMatrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def rotation_vector(R: RotationMatrix) -> Array:
+    """Axis times angle (3,) rad of a rotation."""
+    aa = R.ToAngleAxis()
+    return np.asarray(aa.axis() * aa.angle(), dtype=float)
+
+
+def exp_rotation(vector: Array) -> RotationMatrix:
+    """Rotation of a vector axis times angle (3,) rad."""
+    from pydrake.common.eigen_geometry import AngleAxis
+
+    angle = float(np.linalg.norm(vector))
+    axis = np.array([0.0, 0.0, 1.0]) if angle < 1e-15 else np.asarray(vector) / angle
+    return RotationMatrix(AngleAxis(angle, axis))
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    v = np.asarray(v, dtype=float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out

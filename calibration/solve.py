@@ -1,0 +1,343 @@
+"""Eye-on-base calibration from all sightings: robust, weighted on SE(3), with the uncertainty the residuals admit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.special import gammaincinv
+
+from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.observability import check_diversity, unobservable_sentences
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.rigid import exp_rotation, fit_rigid, fit_rotation, skew
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_GATE = 8.0  # in sigma per axis: only gross outliers go; what a scanner's distortion does at the rim of its field stays
+_HUBER = 2.0
+_POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
+_NORMAL_FLOOR_RAD = 1e-6
+
+
+@dataclass(frozen=True)
+class SolveConfig:
+    """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that agree)."""
+
+    seed: int = 0
+    max_outliers: float = 0.40
+    hypotheses: int = 600
+    use_normals: bool = True
+    min_poses: int = 4
+    allow_coplanar: bool = False
+    leave_one_out: bool = True
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of each pose under a calibration that never saw it: position at the flange centre (n,) m, tilt (n,) rad.
+
+    ``tilt_rad`` is NaN where no normal was seen. Poses refused as outliers keep their (large) error.
+    """
+
+    position_m: Array
+    tilt_rad: Array
+
+
+@dataclass(frozen=True)
+class CalibrationEstimate:
+    """Pose of the camera in the base and what is known of it.
+
+    ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
+    base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
+    ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
+    observations; ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot and scanner
+    together beyond the noise of the fits, estimated from the residuals.
+    """
+
+    X_BC: RigidTransform
+    covariance: Array
+    inliers: Flags
+    position_residuals_m: Array
+    tilt_residuals_rad: Array
+    held_out: HeldOut
+    sigma_position_m: float
+    sigma_normal_rad: float
+    unobservable: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Observations as arrays: b, c (n, 3) m; z, m (n, 3) normals in B and C; has (n,) normal seen; fit noise."""
+
+    b: Array
+    c: Array
+    z: Array
+    m: Array
+    has: Flags
+    cov: Array
+    var_n: Array
+
+    def pick(self, keep: Flags) -> _Data:
+        return _Data(*(getattr(self, f)[keep] for f in ("b", "c", "z", "m", "has", "cov", "var_n")))
+
+
+@dataclass(frozen=True)
+class _Solution:
+    X_BC: RigidTransform
+    information: Array  # about the pivot
+    pivot: Array
+    var_p: float
+    var_n: float
+
+
+def estimate_eye_on_base(
+    observations: list[Observation] | tuple[Observation, ...], config: SolveConfig | None = None
+) -> CalibrationEstimate:
+    """Estimate X_BC from sightings of the flange at n poses; positions and (where seen) normals are used together.
+
+    Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share of the poses. Then
+    Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and of normals are
+    estimated from the residuals (Helmert's simplified estimator, each group divided by its own redundancy), never
+    set by taste. Held-out errors repeat the weighted fit without each pose in turn. Deterministic for ``config.seed``.
+    Raises TooFewPoses, RepeatedPoses, CoplanarPoses (see observability.check_diversity) and InconsistentPoses when no
+    rigid transform explains enough of the poses.
+    """
+    config = config or SolveConfig()
+    observations = tuple(observations)
+    data = _arrays(observations, config.use_normals)
+    check_diversity(data.b, data.has, min_poses=config.min_poses, allow_coplanar=config.allow_coplanar)
+    start = _robust_start(data, config)
+    solution, inliers = _reweighted(data, start)
+    n = len(data.b)
+    need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
+    if int(inliers.sum()) < need and n > 4:
+        raise InconsistentPoses(
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position; check units, pose order and that the camera did not move."
+        )
+    if not inliers.all():
+        check_diversity(
+            data.b[inliers], data.has[inliers], min_poses=config.min_poses, allow_coplanar=config.allow_coplanar
+        )
+    residual, tilt = _residuals(data, solution.X_BC)
+    held_out = HeldOut(residual.copy(), tilt.copy())
+    if config.leave_one_out:
+        held_out = _leave_one_out(data, inliers, solution, held_out)
+    warnings = []
+    if not inliers.all():
+        names = ", ".join(o.id for o, keep in zip(observations, inliers, strict=True) if not keep)
+        warnings.append(f"{n - int(inliers.sum())} of {n} poses disagree with the rest and were left out: {names}.")
+    used = [o for o, keep in zip(observations, inliers, strict=True) if keep]
+    sigma_p = float(np.sqrt(solution.var_p))
+    return CalibrationEstimate(
+        X_BC=solution.X_BC,
+        covariance=_covariance_at_camera(solution),
+        inliers=inliers,
+        position_residuals_m=residual,
+        tilt_residuals_rad=tilt,
+        held_out=held_out,
+        sigma_position_m=sigma_p,
+        sigma_normal_rad=float(np.sqrt(solution.var_n)),
+        unobservable=unobservable_sentences([o.X_BR for o in used], sigma_p, bool(data.has.any())),
+        warnings=tuple(warnings),
+    )
+
+
+def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
+    """Covariance (3, 3) m^2, in B, of the base position of a scanned point that is seen at ``p_BQ`` (3,) m."""
+    lever = -skew(np.asarray(p_BQ, dtype=float) - estimate.X_BC.translation())
+    J = np.hstack([lever, np.eye(3)])
+    return np.asarray(J @ estimate.covariance @ J.T)
+
+
+def _arrays(observations: tuple[Observation, ...], use_normals: bool) -> _Data:
+    n = len(observations)
+    has = np.array([use_normals and o.n_C is not None for o in observations], dtype=bool)
+    m = np.array([o.n_C if o.n_C is not None else np.zeros(3) for o in observations], dtype=float).reshape(n, 3)
+    cov = np.array([np.zeros((3, 3)) if o.center_covariance is None else o.center_covariance for o in observations])
+    var_n = np.array([0.0 if o.normal_sigma is None else o.normal_sigma**2 for o in observations])
+    b = np.array([o.p_BR for o in observations]).reshape(n, 3)
+    z = np.array([o.n_B for o in observations]).reshape(n, 3)
+    return _Data(b, np.array([o.p_CR for o in observations]).reshape(n, 3), z, m, has, cov.reshape(n, 3, 3), var_n)
+
+
+def _residuals(data: _Data, X_BC: RigidTransform) -> tuple[Array, Array]:
+    R = X_BC.rotation().matrix()
+    position = np.linalg.norm(data.c @ R.T + X_BC.translation() - data.b, axis=1)
+    seen = data.m @ R.T
+    sine = np.linalg.norm(np.cross(seen, data.z), axis=1)
+    tilt = np.arctan2(sine, (seen * data.z).sum(axis=1))
+    return position, np.where(data.has, tilt, np.nan)
+
+
+def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
+    """Best of seeded minimal sets, each concentrated twice (least trimmed squares, Rousseeuw and Van Driessen 1999)."""
+    n = len(data.b)
+    if n < 3:
+        return _closed_form(data)
+    h = min(n, max(3, int(np.ceil((1.0 - config.max_outliers) * n))))
+    rng = np.random.default_rng(config.seed)
+    total = n * (n - 1) * (n - 2) // 6
+    if total <= config.hypotheses:
+        i, j, k = np.meshgrid(*[np.arange(n)] * 3, indexing="ij")
+        sets = np.stack([i, j, k], axis=-1).reshape(-1, 3)
+        sets = sets[(sets[:, 0] < sets[:, 1]) & (sets[:, 1] < sets[:, 2])]
+    else:
+        sets = np.array([rng.choice(n, 3, replace=False) for _ in range(config.hypotheses)])
+    candidates: list[tuple[float, RigidTransform]] = []
+    for s in sets:
+        try:
+            X = fit_rigid(data.b[s], data.c[s])
+        except ValueError:
+            continue
+        candidates.append((_trimmed(data, X, h), X))
+    if not candidates:
+        return _closed_form(data)
+    candidates.sort(key=lambda item: item[0])
+    best = candidates[0]
+    for cost, X in candidates[:15]:
+        for _ in range(6):
+            nearest = np.argsort(_residuals(data, X)[0], kind="stable")[:h]
+            try:
+                better = fit_rigid(data.b[nearest], data.c[nearest])
+            except ValueError:
+                break
+            new = _trimmed(data, better, h)
+            if new >= cost * (1.0 - 1e-9):
+                break
+            cost, X = new, better
+        if cost < best[0]:
+            best = (cost, X)
+    return best[1]
+
+
+def _trimmed(data: _Data, X: RigidTransform, h: int) -> float:
+    e = np.linalg.norm(data.c @ X.rotation().matrix().T + X.translation() - data.b, axis=1)
+    return float(np.sum(np.partition(e**2, h - 1)[:h]))
+
+
+def _closed_form(data: _Data) -> RigidTransform:
+    """Few or degenerate poses: normals and chords together fix the rotation."""
+    mean_b, mean_c = data.b.mean(axis=0), data.c.mean(axis=0)
+    scale = max(float(np.abs(data.b - mean_b).max()), 1e-9)
+    u_B = np.vstack([(data.b - mean_b) / scale, data.z[data.has]])
+    u_C = np.vstack([(data.c - mean_c) / scale, data.m[data.has]])
+    R = fit_rotation(u_B, u_C)
+    return RigidTransform(R, mean_b - R.matrix() @ mean_c)
+
+
+def _scale_from_trimmed(e: Array, h: int) -> float:
+    """Per-axis sigma from the h smallest of n 3-D errors, by the matching quantile of the chi distribution."""
+    q = min((h - 0.5) / len(e), 0.98)
+    return float(np.partition(e, h - 1)[h - 1] / np.sqrt(2.0 * gammaincinv(1.5, q)))
+
+
+def _reweighted(data: _Data, start: RigidTransform) -> tuple[_Solution, Flags]:
+    """Alternate gating and weighted fits until the set of inliers repeats."""
+    n = len(data.b)
+    e, _ = _residuals(data, start)
+    # six parameters were fitted to few poses: the small residuals of a minimal set must not set the scale
+    h = max(int(0.6 * n), min(n, 3))
+    dof = max(3 * h - 6, 1) / (3 * h)
+    sigma = max(_scale_from_trimmed(e, h) / np.sqrt(dof), _POSITION_FLOOR_M)
+    keep = _gate(data, start, sigma**2) if n > 4 else np.ones(n, dtype=bool)
+    solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2)
+    seen: set[bytes] = set()
+    for _ in range(12):
+        solution = _fit(data, keep, solution)
+        seen.add(keep.tobytes())
+        if n <= 4:
+            break
+        new = _gate(data, solution.X_BC, solution.var_p)
+        if int(new.sum()) < 3 or new.tobytes() in seen:
+            break
+        keep = new
+    return solution, keep
+
+
+def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:
+    R = X.rotation().matrix()
+    e = data.c @ R.T + X.translation() - data.b
+    cov = R @ data.cov @ R.T + var_p * np.eye(3)
+    d2 = np.einsum("ni,nij,nj->n", e, np.linalg.inv(cov), e)
+    return np.asarray(d2 < _GATE**2)
+
+
+def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _Solution:
+    """Weighted Gauss-Newton on the kept poses, variance components updated between steps."""
+    d = data.pick(keep)
+    pivot = d.b.mean(axis=0)
+    R, p = start.X_BC.rotation().matrix(), start.X_BC.translation()
+    var_p, var_n = start.var_p, start.var_n
+    N = np.eye(6)
+    for step_number in range(iterations):
+        q = d.c @ R.T + p
+        e_p = q - d.b
+        J_p = np.concatenate([-skew(q - pivot), np.broadcast_to(np.eye(3), (len(q), 3, 3))], axis=2)
+        W_p = np.linalg.inv(R @ d.cov @ R.T + var_p * np.eye(3))
+        maha = np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", e_p, W_p, e_p) / 3.0, 1e-30))
+        w_p = np.minimum(1.0, _HUBER / maha)
+        N_p = np.einsum("nki,n,nkl,nlj->ij", J_p, w_p, W_p, J_p)
+        g = np.einsum("nki,n,nkl,nl->i", J_p, w_p, W_p, e_p)
+        rows = d.has
+        s = d.m[rows] @ R.T
+        e_n = s - d.z[rows]
+        along = (e_n * d.z[rows]).sum(axis=1)
+        e_n = e_n - along[:, None] * d.z[rows]
+        J_n = np.concatenate([-skew(s), np.zeros((len(s), 3, 3))], axis=2)
+        k_n = 1.0 / (d.var_n[rows] + var_n)
+        maha_n = np.sqrt(np.maximum((e_n**2).sum(axis=1) * k_n / 2.0, 1e-30))
+        w_n = np.minimum(1.0, _HUBER / maha_n) * k_n
+        N_n = np.einsum("nki,n,nkj->ij", J_n, w_n, J_n)
+        g = g + np.einsum("nki,n,nk->i", J_n, w_n, e_n)
+        N = N_p + N_n
+        step = -np.linalg.lstsq(N, g, rcond=1e-12)[0]
+        dR = exp_rotation(step[:3]).matrix()
+        R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:]
+        R = RotationMatrix.ProjectToRotationMatrix(R).matrix()
+        # Helmert's simplified estimator: each group's weighted square sum over its own redundancy
+        inverse = np.linalg.pinv(N)
+        redundancy_p = max(3.0 * len(q) - float(np.trace(inverse @ N_p)), 0.3)
+        redundancy_n = max(2.0 * len(s) - float(np.trace(inverse @ N_n)), 0.3)
+        new_p = _component(var_p, (w_p * maha**2 * 3.0).sum() / redundancy_p, _POSITION_FLOOR_M)
+        new_n = (
+            _component(var_n, (w_n / k_n * maha_n**2 * 2.0).sum() / redundancy_n, _NORMAL_FLOOR_RAD)
+            if len(s)
+            else var_n
+        )
+        settled = abs(new_p / var_p - 1.0) + abs(new_n / var_n - 1.0) < 1e-4
+        var_p, var_n = new_p, new_n
+        if step_number > 2 and settled and float(np.linalg.norm(step)) < 1e-10:
+            break
+    return _Solution(RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n)
+
+
+def _component(variance: float, ratio: float, floor: float) -> float:
+    """One damped update of a variance component: grows where residuals exceed their prediction, down to a floor."""
+    return max(variance * float(np.clip(ratio, 0.1, 100.0)), floor**2)
+
+
+def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut) -> HeldOut:
+    position, tilt = full.position_m.copy(), full.tilt_rad.copy()
+    if int(inliers.sum()) < 4:
+        return HeldOut(np.full_like(position, np.nan), np.full_like(tilt, np.nan))
+    for i in np.nonzero(inliers)[0]:
+        keep = inliers.copy()
+        keep[i] = False
+        without = _fit(data, keep, solution)
+        e, t = _residuals(data.pick(np.arange(len(inliers)) == i), without.X_BC)
+        position[i], tilt[i] = float(e[0]), float(t[0])
+    return HeldOut(position, tilt)
+
+
+def _covariance_at_camera(solution: _Solution) -> Array:
+    """Move the tangent from the pivot to the camera origin."""
+    covariance = np.linalg.pinv(solution.information)
+    T = np.eye(6)
+    T[3:, :3] = -skew(np.asarray(solution.X_BC.translation()) - solution.pivot)
+    out = T @ covariance @ T.T
+    return np.asarray(0.5 * (out + out.T))

@@ -1,0 +1,1 @@
+"""What exists: arms, flanges, scanners, the soft tool, workpieces, scenarios."""

@@ -1,0 +1,1 @@
+"""Robot arms as numbers: kinematics, limits and masses."""

@@ -1,0 +1,310 @@
+"""An arm as numbers: Universal Robots' link transforms, limits and masses, and what follows from them at 500 Hz.
+
+Frames: B robot base as the controller means it (ROS `base_link` turned by pi about z), L_i the six link frames, F the
+flange (DH frame 6, z out of the flange), which is the last link frame. A link transform is the pose of link i's joint
+in link i-1 at zero angle, and the chain is their plain product: X_BF = prod_i X_{i-1,i}(0) RotZ(q_i). A robot's
+factory calibration has the same schema as the nominal numbers, so nothing else changes when one is given.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.yaml import yaml_load_file
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from weldcal.models.errors import InputError
+
+Array = NDArray[np.float64]
+
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+LINK_NAMES = ("base", *(f"{link}_link" for link in LINKS))
+JOINT_NAMES = (
+    "shoulder_pan_joint",
+    "shoulder_lift_joint",
+    "elbow_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+
+# Factory calibrations move the flange by millimetres; a file that moves it by more is another arm's or in other units.
+MAX_CALIBRATION_SHIFT_M = 0.05
+_POSE_KEYS = ("x", "y", "z", "roll", "pitch", "yaw")
+_HERE = Path(__file__).resolve().parent
+
+
+@dataclass(frozen=True)
+class DenavitHartenberg:
+    """Nominal Denavit-Hartenberg lengths of a UR arm (m); alpha = pi/2, 0, 0, pi/2, -pi/2, 0, all other terms 0."""
+
+    d1: float
+    a2: float
+    a3: float
+    d4: float
+    d5: float
+    d6: float
+
+
+@dataclass(frozen=True, eq=False)
+class ArmModel:
+    """One arm. Arrays are read-only; joint order is `joint_names`, link order is `link_names` (link 0 is the base).
+
+    stack is (6, 4, 4): the link transforms as homogeneous matrices, the one source of the kinematics. Limits are (6,)
+    in rad, rad/s, rad/s^2, Nm (the acceleration limits are a model choice, see joint_limits.yaml). masses (6,) kg,
+    centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
+    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m). calibration is
+    the hash of the factory calibration in use ("" if its file names none), or None for the nominal numbers.
+    """
+
+    name: str
+    joint_names: tuple[str, ...]
+    link_names: tuple[str, ...]
+    stack: Array
+    position_lower: Array
+    position_upper: Array
+    velocity_limit: Array
+    acceleration_limit: Array
+    effort_limit: Array
+    base_mass: float
+    base_radius: float
+    base_length: float
+    masses: Array
+    centers_of_mass: Array
+    inertias: Array
+    tube_offsets: tuple[float, float]
+    dh: DenavitHartenberg
+    calibration: str | None = None
+
+    @property
+    def transforms(self) -> tuple[RigidTransform, ...]:
+        """The six link transforms X_{i-1,i}(0)."""
+        return tuple(_rigid(X[:3, :3], X[:3, 3]) for X in self.stack)
+
+
+def known_arms() -> tuple[str, ...]:
+    """Names that `load_arm` accepts."""
+    return tuple(sorted(p.parent.name for p in _HERE.glob("*/default_kinematics.yaml")))
+
+
+def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
+    """The arm `name` with its nominal kinematics, or with a robot's factory calibration read from `kinematics`.
+
+    `kinematics` is a file of the schema of Universal Robots' ROS 2 description (top-level key `kinematics`; m, rad; an
+    optional `hash`). Its link frames are slid along their own joint axes to where the nominal ones lie, which changes
+    no flange pose and keeps masses and shapes in place even where the calibrated frames of nearly parallel axes lie
+    hundreds of metres away.
+
+    Raises:
+        InputError: unknown arm, or a kinematics file that is missing, malformed, non-finite, or of another arm.
+    """
+    if name not in known_arms():
+        raise InputError(f"There is no arm {name!r}; choose one of: {', '.join(known_arms())}.")
+    folder = _HERE / name
+    stack, _ = _read_kinematics(folder / "default_kinematics.yaml")
+    calibration: str | None = None
+    if kinematics is not None:
+        nominal = stack
+        stack, calibration = _read_kinematics(Path(kinematics))
+        stack = _slide_to_nominal(stack, nominal)
+        _require_same_arm(stack, nominal, name, Path(kinematics))
+    limits = _read(folder / "joint_limits.yaml", "joint_limits")
+    physical = folder / "physical_parameters.yaml"
+    inertia = _read(physical, "inertia_parameters")
+    dh = _read(physical, "dh_parameters")
+    offsets = _read(physical, "offsets")
+
+    def limit(key: str) -> Array:
+        return _frozen([_number(limits, joint, key) for joint in JOINT_NAMES])
+
+    rotations = [_rotation(*(_number(inertia, "rotation", link, k) for k in _POSE_KEYS[3:])) for link in LINKS]
+    tensors = [_tensor({k: _number(inertia, "tensor", link, k) for k in _TENSOR_KEYS}) for link in LINKS]
+    return ArmModel(
+        name=name,
+        joint_names=JOINT_NAMES,
+        link_names=LINK_NAMES,
+        stack=_frozen(stack),
+        position_lower=limit("min_position"),
+        position_upper=limit("max_position"),
+        velocity_limit=limit("max_velocity"),
+        acceleration_limit=limit("max_acceleration"),
+        effort_limit=limit("max_effort"),
+        base_mass=_number(inertia, "base_mass"),
+        base_radius=_number(inertia, "links", "base", "radius"),
+        base_length=_number(inertia, "links", "base", "length"),
+        masses=_frozen([_number(inertia, f"{link}_mass") for link in LINKS]),
+        centers_of_mass=_frozen(
+            [[_number(inertia, "center_of_mass", f"{link}_cog", k) for k in "xyz"] for link in LINKS]
+        ),
+        inertias=_frozen([R @ tensor @ R.T for R, tensor in zip(rotations, tensors, strict=True)]),
+        tube_offsets=(_number(offsets, "shoulder_offset"), _number(offsets, "elbow_offset")),
+        dh=DenavitHartenberg(**{k: _number(dh, k) for k in ("d1", "a2", "a3", "d4", "d5", "d6")}),
+        calibration=calibration,
+    )
+
+
+def forward_kinematics(arm: ArmModel, q: ArrayLike) -> RigidTransform:
+    """Flange pose X_BF at joint angles q (6,) rad; at 500 Hz use `kinematics_and_jacobian`, which builds no object."""
+    X = _chain(arm.stack, np.asarray(q, dtype=np.float64))[5]
+    return _rigid(X[:3, :3], X[:3, 3])
+
+
+def link_frames(arm: ArmModel, q: ArrayLike) -> list[RigidTransform]:
+    """Poses in B of the seven links of `arm.link_names` at q (6,) rad: the base (identity) first, the flange F last."""
+    chain = _chain(arm.stack, np.asarray(q, dtype=np.float64))
+    return [RigidTransform(), *(_rigid(X[:3, :3], X[:3, 3]) for X in chain)]
+
+
+def jacobian(arm: ArmModel, q: ArrayLike, p_FP: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """Geometric Jacobian (6, 6) of point P fixed in F: [omega_BF; v_BP] = J qdot, in axes of B."""
+    return kinematics_and_jacobian(arm, np.asarray(q, dtype=np.float64), np.asarray(p_FP, dtype=np.float64))[2]
+
+
+_ORIGIN = np.zeros(3)
+_ORIGIN.setflags(write=False)
+
+
+def kinematics_and_jacobian(arm: ArmModel, q: Array, p_FP: Array = _ORIGIN) -> tuple[Array, Array, Array]:
+    """R_BF (3, 3), p_BP (3,) m and the Jacobian J (6, 6) of P in B, from raw arrays, unchecked: the fast path.
+
+    J is geometric: column i is [z_i; z_i x (p_P - o_i)] with z_i, o_i the axis and origin of joint i
+    (Siciliano et al., Robotics, 2009, Eq. 3.30, with rotation first as Drake orders spatial vectors).
+    """
+    X = _chain(arm.stack, q)
+    R = X[5, :3, :3]
+    p = R @ p_FP + X[5, :3, 3]
+    z0, z1, z2 = z = X[:, :3, 2].T
+    r0, r1, r2 = p[:, None] - X[:, :3, 3].T
+    J = np.empty((6, 6))
+    J[:3] = z
+    J[3] = z1 * r2 - z2 * r1
+    J[4] = z2 * r0 - z0 * r2
+    J[5] = z0 * r1 - z1 * r0
+    return R, p, J
+
+
+def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
+    """Smallest singular value of J (6, 6) with its linear rows divided by `length` (m): distance from singularity.
+
+    A Jacobian mixes rad/s and m/s; `length` says how many metres of travel weigh as much as one radian of turning. The
+    default, 1 m, is about the reach of a UR10e and leaves the SI numbers as they are.
+    """
+    scaled = np.array(J, dtype=np.float64)
+    scaled[3:] /= length
+    return float(np.linalg.svd(scaled, compute_uv=False)[-1])
+
+
+def _chain(stack: Array, q: Array) -> Array:
+    """Poses (6, 4, 4) of the six links in B."""
+    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
+    x, y = stack[:, :, 0], stack[:, :, 1]
+    step = stack.copy()
+    step[:, :, 0] = x * c + y * s
+    step[:, :, 1] = y * c - x * s
+    for i in range(1, 6):
+        step[i] = step[i - 1] @ step[i]
+    return step
+
+
+def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
+    """The same chain with each frame but the last slid along its own joint axis, nearest to its nominal place.
+
+    A slide along z_i commutes with the rotation about z_i, so X_{i-1,i} RotZ(q_i) may be split on either side of it.
+    """
+    zero = np.zeros(6)
+    X, X_nominal = _chain(stack, zero), _chain(nominal, zero)
+    slide = np.einsum("ij,ij->i", X[:, :3, 2], X_nominal[:, :3, 3] - X[:, :3, 3])
+    slide[5] = 0.0
+    out = stack.copy()
+    out[:, :3, 3] += out[:, :3, 2] * slide[:, None]
+    out[1:, 2, 3] -= slide[:-1]
+    return out
+
+
+def _require_same_arm(stack: Array, nominal: Array, name: str, path: Path) -> None:
+    """Raise InputError where the calibrated flange strays far from the nominal one in some fixed set of postures."""
+    postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
+    shift = max(float(np.linalg.norm((_chain(stack, q) - _chain(nominal, q))[5, :3, 3])) for q in postures)
+    if shift > MAX_CALIBRATION_SHIFT_M:
+        raise InputError(
+            f"{path.name} moves the flange by {shift * 1e3:.0f} mm from a nominal {name}: "
+            f"give the calibration of a {name}, in metres and radians."
+        )
+
+
+def _read_kinematics(path: Path) -> tuple[Array, str]:
+    """Link transforms (6, 4, 4) and the calibration hash of a kinematics file."""
+    section = dict(_read(path, "kinematics"))
+    fingerprint = str(section.pop("hash", ""))
+    for found, wanted, where in [(section, LINKS, "kinematics")] + [
+        (section.get(link), _POSE_KEYS, f"kinematics.{link}") for link in LINKS
+    ]:
+        if not isinstance(found, Mapping) or set(found) != set(wanted):
+            raise InputError(f"{path.name}: give exactly the keys {', '.join(wanted)} under {where}.")
+    stack = np.tile(np.eye(4), (6, 1, 1))
+    for X, link in zip(stack, LINKS, strict=True):
+        x, y, z, roll, pitch, yaw = (_number(section, link, key, path=path) for key in _POSE_KEYS)
+        X[:3, :3] = _rotation(roll, pitch, yaw)
+        X[:3, 3] = x, y, z
+    return stack, fingerprint
+
+
+def _read(path: Path, section: str) -> Mapping[str, Any]:
+    """The mapping under the top-level key `section` of a YAML file."""
+    try:
+        data = yaml_load_file(str(path))  # type: ignore[no-untyped-call]
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); name an existing YAML file.") from error
+    except Exception as error:  # the YAML reader has no common base of its own that pydrake exports
+        raise InputError(
+            f"{path.name} is not a YAML file; write it as Universal Robots' ROS 2 description does."
+        ) from error
+    if not isinstance(data, Mapping) or not isinstance(data.get(section), Mapping):
+        raise InputError(
+            f"{path.name} has no section {section!r}; write it as Universal Robots' ROS 2 description does."
+        )
+    return dict(data[section])
+
+
+def _number(section: Mapping[str, Any], *keys: str, path: Path | None = None) -> float:
+    """A finite number at section[keys[0]][keys[1]]...; YAML 1.1 leaves 1e-05 as text, which is accepted."""
+    value: Any = section
+    for key in keys:
+        value = value.get(key) if isinstance(value, Mapping) else None
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not math.isfinite(number):
+        where = f"{path.name}: " if path else ""
+        raise InputError(f"{where}{'.'.join(keys)} must be a finite number, it is {value!r}.")
+    return number
+
+
+_TENSOR_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+
+
+def _tensor(t: Mapping[str, float]) -> Array:
+    return np.array(
+        [[t["ixx"], t["ixy"], t["ixz"]], [t["ixy"], t["iyy"], t["iyz"]], [t["ixz"], t["iyz"], t["izz"]]],
+    )
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> Array:
+    return np.asarray(RollPitchYaw(roll, pitch, yaw).ToRotationMatrix().matrix(), dtype=np.float64)
+
+
+def _rigid(R: Any, p: Any) -> RigidTransform:
+    return RigidTransform(RotationMatrix(R), p)
+
+
+def _frozen(values: ArrayLike) -> Array:
+    out = np.array(values, dtype=np.float64)
+    out.setflags(write=False)
+    return out

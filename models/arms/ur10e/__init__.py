@@ -1,0 +1,1 @@
+"""The UR10e: Universal Robots' published numbers."""

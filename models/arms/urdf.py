@@ -1,0 +1,244 @@
+"""An arm for Drake: URDF text with masses, limits, actuators and a plain body, and capsules around that body.
+
+Shapes are drawn in the link frames from the nominal lengths and stop 6 mm short of the flange plane: the flange disc
+itself is a mesh of its own, because calibration measures it. They are visual only; the capsules serve planning.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RollPitchYaw, RotationMatrix
+
+from weldcal.models.arms.kinematics import ArmModel
+
+Array = NDArray[np.float64]
+
+FLANGE_DISC_M = 0.006  # the last millimetres before the flange plane, left to the flange's own mesh
+WRIST_3_RADIUS_M = 0.045
+WRIST_3_LENGTH_M = 0.046
+
+_BODY = (0.80, 0.81, 0.82)
+_CAP = (0.35, 0.45, 0.55)
+_SEAL = (0.13, 0.14, 0.15)
+_COLOR_NAMES = {_BODY: "light_grey", _CAP: "blue_grey", _SEAL: "charcoal"}
+
+_BIG, _ELBOW, _WRIST = 0.076, 0.064, 0.0465  # housing radii of the three joint sizes
+_UPPER_TUBE, _FORE_TUBE = 0.061, 0.049
+_SEAL_LENGTH, _SEAL_INSET = 0.004, 0.001
+_DOME = 0.45  # height of a cap over its radius
+
+
+@dataclass(frozen=True, eq=False)
+class Capsule:
+    """All points within `radius` (m) of the segment p_start to p_end (3,) m, in a link's frame.
+
+    link_index counts as `link_frames` and `link_names` do: 0 the base, 6 wrist 3. A sphere has p_start = p_end.
+    """
+
+    link_index: int
+    p_start: Array
+    p_end: Array
+    radius: float
+
+
+@dataclass(frozen=True)
+class _Solid:
+    """A cylinder (along z of its frame) or an ellipsoid, posed in a link; `size` is radius and length, or semi-axes."""
+
+    link: int
+    kind: str
+    center: tuple[float, float, float]
+    rpy: tuple[float, float, float]
+    size: tuple[float, ...]
+    color: tuple[float, float, float]
+
+
+def arm_urdf(arm: ArmModel, model_name: str | None = None) -> str:
+    """URDF text of the arm: root link `base` (= frame B), six actuated joints, a massless link `flange` (= frame F).
+
+    Feed it to `Parser.AddModelsFromString(text, "urdf")` and weld `base` where the robot stands. Joint origins come
+    from the arm's own (nominal or calibrated) kinematics, so a plant's flange pose equals `forward_kinematics`.
+    """
+    robot = ET.Element("robot", {"name": model_name or arm.name, "xmlns:drake": "http://drake.mit.edu"})
+    for color, name in _COLOR_NAMES.items():
+        ET.SubElement(ET.SubElement(robot, "material", name=name), "color", rgba=_text((*color, 1.0)))
+    solids = _solids(arm)
+    r, h, m = arm.base_radius, arm.base_length, arm.base_mass
+    across, about = m * (3.0 * r * r + h * h) / 12.0, m * r * r / 2.0
+    inertials = [(m, np.array([0.0, 0.0, h / 2.0]), np.diag([across, across, about]))]
+    inertials += list(zip(arm.masses, arm.centers_of_mass, arm.inertias, strict=True))
+    for index, (name, inertial) in enumerate(zip(arm.link_names, inertials, strict=True)):
+        link = ET.SubElement(robot, "link", name=name)
+        _add_inertial(link, *inertial)
+        for solid in solids:
+            if solid.link == index:
+                _add_visual(link, solid)
+    ET.SubElement(robot, "link", name="flange")
+    for index, name in enumerate(arm.joint_names):
+        joint = ET.SubElement(robot, "joint", name=name, type="revolute")
+        X = arm.stack[index]
+        rpy = RollPitchYaw(RotationMatrix(X[:3, :3])).vector()
+        ET.SubElement(joint, "origin", xyz=_text(X[:3, 3]), rpy=_text(rpy))
+        ET.SubElement(joint, "parent", link=arm.link_names[index])
+        ET.SubElement(joint, "child", link=arm.link_names[index + 1])
+        ET.SubElement(joint, "axis", xyz="0 0 1")
+        limit = {
+            "lower": arm.position_lower,
+            "upper": arm.position_upper,
+            "velocity": arm.velocity_limit,
+            "drake:acceleration": arm.acceleration_limit,
+            "effort": arm.effort_limit,
+        }
+        ET.SubElement(joint, "limit", {key: repr(float(values[index])) for key, values in limit.items()})
+        transmission = ET.SubElement(robot, "transmission", name=f"{name}_transmission")
+        ET.SubElement(transmission, "type").text = "transmission_interface/SimpleTransmission"
+        ET.SubElement(transmission, "joint", name=name)
+        ET.SubElement(transmission, "actuator", name=name)
+    fixed = ET.SubElement(robot, "joint", name="flange_joint", type="fixed")
+    ET.SubElement(fixed, "parent", link=arm.link_names[-1])
+    ET.SubElement(fixed, "child", link="flange")
+    ET.indent(robot)
+    return ET.tostring(robot, encoding="unicode")
+
+
+def link_capsules(arm: ArmModel) -> list[Capsule]:
+    """Capsules (spheres included) that enclose the drawn body of every link, in link frames, for clearance checks."""
+    upper, fore, shoulder, elbow = arm.dh.a2, arm.dh.a3, *arm.tube_offsets
+    big, mid, small = _BIG + 0.004, _ELBOW + 0.004, _WRIST + 0.004
+    rows: list[tuple[int, ArrayLike, ArrayLike, float]] = [
+        (0, (0.0, 0.0, 0.01), (0.0, 0.0, 0.075), 0.1),
+        (1, (0.0, 0.0, -0.075), (0.0, 0.0, 0.0), big),
+        (1, (0.0, -0.08, 0.0), (0.0, 0.08, 0.0), big),
+        (2, (0.0, 0.0, shoulder - 0.08), (0.0, 0.0, shoulder + 0.08), big),
+        (2, (0.0, 0.0, shoulder), (upper, 0.0, shoulder), mid),
+        (2, (upper, 0.0, shoulder - 0.065), (upper, 0.0, shoulder + 0.07), mid),
+        (3, (0.0, 0.0, elbow - 0.065), (0.0, 0.0, elbow + 0.06), mid),
+        (3, (0.0, 0.0, elbow), (fore, 0.0, elbow), _FORE_TUBE + 0.008),
+        (3, (fore, 0.0, elbow - 0.055), (fore, 0.0, elbow + 0.05), small + 0.002),
+        (4, (0.0, 0.0, -0.08), (0.0, 0.0, 0.05), small),
+        (4, (0.0, 0.0, 0.0), (0.0, -0.06, 0.0), small),
+        (5, (0.0, 0.0, -0.055), (0.0, 0.0, 0.05), small),
+        (5, (0.0, 0.0, 0.0), (0.0, 0.06, 0.0), small),
+    ]
+    middle = (0.0, 0.0, -FLANGE_DISC_M - WRIST_3_LENGTH_M / 2.0)
+    rows.append((6, middle, middle, float(np.hypot(WRIST_3_RADIUS_M, WRIST_3_LENGTH_M / 2.0))))
+    return [Capsule(i, np.array(a, dtype=np.float64), np.array(b, dtype=np.float64), r) for i, a, b, r in rows]
+
+
+def _solids(arm: ArmModel) -> list[_Solid]:
+    """The drawn body: each joint has a housing on its axis, a seal where it turns, a domed cap at its blind end."""
+    upper, fore, shoulder, elbow = arm.dh.a2, arm.dh.a3, *arm.tube_offsets
+    elbow_split = 0.5 * (shoulder + elbow)  # where forearm meets upper arm, along the elbow axis
+    wrist_1_split = 0.5 * (elbow + arm.dh.d4) - 0.016
+    wrist_1_start = wrist_1_split - arm.dh.d4 + _SEAL_LENGTH
+    wrist_2_start = -arm.dh.d5 / 2.0 + _SEAL_LENGTH
+    wrist_3_start = -FLANGE_DISC_M - WRIST_3_LENGTH_M
+    wrist_2_end = arm.dh.d6 + wrist_3_start
+    return [
+        # Base: a foot, a step, the fixed half of the first joint.
+        _rod(0, "z", (0.0, 0.0), 0.0, 0.014, 0.095, _BODY),
+        _rod(0, "z", (0.0, 0.0), 0.014, 0.030, 0.083, _BODY),
+        _rod(0, "z", (0.0, 0.0), 0.030, 0.094, _BIG, _BODY),
+        _seal(0, "z", (0.0, 0.0), 0.094, _BIG),
+        # Shoulder: upright housing turning into the one along the lift axis (-y carries the arm).
+        _rod(1, "z", (0.0, 0.0), 0.097 - arm.dh.d1, 0.0, _BIG, _BODY),
+        _rod(1, "y", (0.0, 0.0), -0.085, 0.070, _BIG, _BODY),
+        _seal(1, "y", (0.0, 0.0), -0.088, _BIG),
+        *_cap(1, "y", (0.0, 0.0), 0.070, 1.0, _BIG),
+        # Upper arm: its own half of the lift joint, the tube with two collars, its half of the elbow.
+        _rod(2, "z", (0.0, 0.0), 0.088, shoulder + 0.070, _BIG, _BODY),
+        *_cap(2, "z", (0.0, 0.0), shoulder + 0.070, 1.0, _BIG),
+        _rod(2, "x", (0.0, shoulder), upper, 0.0, _UPPER_TUBE, _BODY),
+        _rod(2, "x", (0.0, shoulder), -0.112, -0.02, _UPPER_TUBE + 0.005, _BODY),
+        _rod(2, "x", (0.0, shoulder), upper + 0.02, upper + 0.098, _UPPER_TUBE + 0.0025, _BODY),
+        _rod(2, "z", (upper, 0.0), elbow_split + _SEAL_LENGTH, shoulder + 0.062, _ELBOW, _BODY),
+        _seal(2, "z", (upper, 0.0), elbow_split, _ELBOW),
+        *_cap(2, "z", (upper, 0.0), shoulder + 0.062, 1.0, _ELBOW),
+        # Forearm: elbow half, tube, and its half of wrist 1.
+        _rod(3, "z", (0.0, 0.0), elbow - 0.055, elbow_split, _ELBOW, _BODY),
+        *_cap(3, "z", (0.0, 0.0), elbow - 0.055, -1.0, _ELBOW),
+        _rod(3, "x", (0.0, elbow), fore, 0.0, _FORE_TUBE, _BODY),
+        _rod(3, "x", (0.0, elbow), -0.098, -0.02, _FORE_TUBE + 0.004, _BODY),
+        _rod(3, "z", (fore, 0.0), elbow - 0.048, wrist_1_split, _WRIST + 0.0045, _BODY),
+        *_cap(3, "z", (fore, 0.0), elbow - 0.048, -1.0, _WRIST + 0.0045),
+        _seal(3, "z", (fore, 0.0), wrist_1_split, _WRIST),
+        # Wrists 1 and 2: an elbow pipe each.
+        _rod(4, "z", (0.0, 0.0), wrist_1_start, 0.042, _WRIST, _BODY),
+        *_cap(4, "z", (0.0, 0.0), 0.042, 1.0, _WRIST),
+        _rod(4, "y", (0.0, 0.0), -arm.dh.d5 / 2.0, 0.0, _WRIST, _BODY),
+        _seal(5, "z", (0.0, 0.0), wrist_2_start - _SEAL_LENGTH, _WRIST),
+        _rod(5, "z", (0.0, 0.0), wrist_2_start, 0.042, _WRIST, _BODY),
+        *_cap(5, "z", (0.0, 0.0), 0.042, 1.0, _WRIST),
+        _rod(5, "y", (0.0, 0.0), 0.0, wrist_2_end - _SEAL_LENGTH, _WRIST, _BODY),
+        _seal(5, "y", (0.0, 0.0), wrist_2_end - _SEAL_LENGTH, WRIST_3_RADIUS_M),
+        # Wrist 3 ends where the flange disc begins.
+        _rod(6, "z", (0.0, 0.0), wrist_3_start, -FLANGE_DISC_M, WRIST_3_RADIUS_M, _BODY),
+    ]
+
+
+_ALONG = {"x": (0.0, np.pi / 2, 0.0), "y": (np.pi / 2, 0.0, 0.0), "z": (0.0, 0.0, 0.0)}
+
+
+def _at(axis: str, off_axis: tuple[float, float], along: float) -> tuple[float, float, float]:
+    """The point at `along` on a line parallel to `axis` that passes the other two coordinates at `off_axis`."""
+    a, b = off_axis
+    return {"x": (along, a, b), "y": (a, along, b), "z": (a, b, along)}[axis]
+
+
+def _rod(
+    link: int,
+    axis: str,
+    off_axis: tuple[float, float],
+    start: float,
+    end: float,
+    radius: float,
+    color: tuple[float, float, float],
+) -> _Solid:
+    center = _at(axis, off_axis, 0.5 * (start + end))
+    return _Solid(link, "cylinder", center, _ALONG[axis], (radius, end - start), color)
+
+
+def _seal(link: int, axis: str, off_axis: tuple[float, float], start: float, radius: float) -> _Solid:
+    return _rod(link, axis, off_axis, start, start + _SEAL_LENGTH, radius - _SEAL_INSET, _SEAL)
+
+
+def _cap(
+    link: int, axis: str, off_axis: tuple[float, float], start: float, sign: float, radius: float
+) -> tuple[_Solid, _Solid]:
+    """A low rim and a flat dome on the blind end of a housing, towards `sign` along `axis`."""
+    rim = 0.1 * radius
+    low, high = sorted((start, start + sign * rim))
+    dome = (0.9 * radius, 0.9 * radius, 0.9 * radius * _DOME - rim)
+    return (
+        _rod(link, axis, off_axis, low, high, 0.955 * radius, _CAP),
+        _Solid(link, "ellipsoid", _at(axis, off_axis, start + sign * rim), _ALONG[axis], dome, _CAP),
+    )
+
+
+def _add_inertial(link: ET.Element, mass: float, center: Array, inertia: Array) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    ET.SubElement(inertial, "origin", xyz=_text(center))
+    ET.SubElement(inertial, "mass", value=repr(float(mass)))
+    pairs = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
+    ET.SubElement(inertial, "inertia", {key: repr(float(inertia[ij])) for key, ij in pairs.items()})
+
+
+def _add_visual(link: ET.Element, solid: _Solid) -> None:
+    visual = ET.SubElement(link, "visual")
+    ET.SubElement(visual, "origin", xyz=_text(solid.center), rpy=_text(solid.rpy))
+    geometry = ET.SubElement(visual, "geometry")
+    if solid.kind == "cylinder":
+        radius, length = solid.size
+        ET.SubElement(geometry, "cylinder", radius=repr(float(radius)), length=repr(float(length)))
+    else:
+        sizes = {key: repr(float(value)) for key, value in zip("abc", solid.size, strict=True)}
+        ET.SubElement(geometry, "drake:ellipsoid", sizes)
+    ET.SubElement(visual, "material", name=_COLOR_NAMES[solid.color])
+
+
+def _text(values: ArrayLike) -> str:
+    return " ".join(repr(float(v)) for v in np.asarray(values, dtype=np.float64))

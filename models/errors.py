@@ -1,0 +1,11 @@
+"""The one base of every named exception: what a user can put right, in one sentence."""
+
+from __future__ import annotations
+
+
+class WeldcalError(Exception):
+    """A problem that the user can put right; its text is one clear sentence that says what to change."""
+
+
+class InputError(WeldcalError):
+    """Something that was handed in cannot be used as it is (a file, a number, a unit, a scenario)."""

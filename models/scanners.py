@@ -1,0 +1,197 @@
+"""3D scanners by name: intrinsics, working range and noise, and the depth maps they would return.
+
+One pixel convention everywhere: OpenCV's, the centre of the first pixel at (0, 0). `drake_intrinsics` is the only place
+that converts it to what Drake's camera wants.
+
+Sources: Photoneo's data sheets for the PhoXi 3D Scanner S and M (range, scan area at the optimum distance, calibration
+accuracy, temporal noise); one pixel spans the scan width over 2064, and pixels are square, so the image is as high as
+the sensor's shape makes it and not exactly the sheet's scan area. The MotionCam-3D M rows keep its published
+resolutions; their distances and noise are unconfirmed. Azure Kinect: Microsoft's specification of the narrow unbinned mode, and a
+repeatability of about 1 mm at 1 m.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from weldcal.models.depth_noise import Depth, DepthNoise, noisy_depth
+from weldcal.models.errors import InputError
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScannerPreset:
+    """A scanner: image size and intrinsics in pixels (OpenCV convention), working range in metres, and its noise."""
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near_m: float
+    far_m: float
+    optimum_m: float
+    noise: DepthNoise
+
+    @property
+    def K(self) -> Floats:
+        """(3,3) OpenCV camera matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def footprint_m(self, distance_m: float) -> tuple[float, float]:
+        """Width and height of the scanned area on a plane at that distance, m."""
+        return self.width * distance_m / self.fx, self.height * distance_m / self.fy
+
+    def resized(self, width: int, height: int | None = None) -> ScannerPreset:
+        """The same view in another resolution; the image corners, not the pixel centres, stay where they are."""
+        height = round(self.height * width / self.width) if height is None else height
+        if width < 8 or height < 8:
+            raise InputError("A scanner image needs at least 8 x 8 pixels: ask for a larger width and height.")
+        su, sv = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * su,
+            fy=self.fy * sv,
+            cx=(self.cx + 0.5) * su - 0.5,
+            cy=(self.cy + 0.5) * sv - 0.5,
+            noise=replace(self.noise, correlation_px=self.noise.correlation_px * su),
+        )
+
+
+@dataclass(frozen=True)
+class DrakeIntrinsics:
+    """What Drake's CameraInfo takes: focal lengths and principal point in pixels, image corner at (0, 0)."""
+
+    width: int
+    height: int
+    focal_x: float
+    focal_y: float
+    center_x: float
+    center_y: float
+
+
+def drake_intrinsics(preset: ScannerPreset) -> DrakeIntrinsics:
+    """The preset for Drake's RgbdSensor, which samples pixel (u, v) at (u + 0.5, v + 0.5): half a pixel more."""
+    return DrakeIntrinsics(preset.width, preset.height, preset.fx, preset.fy, preset.cx + 0.5, preset.cy + 0.5)
+
+
+def _by_area(
+    name: str, width: int, height: int, near: float, optimum: float, far: float, scan_width: float, noise: DepthNoise
+) -> ScannerPreset:
+    """A scanner with square pixels and a centred axis; its image spans `scan_width` metres at the optimum distance."""
+    f = width * optimum / scan_width
+    return ScannerPreset(name, width, height, f, f, 0.5 * (width - 1), 0.5 * (height - 1), near, far, optimum, noise)
+
+
+def _structured_light(sigma_m: float, optimum_m: float, correlation_px: float, flying: float) -> DepthNoise:
+    """Photoneo's structured light: few flying pixels, gaps at edges, nothing on grazing surfaces."""
+    return DepthNoise(
+        sigma_m=sigma_m,
+        reference_m=optimum_m,
+        correlation_px=correlation_px,
+        edge_step_m=0.004,
+        flying=flying,
+        edge_dropout=0.3,
+        grazing_rad=math.radians(78.0),
+        dropout=0.0005,
+        dark_dropout=0.9,
+        dark_gain=3.0,
+    )
+
+
+SCANNERS: dict[str, ScannerPreset] = {
+    preset.name: preset
+    for preset in (
+        _by_area("phoxi_s", 2064, 1544, 0.384, 0.442, 0.520, 0.360, _structured_light(5.0e-5, 0.442, 0.8, 0.05)),
+        _by_area("phoxi_m", 2064, 1544, 0.458, 0.650, 1.118, 0.590, _structured_light(1.0e-4, 0.650, 0.8, 0.05)),
+        _by_area(
+            "motioncam_3d_static", 1680, 1200, 0.497, 0.650, 0.939, 0.590, _structured_light(1.0e-4, 0.650, 0.8, 0.08)
+        ),
+        _by_area(
+            "motioncam_3d_motion", 1120, 800, 0.497, 0.650, 0.939, 0.590, _structured_light(2.5e-4, 0.650, 1.2, 0.15)
+        ),
+        ScannerPreset(
+            "azure_kinect",
+            640,
+            576,
+            504.0,
+            504.0,
+            319.5,
+            287.5,
+            0.5,
+            3.86,
+            1.0,
+            DepthNoise(
+                sigma_m=1.0e-3,
+                reference_m=1.0,
+                edge_step_m=0.02,
+                flying=0.7,
+                edge_dropout=0.1,
+                grazing_rad=math.radians(80.0),
+                dark_dropout=0.8,
+                dark_gain=3.0,
+                quantum_m=1.0e-3,
+            ),
+        ),
+        _by_area("ideal", 2064, 1544, 0.1, 0.650, 5.0, 0.590, DepthNoise()),
+    )
+}
+"""Every scanner known by name, in its full resolution."""
+
+
+def get_scanner(name: str, width: int | None = None, height: int | None = None) -> ScannerPreset:
+    """The named scanner, resized when a width (and height) is given; raises InputError naming the known ones."""
+    preset = SCANNERS.get(name.strip().lower().replace("-", "_"))
+    if preset is None:
+        raise InputError(f"Scanner '{name}' is not known: use one of {', '.join(SCANNERS)}.")
+    if width is None:
+        if height is not None:
+            raise InputError("A scanner is resized by its width: give the width too, or leave the height out.")
+        return preset
+    return preset.resized(width, height)
+
+
+def apply_noise(
+    depth: Depth,
+    preset: ScannerPreset,
+    rng: np.random.Generator,
+    dark: npt.NDArray[np.floating] | None = None,
+) -> Depth:
+    """What the scanner returns for a perfect depth map (H,W) in metres: float32, 0 where it measured nothing.
+
+    `dark` (H,W) from 0 to 1 says how dark the surface is. Depths outside the working range, before or after the noise,
+    are not measured. Raises InputError when the map or `dark` has not the preset's size.
+    """
+    expected = (preset.height, preset.width)
+    if depth.shape != expected or (dark is not None and dark.shape != expected):
+        raise InputError(
+            f"Scanner '{preset.name}' has images of {expected}: give a depth map (and dark) of that shape."
+        )
+    p = preset
+    out = noisy_depth(np.asarray(depth, dtype=np.float32), p.noise, p.fx, p.fy, p.cx, p.cy, rng, dark)
+    out[~((depth >= p.near_m) & (depth <= p.far_m) & (out >= p.near_m) & (out <= p.far_m))] = 0.0
+    return out
+
+
+def depth_to_points(depth: npt.NDArray[np.floating], fx: float, fy: float, cx: float, cy: float) -> Floats:
+    """Organised cloud (H,W,3) in the optical frame C, metres, NaN where the depth is 0, infinite or NaN.
+
+    Pixel (u, v) lies on the ray ((u - cx)/fx, (v - cy)/fy, 1): the OpenCV convention.
+    """
+    height, width = depth.shape
+    with np.errstate(invalid="ignore"):
+        z = np.where(np.isfinite(depth) & (depth > 0.0), depth, np.nan).astype(np.float64)
+    points = np.empty((height, width, 3))
+    points[..., 0] = z * ((np.arange(width) - cx) / fx)[None, :]
+    points[..., 1] = z * ((np.arange(height) - cy) / fy)[:, None]
+    points[..., 2] = z
+    return points

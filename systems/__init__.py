@@ -1,0 +1,1 @@
+"""Thin Drake LeafSystems over calibration and welding, the station and the cell Diagram."""

@@ -1,0 +1,97 @@
+"""ArucoDeformationEstimator: finger image in, how far the soft tip stands from its rest out."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.tool import FingerCamera, WeldingTool
+from weldcal.systems.messages import Image, Message
+from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.welding.deformation import TagModel, deflection_from_tag, detect_tag
+from weldcal.welding.servo_state import DeflectionSample
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Deformation(Message):
+    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose of its own moment; None before the first."""
+
+    sequence: int = 0
+    sample: DeflectionSample | None = None
+    reason: str = "no image yet"
+    reprojection_px: float = np.nan
+
+
+class ArucoDeformationEstimator(LeafSystem):
+    """Detects the tag in each new image and pairs its displacement with the arm's pose at the image's capture time.
+
+    .. pydrake_system::
+
+        name: ArucoDeformationEstimator
+        input_ports:
+        - image
+        - history
+        output_ports:
+        - deformation
+        - deflection
+
+    `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age s.
+    A frame without a trustworthy tag is passed on as invalid with its reason, never as an old value.
+    """
+
+    def __init__(self, arm: ArmModel, tool: WeldingTool, camera: FingerCamera, period_s: float = 0.008) -> None:
+        super().__init__()
+        self._arm, self._tool, self._K = arm, tool, camera.camera_matrix
+        self._tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
+        self._image = self.DeclareAbstractInputPort("image", AbstractValue.Make(Image()))
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(Deformation()))
+        ticket = {self.abstract_state_ticket(self._state)}
+        self.DeclareAbstractOutputPort("deformation", lambda: AbstractValue.Make(Deformation()), self._output, ticket)
+        self.DeclareVectorOutputPort("deflection", 5, self._vector, ticket | {self.time_ticket()})
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        image: Image = self._image.Eval(context)
+        newest: Deformation = context.get_abstract_state(self._state).get_value()
+        if image.sequence <= newest.sequence:
+            return
+        X_BF = self._history.Eval(context).pose_at(self._arm, image.capture_time)
+        if X_BF is None:
+            return
+        state.get_mutable_abstract_state(self._state).set_value(
+            measure_deformation(image, X_BF, self._tool, self._tag, self._K)
+        )
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())
+
+    def _vector(self, context: Context, output: BasicVector) -> None:
+        deformation: Deformation = context.get_abstract_state(self._state).get_value()
+        sample = deformation.sample
+        if sample is None:
+            output.SetFromVector([0.0, 0.0, 0.0, 0.0, np.inf])
+            return
+        age = context.get_time() - sample.capture_time
+        output.SetFromVector([*sample.deflection_T, float(sample.valid), age])
+
+
+def measure_deformation(
+    image: Image, X_BF: RigidTransform, tool: WeldingTool, tag: TagModel, camera_matrix: np.ndarray
+) -> Deformation:
+    """Tag detection and rest-pose difference for one image (grey (H, W)); invalid with a reason where the tag is not seen."""
+    seen = detect_tag(image.pixels, camera_matrix, tag)
+    X_BT = X_BF @ tool.X_FT
+    if not seen.valid or seen.X_KM is None:
+        sample = DeflectionSample(image.capture_time, X_BT, np.zeros(3), False)
+        return Deformation(image.sequence, sample, seen.reason)
+    R_TK = tool.X_FT.rotation().inverse() @ tool.X_FK.rotation()
+    deflection = deflection_from_tag(seen.X_KM, tool.X_KM_rest, R_TK)
+    sample = DeflectionSample(image.capture_time, X_BT, deflection, True)
+    return Deformation(image.sequence, sample, "", seen.reprojection_px)

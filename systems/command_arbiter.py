@@ -1,0 +1,40 @@
+"""CommandArbiter: one motion channel, so one of mover and servo drives, or neither."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from weldcal.systems.messages import JobCommand, UrStatus
+
+
+class CommandArbiter(LeafSystem):
+    """Passes on the velocity of whoever the job's mode names, and zero while the job or the robot holds.
+
+    .. pydrake_system::
+
+        name: CommandArbiter
+        input_ports:
+        - job
+        - robot_status
+        - mover_velocity
+        - servo_velocity
+        output_ports:
+        - velocity_wanted
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
+        self._mover = self.DeclareVectorInputPort("mover_velocity", 6)
+        self._servo = self.DeclareVectorInputPort("servo_velocity", 6)
+        self.DeclareVectorOutputPort("velocity_wanted", 6, self._choose)
+
+    def _choose(self, context: Context, output: BasicVector) -> None:
+        job: JobCommand = self._job.Eval(context)
+        if not self._status.Eval(context).ready or job.mode not in ("move", "weld"):
+            output.SetFromVector(np.zeros(6))
+        else:
+            output.SetFromVector((self._mover if job.mode == "move" else self._servo).Eval(context))

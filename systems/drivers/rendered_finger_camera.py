@@ -1,0 +1,129 @@
+"""The finger camera in simulation: the tag rendered as it moves with the soft tip, with noise and latency."""
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U, RgbdSensor
+
+from weldcal.models.tool import FingerCamera
+from weldcal.systems.drivers.simulated_world import FINGER_RENDERER
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.messages import Image, Message
+
+
+@dc.dataclass
+class RenderedFingerCamera:
+    """`!RenderedFingerCamera`: the camera in the tool, looking at the tag."""
+
+    width: int = 640
+    height: int = 480
+    focal_px: float = 450.0
+    rate_hz: float = 30.0
+    latency_s: float = 0.040
+    noise_grey: float = 2.0
+    hidden_from_s: float | None = None  # spatter on the lens: from this time after the camera started, the tag is not seen
+
+    def camera(self) -> FingerCamera:
+        """The camera as numbers."""
+        return FingerCamera(self.width, self.height, self.focal_px, self.rate_hz, self.latency_s, self.noise_grey)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class _Stream(Message):
+    """The newest frames, oldest first: some are still on their way through the latency."""
+
+    started: float = -np.inf
+    count: int = 0
+    frames: tuple[Image, ...] = (Image(),)
+
+
+class StreamingColourCamera(LeafSystem):
+    """Takes grey frames at the camera's rate while it is asked to stream.
+
+    .. pydrake_system::
+
+        name: StreamingColourCamera
+        input_ports:
+        - streaming
+        - color_image
+        output_ports:
+        - image
+        - capture_time
+
+    A frame shows the world as of the plant's last step, so that is the capture time it carries.
+    """
+
+    def __init__(self, config: RenderedFingerCamera, seed: int, plant_period_s: float) -> None:
+        super().__init__()
+        self._config = config
+        self._seed = seed
+        self._plant_period_s = plant_period_s
+        self._streaming = self.DeclareVectorInputPort("streaming", 1)
+        self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(config.width, config.height)))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(_Stream()))
+        ticket = {self.abstract_state_ticket(self._state), self.time_ticket()}
+        self.DeclareAbstractOutputPort("image", lambda: AbstractValue.Make(Image()), self._image, ticket)
+        self.DeclareVectorOutputPort("capture_time", 1, self._capture_time, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / config.rate_hz, 0.0, self._expose)
+
+    def _expose(self, context: Context, state: State) -> None:
+        stream: _Stream = context.get_abstract_state(self._state).get_value()
+        if self._streaming.Eval(context)[0] < 0.5:
+            return
+        now = context.get_time()
+        started = stream.started if np.isfinite(stream.started) else now
+        hidden = self._config.hidden_from_s is not None and now - started >= self._config.hidden_from_s
+        rng = np.random.default_rng([self._seed, stream.count])
+        shape = (self._config.height, self._config.width)
+        if hidden:
+            grey = np.full(shape, 25.0)
+        else:
+            rgba = self._color.Eval(context).data
+            grey = rgba[:, :, 1].astype(np.float32)  # the tag is black on white: one channel says it all
+        noisy = np.clip(grey + self._config.noise_grey * rng.standard_normal(shape, dtype=np.float32), 0, 255).astype(np.uint8)
+        step = self._plant_period_s
+        taken = np.floor(now / step + 1e-6) * step
+        frame = Image(sequence=stream.count + 1, capture_time=taken, pixels=noisy)
+        kept = 2 + int(self._config.latency_s * self._config.rate_hz)  # enough to look back through the latency
+        new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
+        state.get_mutable_abstract_state(self._state).set_value(new)
+
+    def _arrived(self, context: Context) -> Image:
+        stream: _Stream = context.get_abstract_state(self._state).get_value()
+        now = context.get_time()
+        ripe = [f for f in stream.frames if now >= f.capture_time + self._config.latency_s - 1e-9]
+        return ripe[-1] if ripe else Image()
+
+    def _image(self, context: Context, output: Any) -> None:
+        output.set_value(self._arrived(context))
+
+    def _capture_time(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, self._arrived(context).capture_time)
+
+
+def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None:
+    """Mount a colour camera in the tool and stream it."""
+    world, tool = build.simulated_world(), build.tool
+    if tool is None or world.tool is None:
+        return
+    camera = config.camera()
+    K = camera.camera_matrix
+    info = CameraInfo(config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)  # half pixel: VTK's convention
+    core = RenderCameraCore(FINGER_RENDERER, info, ClippingRange(0.005, 0.5), RigidTransform())
+    color, depth = ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.01, 0.4))
+    plate = world.plant.GetBodyByName("tool_plate", world.tool)
+    frame = world.plant.GetBodyFrameIdOrThrow(plate.index())
+    sensor = build.builder.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
+    sensor.set_name("finger_camera_colour")
+    stream = build.builder.AddSystem(StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step()))
+    stream.set_name("finger_camera")
+    build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    build.builder.Connect(sensor.color_image_output_port(), stream.GetInputPort("color_image"))
+    build.inputs["finger_camera.streaming"] = stream.GetInputPort("streaming")
+    build.outputs["finger_camera.image"] = stream.GetOutputPort("image")
+    build.outputs["finger_camera.capture_time"] = stream.GetOutputPort("capture_time")

@@ -1,0 +1,117 @@
+"""A structured-light scanner in simulation: depth rendering at the real geometry, then the scanner's own noise."""
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from pydrake.common.eigen_geometry import AngleAxis
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, RgbdSensor
+
+from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
+from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.messages import Scan
+
+
+@dc.dataclass
+class RenderedScanner:
+    """`!RenderedScanner`: where the simulated scanner truly stands, and what it is."""
+
+    preset: str = "phoxi_m"
+    width: int | None = 824  # 0.5 Mpx; null: the scanner's full resolution
+    height: int | None = 616
+    xyz_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.95])  # nominal X_BC
+    rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, -90.0])
+    mounting_translation_mm: float = 15.0  # the true pose differs from the nominal one by this much, drawn from the seed
+    mounting_rotation_deg: float = 1.5
+    exposure_s: float = 0.25  # from the trigger to the cloud
+
+
+def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
+    """A pose error of exactly this size in a random direction."""
+    axis, direction = rng.normal(size=3), rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    direction /= np.linalg.norm(direction)
+    return RigidTransform(RotationMatrix(AngleAxis(rotation_rad, axis)), translation_m * direction)
+
+
+class TriggeredDepthScanner(LeafSystem):
+    """Takes one noisy organised cloud per trigger.
+
+    .. pydrake_system::
+
+        name: TriggeredDepthScanner
+        input_ports:
+        - trigger
+        - depth_image
+        output_ports:
+        - scan
+
+    `trigger` (1) is the sequence number of the newest scan that was asked for; when it grows, the depth image is rendered,
+    the scanner's noise is added from the seed and the sequence number, and the cloud appears on `scan` after the exposure.
+    """
+
+    def __init__(self, preset: ScannerPreset, seed: int, exposure_s: float, period_s: float = 0.02) -> None:
+        super().__init__()
+        self._preset = preset
+        self._seed = seed
+        self._exposure_s = exposure_s
+        self._trigger = self.DeclareVectorInputPort("trigger", 1)
+        self._depth = self.DeclareAbstractInputPort(
+            "depth_image", AbstractValue.Make(ImageDepth32F(preset.width, preset.height))
+        )
+        self._shown = self.DeclareAbstractState(AbstractValue.Make(Scan()))
+        self._pending = self.DeclareAbstractState(AbstractValue.Make(Scan()))
+        self.DeclareAbstractOutputPort(
+            "scan", lambda: AbstractValue.Make(Scan()), self._output, {self.abstract_state_ticket(self._shown)}
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        shown: Scan = context.get_abstract_state(self._shown).get_value()
+        pending: Scan = context.get_abstract_state(self._pending).get_value()
+        now = context.get_time()
+        if pending.sequence > shown.sequence and now >= pending.capture_time + self._exposure_s - 1e-9:
+            state.get_mutable_abstract_state(self._shown).set_value(pending)
+        wanted = int(self._trigger.Eval(context)[0])
+        if wanted > pending.sequence:
+            depth = np.array(self._depth.Eval(context).data[:, :, 0])
+            rng = np.random.default_rng([self._seed, wanted])
+            noisy = apply_noise(np.where(np.isfinite(depth), depth, 0.0), self._preset, rng)
+            p = self._preset
+            points = depth_to_points(noisy, p.fx, p.fy, p.cx, p.cy).astype(np.float32)
+            scan = Scan(sequence=wanted, capture_time=now, points_C=points)
+            state.get_mutable_abstract_state(self._pending).set_value(scan)
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._shown).get_value())
+
+
+def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
+    """Stand a depth camera in the world at its true pose (known to `cheat.X_BC` alone) and add the scanner behind it."""
+    world = build.simulated_world()
+    preset = get_scanner(config.preset, width=config.width, height=config.height)
+    nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
+    error = random_pose_error(build.rng, config.mounting_translation_mm * 1e-3, np.deg2rad(config.mounting_rotation_deg))
+    X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
+    k = drake_intrinsics(preset)
+    core = RenderCameraCore(
+        SCANNER_RENDERER,
+        CameraInfo(k.width, k.height, k.focal_x, k.focal_y, k.center_x, k.center_y),
+        ClippingRange(0.05, 5.0),
+        RigidTransform(),
+    )
+    camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
+    sensor = build.builder.AddSystem(RgbdSensor(world.scene_graph.world_frame_id(), X_BC, camera))
+    sensor.set_name("scanner_depth")
+    scanner = build.builder.AddSystem(TriggeredDepthScanner(preset, int(build.rng.integers(2**31)), config.exposure_s))
+    scanner.set_name("scanner")
+    build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    build.builder.Connect(sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))
+    build.inputs["scanner.trigger"] = scanner.GetInputPort("trigger")
+    build.outputs["scanner.scan"] = scanner.GetOutputPort("scan")
+    return X_BC

@@ -1,0 +1,230 @@
+"""The simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant, with what its cameras see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddContactMaterial,
+    AddRigidHydroelasticProperties,
+    Box,
+    Cylinder,
+    InMemoryMesh,
+    MakeRenderEngineVtk,
+    Mesh,
+    ProximityProperties,
+    RenderEngineVtkParams,
+    SceneGraph,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    JointActuatorIndex,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+)
+from pydrake.systems.controllers import InverseDynamics
+from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.flanges import flange_mesh, get_flange
+from weldcal.models.mesh import TriMesh
+from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.messages import Message
+from weldcal.welding.deformation import TagModel, tag_cells
+
+SCANNER_RENDERER = "scanner"
+FINGER_RENDERER = "finger"
+STEEL = (0.62, 0.64, 0.67, 1.0)
+DARK = (0.16, 0.18, 0.21, 1.0)
+COPPER = (0.80, 0.45, 0.20, 1.0)
+SOFT = (0.18, 0.42, 0.62, 1.0)
+TABLE = (0.36, 0.38, 0.40, 1.0)
+TIP_FRICTION = 0.2  # soft tip on steel
+
+
+@dataclass(frozen=True)
+class SimulatedWorld(Message):
+    """Handles into the plant that drivers and `cheat.*` ports need."""
+
+    plant: MultibodyPlant
+    scene_graph: SceneGraph
+    arm: ModelInstanceIndex
+    tool: ModelInstanceIndex | None
+    tip_joints: tuple[PrismaticJoint, ...]
+
+
+def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
+    """A Drake Mesh of a TriMesh, kept in memory."""
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents=mesh.to_obj(), extension=".obj", filename_hint=name)))
+
+
+def _show(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]) -> None:
+    """Give a body something to see, in Meshcat and in the rendered images alike."""
+    plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
+
+
+def _add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> None:
+    """The ISO 9409-1 flange: its face in the flange frame's plane, its back inside the wrist."""
+    body = plant.GetBodyByName("flange", arm)
+    shape = mesh_shape(flange_mesh(get_flange(flange), thickness_m=0.012), "flange.obj")
+    _show(plant, body, RigidTransform(), shape, "iso_flange", STEEL)
+
+
+def _tag_mesh(tag: TagModel) -> TriMesh:
+    """The dark cells of the tag as one mesh of quads in the marker frame (x right, y up, z out of the print)."""
+    dark = ~tag_cells(tag)
+    n = dark.shape[0]
+    cell = tag.size_m / n
+    vertices: list[tuple[float, float, float]] = []
+    triangles: list[tuple[int, int, int]] = []
+    for row, column in np.argwhere(dark):
+        x0, y0 = -tag.size_m / 2 + column * cell, tag.size_m / 2 - row * cell
+        k = len(vertices)
+        vertices += [(x0, y0, 0.0), (x0 + cell, y0, 0.0), (x0 + cell, y0 - cell, 0.0), (x0, y0 - cell, 0.0)]
+        triangles += [(k, k + 2, k + 1), (k, k + 3, k + 2)]
+    return TriMesh(np.array(vertices), np.array(triangles))
+
+
+def _add_tool(
+    plant: MultibodyPlant, arm: ModelInstanceIndex, tool: WeldingTool, contact_hint_m: float
+) -> tuple[ModelInstanceIndex, tuple[PrismaticJoint, ...]]:
+    """Plate, ring, camera, torch (welded to the flange) and the soft tip on three sprung prismatic joints."""
+    instance = plant.AddModelInstance("tool")
+    flange_frame = plant.GetFrameByName("flange", arm)
+    inertia = SpatialInertia(tool.mass_kg, np.array([0.03, 0.0, 0.05]), UnitInertia.SolidBox(0.25, 0.08, 0.12).ShiftFromCenterOfMass(
+        np.array([-0.03, 0.0, -0.05])))
+    plate = plant.AddRigidBody("tool_plate", instance, inertia)
+    plant.WeldFrames(flange_frame, plate.body_frame())
+    t, r = tool.plate_thickness_m, tool.ring_offset_m
+    ring = flange_mesh(get_flange("tool-ring-63"), thickness_m=tool.ring_height_m)
+    _show(plant, plate, RigidTransform([0.0, 0.0, t / 2]), Cylinder(0.0375, t), "mount", DARK)
+    _show(plant, plate, RigidTransform([r / 2, 0.0, t / 2]), Box(r, 0.064, t), "bar", DARK)
+    _show(plant, plate, RigidTransform([r, 0.0, t / 2]), Cylinder(0.0375, t), "ring_base", DARK)
+    _show(plant, plate, tool.X_FR, mesh_shape(ring, "ring.obj"), "flange_like_ring", STEEL)
+    camera_z = tool.X_FK.translation()[2]
+    _show(plant, plate, RigidTransform([0.0, 0.0, t + (camera_z - 0.006 - t) / 2]), Box(0.026, 0.026, camera_z - 0.006 - t), "camera", DARK)
+    for side in (-1.0, 1.0):  # the frame that carries the soft metamaterial, outside the camera's view
+        _show(plant, plate, RigidTransform([0.0, side * 0.034, (t + tool.tag_reach_m) / 2]), Box(0.012, 0.004, tool.tag_reach_m - t), f"post{side:+.0f}", DARK)
+    p_FW = tool.X_FT @ tool.p_TW
+    length = p_FW[2] - 0.012 - t
+    _show(plant, plate, RigidTransform([p_FW[0] / 2 - 0.01, 0.0, t / 2 + t]), Box(-p_FW[0] + 0.02, 0.03, t), "torch_arm", DARK)
+    _show(plant, plate, RigidTransform([p_FW[0], 0.0, t + length / 2]), Cylinder(0.009, length), "torch_body", COPPER)
+    _show(plant, plate, RigidTransform([p_FW[0], 0.0, p_FW[2] - 0.006]), Cylinder(0.0006, 0.012), "torch_wire", STEEL)
+
+    # Three prismatic joints in series carry the tip; the springs are implicit PD, stable at 2 ms with a mass of grams.
+    parent = plant.AddFrame(_fixed_offset(plant, "tip_rest", plate, tool.X_FT))
+    small = SpatialInertia(tool.tip_mass_kg / 3, np.zeros(3), UnitInertia.SolidSphere(0.01))
+    joints: list[PrismaticJoint] = []
+    body = plate
+    for axis, name in enumerate("xyz"):
+        body = plant.AddRigidBody(f"tip_{name}", instance, small)
+        direction = np.eye(3)[axis]
+        joint = plant.AddJoint(PrismaticJoint(f"tip_{name}", parent, body.body_frame(), direction, -0.012, 0.012, 0.0))
+        actuator = plant.AddJointActuator(f"tip_{name}", joint)
+        stiffness = tool.axial_stiffness_N_per_m if name == "z" else tool.lateral_stiffness_N_per_m
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=tool.damping_N_s_per_m))
+        joints.append(joint)
+        parent = body.body_frame()
+
+    radius, reach = tool.tip_radius_m, tool.tip_reach_m - tool.tag_reach_m
+    _show(plant, body, RigidTransform(), Sphere(radius), "tip", SOFT)
+    _show(plant, body, RigidTransform([0.0, 0.0, reach / 2 - 0.003]), Cylinder(0.0022, reach - 0.006), "finger", SOFT)
+    _show(plant, body, RigidTransform([0.0, 0.0, reach - 0.0015]), Cylinder(0.026, 0.002), "membrane", SOFT)
+    tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
+    X_TM = RigidTransform([0.0, 0.0, reach])
+    _show(plant, body, X_TM @ RigidTransform([0.0, 0.0, -0.0003]), Box(0.016, 0.016, 0.0005), "tag_white", (1.0, 1.0, 1.0, 1.0))
+    _show(plant, body, X_TM, mesh_shape(_tag_mesh(tag), "tag.obj"), "tag_dark", (0.02, 0.02, 0.02, 1.0))
+    contact = ProximityProperties()
+    AddContactMaterial(dissipation=1.0, friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=contact)
+    AddCompliantHydroelasticProperties(resolution_hint=contact_hint_m, hydroelastic_modulus=5e6, properties=contact)
+    plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), "tip_contact", contact)
+    return instance, tuple(joints)
+
+
+def _compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
+    """The controller's feed-forward: joint torques against gravity, so that the servos need not sag to find them.
+
+    Gravity stays on: an arm at rest without any force leaves the contact solver no scale to converge by.
+    """
+    feed_forward = builder.AddSystem(InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
+    feed_forward.set_name("gravity_compensation")
+    builder.Connect(plant.get_state_output_port(), feed_forward.get_input_port_estimated_state())
+    split = builder.AddSystem(Demultiplexer([plant.num_actuated_dofs(m) for m in models]))
+    builder.Connect(feed_forward.get_output_port_generalized_force(), split.get_input_port())
+    for k, model in enumerate(models):
+        builder.Connect(split.get_output_port(k), plant.get_actuation_input_port(model))
+
+
+def _fixed_offset(plant: MultibodyPlant, name: str, body: RigidBody, X: RigidTransform) -> FixedOffsetFrame:
+    return FixedOffsetFrame(name, body.body_frame(), X, body.model_instance())
+
+
+def build_world(
+    builder: DiagramBuilder,
+    arm: ArmModel,
+    tool: WeldingTool | None,
+    robot: SimulatedUr,
+    q_home: np.ndarray,
+    *,
+    flange: str,
+    table_z_m: float,
+    workpiece: Workpiece | None,
+    X_BP: RigidTransform | None,
+    time_step_s: float = 0.002,
+) -> SimulatedWorld:
+    """Build the plant with everything the station needs; the arm hangs in its implicit joint servos.
+
+    Frame: the world is the robot base B. `workpiece` is the real part (it may differ from its CAD), placed at X_BP.
+    """
+    plant, scene_graph = AddMultibodyPlant(
+        MultibodyPlantConfig(
+            time_step=time_step_s,
+            contact_model="hydroelastic",
+            discrete_contact_approximation="lagged",  # with `sap` the tip's rest position depends on the sliding speed
+        ),
+        builder,
+    )
+    for name in (SCANNER_RENDERER, FINGER_RENDERER):
+        scene_graph.AddRenderer(name, MakeRenderEngineVtk(RenderEngineVtkParams()))
+    (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
+    _add_flange(plant, instance, flange)
+    tool_instance, tip_joints = (None, ()) if tool is None else _add_tool(plant, instance, tool, tool.tip_radius_m / 2)
+    world_body = plant.world_body()
+    _show(plant, world_body, RigidTransform([0.45, 0.0, table_z_m - 0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    if workpiece is not None and X_BP is not None:
+        _show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
+        rigid = ProximityProperties()
+        AddContactMaterial(friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=rigid)
+        AddRigidHydroelasticProperties(resolution_hint=0.002, properties=rigid)
+        plant.RegisterCollisionGeometry(world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid)
+    for k in range(6):  # by index: the indices of one model instance are not known before Finalize
+        servo = plant.get_joint_actuator(JointActuatorIndex(k))
+        servo.set_controller_gains(PdControllerGains(p=robot.stiffness[k], d=robot.damping[k]))
+    plant.Finalize()
+    actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
+    if len(actuators) != 6 or not all(a.has_controller() for a in actuators):
+        raise RuntimeError("the six joint servos of the arm are not in place")
+    plant.SetDefaultPositions(instance, q_home)
+    _compensate_gravity(builder, plant, [m for m in (instance, tool_instance) if m is not None])
+    if tool_instance is not None:
+        rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
+        rest.set_name("tip_at_rest")
+        builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
+    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints)

@@ -1,0 +1,99 @@
+"""FlangeEstimator: a scan in, the circle of the flange (or of the tool's flange-like ring) out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem, State
+
+from weldcal.calibration.flange_fit import FlangeGuess, FlangeNotFound, fit_flange
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
+from weldcal.systems.pose_recorder import PoseHistory
+
+
+class FlangeEstimator(LeafSystem):
+    """Fits the flange in each calibration scan, near where the present belief expects it.
+
+    .. pydrake_system::
+
+        name: FlangeEstimator
+        input_ports:
+        - scan
+        - job
+        - history
+        - calibration_status
+        output_ports:
+        - flange_estimate
+
+    The search ball is centred where the newest X_BC (at first the tape-measure guess) and the arm's pose at the capture
+    time put the feature.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        X_FR: RigidTransform,
+        standard: FlangeStandard,
+        X_BC_guess: RigidTransform,
+        guess_radius_m: float,
+        period_s: float = 0.02,
+    ) -> None:
+        super().__init__()
+        self._arm, self._X_FR, self._standard = arm, X_FR, standard
+        self._X_BC_guess, self._guess_radius_m = X_BC_guess, guess_radius_m
+        self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+        self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(FlangeEstimate()))
+        self.DeclareAbstractOutputPort(
+            "flange_estimate", lambda: AbstractValue.Make(FlangeEstimate()), self._output, {self.abstract_state_ticket(self._state)}
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        scan: Scan = self._scan.Eval(context)
+        job: JobCommand = self._job.Eval(context)
+        newest: FlangeEstimate = context.get_abstract_state(self._state).get_value()
+        if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose == "workpiece":
+            return
+        status: CalibrationStatus = self._status.Eval(context)
+        X_BF = self._history.Eval(context).pose_at(self._arm, scan.capture_time)
+        estimate = estimate_flange(
+            scan, job, X_BF, self._X_FR, self._standard, status.X_BC or self._X_BC_guess, self._guess_radius_m
+        )
+        state.get_mutable_abstract_state(self._state).set_value(estimate)
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())
+
+
+def estimate_flange(
+    scan: Scan,
+    job: JobCommand,
+    X_BF: RigidTransform | None,
+    X_FR: RigidTransform,
+    standard: FlangeStandard,
+    X_BC: RigidTransform,
+    guess_radius_m: float,
+) -> FlangeEstimate:
+    """Fit the feature in one scan; a scan that cannot be used comes back with its reason, never as an exception."""
+    base = dict(sequence=scan.sequence, capture_time=scan.capture_time, purpose=job.scan_purpose, label=job.scan_label)
+    if X_BF is None:
+        return FlangeEstimate(**base, reason="the arm's pose at the time of the scan is not known")
+    X_CR = X_BC.InvertAndCompose(X_BF @ X_FR)
+    radius = guess_radius_m + 0.5 * standard.outer_m
+    guess = FlangeGuess(center_C=X_CR.translation(), radius_m=radius, normal_C=X_CR.rotation().matrix()[:, 2])
+    try:
+        fit = fit_flange(scan.points_C, standard, guess=guess)
+    except FlangeNotFound as error:
+        return FlangeEstimate(**base, reason=str(error))
+    points = scan.points_C.reshape(-1, 3).astype(float)
+    points = points[np.all(np.isfinite(points), axis=1)]
+    near = np.linalg.norm(points - fit.center_C, axis=1) < 0.75 * standard.outer_m
+    return FlangeEstimate(**base, fit=fit, points_C=points[near])

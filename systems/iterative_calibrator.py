@@ -1,0 +1,149 @@
+"""IterativeCalibrator: one flange estimate after the other into X_BC, until its own error is small enough."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem, State
+
+from weldcal.calibration.iterative import Algorithm1State, algorithm1_start, algorithm1_step, translation_and_rotation_cost, translation_cost
+from weldcal.calibration.observation import Observation, observation_from_fit
+from weldcal.calibration.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
+from weldcal.calibration.verification import make_verification
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.errors import WeldcalError
+from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
+from weldcal.systems.pose_recorder import PoseHistory
+
+
+WORK_RADIUS_M = 0.2  # of the cost metric that adds the rotation's displacement at this distance
+
+
+@dc.dataclass(frozen=True)
+class CalibratorConfig:
+    """When the live calibration may stop (m), and where its error counts: the work point p_BWork (3,) in B."""
+
+    required_error_m: float
+    minimum_scans: int
+    maximum_scans: int
+    p_BWork: NDArray[np.float64]
+    cost: str = "translation"
+
+
+class IterativeCalibrator(LeafSystem):
+    """Keeps Algorithm 1's pool of four and, beside it, the robust estimate from all scans, which is the one that is used.
+
+    .. pydrake_system::
+
+        name: IterativeCalibrator
+        input_ports:
+        - flange_estimate
+        - history
+        output_ports:
+        - calibration_status
+
+    It is done when the estimate's own expected error at the work point is within what is required; Algorithm 1's figure is
+    kept to be shown, because it cannot see the error it leaves (docs/calibration.md).
+    """
+
+    def __init__(
+        self, arm: ArmModel, X_FR: RigidTransform, standard: FlangeStandard, config: CalibratorConfig, period_s: float = 0.02
+    ) -> None:
+        super().__init__()
+        self._arm, self._X_FR, self._config = arm, X_FR, config
+        self._standard = standard
+        self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(CalibrationStatus()))
+        self.DeclareAbstractOutputPort(
+            "calibration_status",
+            lambda: AbstractValue.Make(CalibrationStatus()),
+            self._output,
+            {self.abstract_state_ticket(self._state)},
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def status(self, context: Context) -> CalibrationStatus:
+        """The newest status in this system's context."""
+        status: CalibrationStatus = context.get_abstract_state(self._state).get_value()
+        return status
+
+    def _update(self, context: Context, state: State) -> None:
+        estimate: FlangeEstimate = self._estimate.Eval(context)
+        status = self.status(context)
+        if estimate.sequence <= status.sequence:
+            return
+        X_BF = self._history.Eval(context).pose_at(self._arm, estimate.capture_time)
+        X_BR = None if X_BF is None else X_BF @ self._X_FR
+        new = digest(status, estimate, X_BR, self._standard, self._config)
+        state.get_mutable_abstract_state(self._state).set_value(new)
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(self.status(context))
+
+
+def digest(
+    status: CalibrationStatus,
+    seen: FlangeEstimate,
+    X_BR: RigidTransform | None,
+    standard: FlangeStandard,
+    config: CalibratorConfig,
+) -> CalibrationStatus:
+    """The status after one more flange estimate; a scan that cannot be used is refused by name with its reason."""
+    counts = seen.purpose == "calibrate"
+    status = dc.replace(status, sequence=seen.sequence, calibration_scans=status.calibration_scans + int(counts))
+    if seen.fit is None or X_BR is None:
+        reason = seen.reason or "the arm's pose at the time of the scan is not known"
+        return dc.replace(status, refused=(*status.refused, (seen.label, reason)), message=reason)
+    if seen.purpose == "verification_cloud" and seen.points_C is not None:
+        return dc.replace(status, verification_cloud=make_verification(seen.points_C, X_BR, standard))
+    if seen.purpose == "verify":
+        return dc.replace(status, verifications=(*status.verifications, verify_at(status, seen, X_BR)))
+    observation = observation_from_fit(seen.label, X_BR, seen.fit)
+    observations = (*status.observations, observation)
+    status = dc.replace(status, observations=observations, algorithm_1=_algorithm_1(status, observation, config))
+    try:
+        estimate = estimate_eye_on_base(observations)
+    except WeldcalError as error:
+        return dc.replace(status, message=str(error))
+    predicted = expected_error(estimate, config.p_BWork)
+    figure = status.algorithm_1.cost if status.algorithm_1 is not None else np.nan
+    held_out = float(np.median(estimate.held_out.position_m))
+    return dc.replace(
+        status,
+        estimate=estimate,
+        predicted_error_m=predicted,
+        history=(*status.history, (len(observations), predicted, held_out, figure)),
+        done=len(observations) >= config.minimum_scans and predicted <= config.required_error_m,
+        message="",
+    )
+
+
+def expected_error(estimate: CalibrationEstimate, p_BWork: NDArray[np.float64]) -> float:
+    """Expected error (m, rms) of the base position of a point seen at the work point, from the estimate's covariance."""
+    return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BWork))))
+
+
+def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransform) -> VerificationResult:
+    """Position error (m) and tilt (rad) of the calibration at one scan it never saw."""
+    if status.estimate is None or seen.fit is None:
+        return VerificationResult(seen.label, np.inf, np.inf)
+    X_BC = status.estimate.X_BC
+    error = float(np.linalg.norm(X_BC @ seen.fit.center_C - X_BR.translation()))
+    cosine = float(np.dot(X_BC.rotation().matrix() @ seen.fit.normal_C, X_BR.rotation().matrix()[:, 2]))
+    return VerificationResult(seen.label, error, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def _algorithm_1(status: CalibrationStatus, observation: Observation, config: CalibratorConfig) -> Algorithm1State | None:
+    """One step of the published algorithm, where its verification cloud was seen."""
+    if status.verification_cloud is None:
+        return None
+    cost = translation_cost if config.cost == "translation" else translation_and_rotation_cost(WORK_RADIUS_M)
+    state = status.algorithm_1 or algorithm1_start(config.required_error_m, config.maximum_scans)
+    return algorithm1_step(state, observation, status.verification_cloud, cost)

@@ -1,0 +1,310 @@
+"""JobSequencer: calibrate, verify, scan, plan, approach, weld, retract; or hold, and say why."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from weldcal.systems.calibration_pose_planner import NextPose
+from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus
+from weldcal.systems.welding_velocity_servo import ServoReport
+
+
+@dc.dataclass(frozen=True)
+class JobPlan:
+    """What the job is to do, in plain numbers (mm where a person reads them in a reason)."""
+
+    calibrate: bool
+    weld: bool
+    q_home: NDArray[np.float64]
+    maximum_scans: int
+    verification_scans: int
+    verification_limit_m: float
+    required_error_m: float
+    dwell_s: float = 0.3
+    scan_timeout_s: float = 8.0
+    move_timeout_s: float = 20.0
+    maximum_time_s: float = 240.0
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Seen(Message):
+    """Everything the sequencer looks at in one tick."""
+
+    time: float
+    robot: UrStatus
+    settled_goal: int
+    q: NDArray[np.float64]
+    next_pose: NextPose
+    calibration: CalibrationStatus
+    seam: PlannedSeam
+    servo: ServoReport
+
+
+@dc.dataclass(frozen=True, eq=False)
+class JobState(Message):
+    """The command that stands, when its phase began, where the phase goes next and the log of all phases."""
+
+    command: JobCommand = dc.field(default_factory=JobCommand)
+    since: float = 0.0
+    settled_since: float | None = None
+    log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
+
+
+def _enter(state: JobState, seen: Seen, phase: str, **changes: Any) -> JobState:
+    command = dc.replace(state.command, phase=phase, **changes)
+    return JobState(command, seen.time, None, (*state.log, (seen.time, phase)))
+
+
+def _move(state: JobState, seen: Seen, phase: str, q_goal: NDArray[np.float64]) -> JobState:
+    return _enter(state, seen, phase, mode="move", goal_id=state.command.goal_id + 1, q_goal=q_goal)
+
+
+def _scan(state: JobState, seen: Seen, phase: str, purpose: str, label: str) -> JobState:
+    return _enter(
+        state, seen, phase, mode="hold", scan_sequence=state.command.scan_sequence + 1, scan_purpose=purpose, scan_label=label
+    )
+
+
+def hold(state: JobState, seen: Seen, reason: str) -> JobState:
+    """Process off and arm at rest, latched; nothing leaves this state but a person's reset."""
+    return _enter(state, seen, "held", mode="hold", process_on=False, held=True, finished=True, reason=reason)
+
+
+def _arrived(state: JobState, seen: Seen, plan: JobPlan) -> tuple[JobState, bool]:
+    """Settled at the goal for the dwell time."""
+    if seen.settled_goal != state.command.goal_id:
+        return dc.replace(state, settled_since=None), False
+    since = seen.time if state.settled_since is None else state.settled_since
+    return dc.replace(state, settled_since=since), seen.time - since >= plan.dwell_s
+
+
+def _start(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    if plan.calibrate:
+        return _to_next_pose(state, seen, "move_to_verification_cloud")
+    return _move(state, seen, "park", plan.q_home)
+
+
+def _to_next_pose(state: JobState, seen: Seen, phase: str) -> JobState:
+    if seen.next_pose.after_sequence < seen.calibration.sequence:
+        return state  # the planner has not looked at the newest status yet
+    if seen.next_pose.q is None:
+        return hold(state, seen, "The planned calibration poses are used up: plan more of them or free more of the workspace.")
+    return _move(state, seen, phase, seen.next_pose.q)
+
+
+def _arrive_and_scan(purpose: str, phase: str) -> Callable[[JobState, Seen, JobPlan], JobState]:
+    def step(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+        state, there = _arrived(state, seen, plan)
+        if there:
+            return _scan(state, seen, phase, purpose, seen.next_pose.label)
+        if seen.time - state.since > plan.move_timeout_s:
+            return hold(state, seen, f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s.")
+        return state
+
+    return step
+
+
+def _digested(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    """After each calibration scan: more poses, verification, or an honest end."""
+    status = seen.calibration
+    if status.sequence < state.command.scan_sequence:
+        if seen.time - state.since > plan.scan_timeout_s:
+            return hold(state, seen, f"No scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
+        return state
+    if status.done:
+        return _to_next_pose(state, seen, "move_to_verify")
+    if status.calibration_scans >= plan.maximum_scans:
+        return hold(state, seen, unreached_reason(status, plan))
+    return _to_next_pose(state, seen, "move_to_pose")
+
+
+def unreached_reason(status: CalibrationStatus, plan: JobPlan) -> str:
+    """Why the calibration ended without the required error."""
+    required = plan.required_error_m * 1e3
+    if status.estimate is None:
+        why = status.refused[-1][1] if status.refused else status.message
+        return f"No calibration after {status.calibration_scans} scans: {why}"
+    return (
+        f"The calibration did not reach the required {required:.3f} mm: after {status.calibration_scans} scans it expects "
+        f"{status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans, a wider workspace or a better scanner."
+    )
+
+
+def _verified(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    status = seen.calibration
+    if status.sequence < state.command.scan_sequence:
+        if seen.time - state.since > plan.scan_timeout_s:
+            return hold(state, seen, f"No scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
+        return state
+    if len(status.verifications) < plan.verification_scans:
+        return _to_next_pose(state, seen, "move_to_verify")
+    worst = max(status.verifications, key=lambda v: v.error_m)
+    if worst.error_m > plan.verification_limit_m:
+        limit = plan.verification_limit_m * 1e3
+        return hold(
+            state, seen, f"The calibration is {worst.error_m * 1e3:.2f} mm off at the unseen pose '{worst.label}' (limit {limit:.2f} mm)."
+        )
+    return _move(state, seen, "park", plan.q_home)
+
+
+def _parked(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    state, there = _arrived(state, seen, plan)
+    if not there:
+        return state
+    if not plan.weld:
+        return _enter(state, seen, "done", mode="hold", finished=True)
+    return _scan(state, seen, "scan_workpiece", "workpiece", "workpiece")
+
+
+def _planned(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    if seen.seam.sequence < state.command.scan_sequence:
+        if seen.time - state.since > plan.scan_timeout_s:
+            return hold(state, seen, f"No workpiece scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
+        return state
+    if seen.seam.seam is None or seen.seam.q_above is None:
+        return hold(state, seen, seen.seam.reason or "No seam could be planned.")
+    return _move(state, seen, "approach_above", seen.seam.q_above)
+
+
+def _above(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    state, there = _arrived(state, seen, plan)
+    if there and seen.seam.q_start is not None:
+        return dc.replace(_move(state, seen, "approach", seen.seam.q_start))
+    return state
+
+
+def _approached(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    if not state.command.streaming:
+        state = dc.replace(state, command=dc.replace(state.command, streaming=True))
+    state, there = _arrived(state, seen, plan)
+    return _enter(state, seen, "weld", mode="weld", process_on=True) if there else state
+
+
+def _welding(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    if seen.servo.phase == "FAULT":
+        return hold(state, seen, seen.servo.reason or "The welding servo stopped.")
+    if seen.servo.phase == "DONE" and seen.seam.q_retract is not None:
+        return _move(dc.replace(state, command=dc.replace(state.command, process_on=False, streaming=False)), seen, "retract", seen.seam.q_retract)
+    return state
+
+
+def _retracted(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    state, there = _arrived(state, seen, plan)
+    return _move(state, seen, "home", plan.q_home) if there else state
+
+
+def _home(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    state, there = _arrived(state, seen, plan)
+    return _enter(state, seen, "done", mode="hold", finished=True) if there else state
+
+
+PHASES: dict[str, Callable[[JobState, Seen, JobPlan], JobState]] = {
+    "start": _start,
+    "move_to_verification_cloud": _arrive_and_scan("verification_cloud", "scan_verification_cloud"),
+    "scan_verification_cloud": _digested,
+    "move_to_pose": _arrive_and_scan("calibrate", "scan_pose"),
+    "scan_pose": _digested,
+    "move_to_verify": _arrive_and_scan("verify", "scan_verify"),
+    "scan_verify": _verified,
+    "park": _parked,
+    "scan_workpiece": _planned,
+    "approach_above": _above,
+    "approach": _approached,
+    "weld": _welding,
+    "retract": _retracted,
+    "home": _home,
+}
+
+
+def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    """One tick of the job; `held` and `done` are final."""
+    if state.command.finished:
+        return state
+    if not seen.robot.ready:
+        return hold(state, seen, f"The robot stopped: {seen.robot.fault or seen.robot.safety_mode}.")
+    if seen.time > plan.maximum_time_s:
+        return hold(state, seen, f"The job took longer than its {plan.maximum_time_s:.0f} s, in the phase '{state.command.phase}'.")
+    return PHASES[state.command.phase](state, seen, plan)
+
+
+class JobSequencer(LeafSystem):
+    """The state machine of the cell.
+
+    .. pydrake_system::
+
+        name: JobSequencer
+        input_ports:
+        - robot_status
+        - settled_goal
+        - position_measured
+        - next_pose
+        - calibration_status
+        - planned_seam
+        - servo_report
+        output_ports:
+        - job
+        - job_state
+        - scan_trigger
+        - streaming
+
+    `job` carries the `JobCommand`, `job_state` the whole `JobState` with its log; `scan_trigger` and `streaming` (1) go to the
+    station.
+    """
+
+    def __init__(self, plan: JobPlan, period_s: float = 0.02) -> None:
+        super().__init__()
+        self._plan = plan
+        self._robot = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
+        self._settled = self.DeclareVectorInputPort("settled_goal", 1)
+        self._q = self.DeclareVectorInputPort("position_measured", 6)
+        self._next = self.DeclareAbstractInputPort("next_pose", AbstractValue.Make(NextPose()))
+        self._calibration = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
+        self._servo = self.DeclareAbstractInputPort("servo_report", AbstractValue.Make(ServoReport()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(JobState()))
+        ticket = {self.abstract_state_ticket(self._state)}
+        self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job_out, ticket)
+        self.DeclareAbstractOutputPort("job_state", lambda: AbstractValue.Make(JobState()), self._state_out, ticket)
+        self.DeclareVectorOutputPort("scan_trigger", 1, self._trigger_out, ticket)
+        self.DeclareVectorOutputPort("streaming", 1, self._streaming_out, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def job_state(self, context: Context) -> JobState:
+        """The job's state in this system's context."""
+        state: JobState = context.get_abstract_state(self._state).get_value()
+        return state
+
+    def _update(self, context: Context, state: State) -> None:
+        seen = Seen(
+            time=context.get_time(),
+            robot=self._robot.Eval(context),
+            settled_goal=int(self._settled.Eval(context)[0]),
+            q=self._q.Eval(context),
+            next_pose=self._next.Eval(context),
+            calibration=self._calibration.Eval(context),
+            seam=self._seam.Eval(context),
+            servo=self._servo.Eval(context),
+        )
+        old = self.job_state(context)
+        new = next_job_state(old, seen, self._plan)
+        if new is not old:
+            state.get_mutable_abstract_state(self._state).set_value(new)
+
+    def _job_out(self, context: Context, output: Any) -> None:
+        output.set_value(self.job_state(context).command)
+
+    def _state_out(self, context: Context, output: Any) -> None:
+        output.set_value(self.job_state(context))
+
+    def _trigger_out(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self.job_state(context).command.scan_sequence))
+
+    def _streaming_out(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self.job_state(context).command.streaming))

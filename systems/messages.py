@@ -1,0 +1,137 @@
+"""What travels on the abstract ports: immutable messages, each datum with the time it was taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.iterative import Algorithm1State
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.solve import CalibrationEstimate
+from weldcal.calibration.verification import Verification
+from weldcal.welding.seam import SeamCurve
+
+
+class Message:
+    """An immutable value on a port: Drake deep-copies abstract state at each event, and a message need never be copied."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Message:
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Scan(Message):
+    """One frame of the scanner: organised cloud p_CS (H, W, 3) in metres, NaN where there is no return."""
+
+    sequence: int = 0
+    capture_time: float = -np.inf
+    points_C: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 0, 3), dtype=np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Image(Message):
+    """One frame of the finger camera: grey (H, W) uint8, with the time of its exposure."""
+
+    sequence: int = 0
+    capture_time: float = -np.inf
+    pixels: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), dtype=np.uint8))
+
+
+@dataclass(frozen=True)
+class UrStatus(Message):
+    """What the controller says of itself, in the words of the RTDE enumerations."""
+
+    robot_mode: str = "RUNNING"
+    safety_mode: str = "NORMAL"
+    program_running: bool = True
+    speed_scaling: float = 1.0
+    fault: str | None = None
+
+    @property
+    def ready(self) -> bool:
+        """True while velocity commands are obeyed."""
+        return self.fault is None and self.program_running and self.safety_mode in ("NORMAL", "REDUCED")
+
+
+@dataclass(frozen=True, eq=False)
+class JobCommand(Message):
+    """What the JobSequencer asks of the other systems."""
+
+    phase: str = "start"
+    mode: str = "hold"  # hold: zero velocity; move: the FlangeMover drives; weld: the servo drives
+    goal_id: int = 0
+    q_goal: NDArray[np.float64] | None = None  # (6,) rad
+    scan_sequence: int = 0  # the newest scan that was asked for
+    scan_purpose: str = ""  # calibrate, verify or workpiece: whose scan_sequence it is
+    scan_label: str = ""
+    streaming: bool = False  # the finger camera runs
+    process_on: bool = False  # the torch may burn
+    finished: bool = False
+    held: bool = False
+    reason: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FlangeEstimate(Message):
+    """What the FlangeEstimator found in one scan."""
+
+    sequence: int = 0
+    capture_time: float = -np.inf
+    purpose: str = ""
+    label: str = ""
+    fit: FlangeFit | None = None
+    points_C: NDArray[np.float64] | None = None  # face points around the fit, for verification and the viewer
+    reason: str | None = None  # why there is no fit
+
+
+@dataclass(frozen=True, eq=False)
+class VerificationResult(Message):
+    """How the calibration did at one pose it never saw."""
+
+    label: str
+    error_m: float
+    tilt_rad: float
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationStatus(Message):
+    """The state of the IterativeCalibrator after its newest scan."""
+
+    sequence: int = 0  # of the newest scan it has digested
+    calibration_scans: int = 0
+    observations: tuple[Observation, ...] = ()
+    refused: tuple[tuple[str, str], ...] = ()
+    estimate: CalibrationEstimate | None = None
+    predicted_error_m: float = np.inf  # expected error of a point at the work point, from the estimate's own covariance and noise
+    verification_cloud: Verification | None = None  # P_v of Algorithm 1
+    algorithm_1: Algorithm1State | None = None
+    history: tuple[tuple[int, float, float, float], ...] = ()  # scans, predicted error, held-out median, Algorithm 1's figure; m
+    verifications: tuple[VerificationResult, ...] = ()
+    done: bool = False
+    message: str = ""
+
+    @property
+    def X_BC(self) -> RigidTransform | None:
+        """The pose of the scanner in the base, once there is one."""
+        return None if self.estimate is None else self.estimate.X_BC
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSeam(Message):
+    """What the SeamPlanner made of the workpiece scan."""
+
+    sequence: int = 0
+    seam: SeamCurve | None = None
+    X_BP: RigidTransform | None = None
+    rms_m: float = np.nan
+    confidence: float = 0.0
+    q_start: NDArray[np.float64] | None = None  # (6,) rad, where the touch begins
+    q_above: NDArray[np.float64] | None = None
+    q_retract: NDArray[np.float64] | None = None
+    points_B: NDArray[np.float64] | None = None
+    reason: str | None = None

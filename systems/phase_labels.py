@@ -1,0 +1,57 @@
+"""The phase of the job as a sign behind the cell: a textured board per phase, shown in its time."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import InMemoryMesh, Mesh, Meshcat
+from pydrake.math import RigidTransform, RollPitchYaw
+
+WIDTH_M, HEIGHT_M = 0.72, 0.09
+# Above and behind the cell, facing a viewer who stands in front of the robot (+x) and looks back at it.
+X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.pi / 2), [-0.25, 0.0, 1.18])
+TEXT = {
+    "start": "ready",
+    "move_to_verification_cloud": "calibrate: to the verification pose",
+    "scan_verification_cloud": "calibrate: scan for verification",
+    "move_to_pose": "calibrate: to the next pose",
+    "scan_pose": "calibrate: scan the ring",
+    "move_to_verify": "verify: to an unseen pose",
+    "scan_verify": "verify: scan the ring",
+    "park": "park",
+    "scan_workpiece": "scan the workpiece",
+    "approach_above": "approach",
+    "approach": "approach",
+    "weld": "feel the seam, weld behind",
+    "retract": "retract",
+    "home": "home",
+    "done": "done",
+    "held": "HELD: see the report",
+}
+
+
+def label_image(text: str) -> np.ndarray:
+    """A (128, 1024, 3) uint8 BGR board with the text."""
+    board = np.full((128, 1024, 3), (46, 38, 33), dtype=np.uint8)
+    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.6, 2)
+    cv2.putText(board, text, ((1024 - width) // 2, 82), cv2.FONT_HERSHEY_DUPLEX, 1.6, (240, 240, 240), 2, cv2.LINE_AA)
+    return board
+
+
+def add_phase_label(meshcat: Meshcat, path: str, phase: str) -> None:
+    """Put the board for a phase at `path`."""
+    w, h = WIDTH_M / 2, HEIGHT_M / 2
+    name = f"phase_{phase}"
+    obj = (
+        f"mtllib {name}.mtl\nusemtl board\nv {-w} {-h} 0\nv {w} {-h} 0\nv {w} {h} 0\nv {-w} {h} 0\n"
+        "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
+    )
+    mtl = f"newmtl board\nKa 1 1 1\nKd 1 1 1\nmap_Kd {name}.png\n"
+    png = cv2.imencode(".png", label_image(TEXT.get(phase, phase)))[1].tobytes()
+    mesh = InMemoryMesh(
+        mesh_file=MemoryFile(obj, ".obj", f"{name}.obj"),
+        supporting_files={f"{name}.mtl": MemoryFile(mtl, ".mtl", f"{name}.mtl"), f"{name}.png": MemoryFile(png, ".png", f"{name}.png")},
+    )
+    meshcat.SetObject(path, Mesh(mesh))
+    meshcat.SetTransform(path, X_WS)

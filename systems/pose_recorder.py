@@ -1,0 +1,74 @@
+"""PoseRecorder: remembers the arm's last joint positions, so that a sensor's datum meets the pose of its own time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem, State
+
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.systems.messages import Message
+
+
+@dataclass(frozen=True, eq=False)
+class PoseHistory(Message):
+    """Times (n,) s, ascending, and joint positions (n, 6) rad of the last moments."""
+
+    times: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    positions: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
+
+    def joints_at(self, time: float) -> NDArray[np.float64] | None:
+        """Joint positions (6,) interpolated to `time` s; None when the history does not reach it by more than one sample."""
+        t = self.times
+        if t.size < 2 or not t[0] <= time <= t[-1] + (t[-1] - t[-2]):
+            return None
+        k = int(np.clip(np.searchsorted(t, time), 1, t.size - 1))
+        w = (time - t[k - 1]) / (t[k] - t[k - 1])
+        return np.asarray((1.0 - w) * self.positions[k - 1] + w * self.positions[k])
+
+    def pose_at(self, arm: ArmModel, time: float) -> RigidTransform | None:
+        """Flange pose X_BF at `time` s, or None."""
+        q = self.joints_at(time)
+        return None if q is None else forward_kinematics(arm, q)
+
+
+class PoseRecorder(LeafSystem):
+    """Keeps a ring of joint positions, each with the time it was sampled.
+
+    .. pydrake_system::
+
+        name: PoseRecorder
+        input_ports:
+        - position_measured
+        - sample_time
+        output_ports:
+        - history
+    """
+
+    def __init__(self, period_s: float = 0.008, length_s: float = 1.6) -> None:
+        super().__init__()
+        self._length = int(length_s / period_s)
+        self._position = self.DeclareVectorInputPort("position_measured", 6)
+        self._time = self.DeclareVectorInputPort("sample_time", 1)
+        self._state = self.DeclareAbstractState(AbstractValue.Make(PoseHistory()))
+        self.DeclareAbstractOutputPort(
+            "history", lambda: AbstractValue.Make(PoseHistory()), self._output, {self.abstract_state_ticket(self._state)}
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._record)
+
+    def _record(self, context: Context, state: State) -> None:
+        old: PoseHistory = context.get_abstract_state(self._state).get_value()
+        time = float(self._time.Eval(context)[0])
+        if old.times.size and time <= old.times[-1]:
+            return
+        times = np.append(old.times[-self._length :], time)
+        positions = np.vstack([old.positions[-self._length :], self._position.Eval(context)])
+        state.get_mutable_abstract_state(self._state).set_value(PoseHistory(times, positions))
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())

@@ -1,0 +1,187 @@
+"""What a scenario YAML may say: typed configuration of one cell, unknown keys are errors."""
+
+import dataclasses as dc
+import math
+from pathlib import Path
+from typing import Union
+
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.simulated_ur import SimulatedUr
+
+SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
+
+
+@dc.dataclass
+class PoseConfig:
+    """A pose as a person writes it: metres and degrees, roll-pitch-yaw about fixed axes."""
+
+    xyz_m: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
+    rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def pose(self) -> RigidTransform:
+        """The pose as a RigidTransform.
+
+        Raises:
+            InputError: if it is not three finite metres and three finite degrees.
+        """
+        if len(self.xyz_m) != 3 or len(self.rpy_deg) != 3 or not all(map(math.isfinite, self.xyz_m + self.rpy_deg)):
+            raise InputError("Write every pose of the scenario as three finite numbers xyz_m and three finite numbers rpy_deg.")
+        return RigidTransform(RollPitchYaw([math.radians(a) for a in self.rpy_deg]), self.xyz_m)
+
+
+@dc.dataclass
+class ErrorConfig:
+    """How far the simulated world may differ from what the cell was told (drawn from the run's seed)."""
+
+    translation_mm: float = 0.0
+    rotation_deg: float = 0.0
+
+
+@dc.dataclass
+class CalibrationConfig:
+    """The calibration job: which feature, which poses, when to stop."""
+
+    feature: str = "tool_ring"  # tool_ring: the ring on the welding tool; flange: the bare flange
+    mounting_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BC as measured with a tape
+    guess_radius_mm: float = 60.0  # how far the feature may be from where the guess puts it
+    theta_max_deg: float = 25.0  # between the feature's normal and the line of sight
+    required_error_mm: float = 0.10  # e_required, on the estimate's own error at the work point
+    minimum_scans: int = 6
+    maximum_scans: int = 10  # k_max, verification scans not counted
+    verification_scans: int = 1
+    verification_limit_mm: float = 0.5  # a larger error at the unseen pose holds the job
+    cost: str = "translation"  # cost metric of Algorithm 1: translation, or translation_and_rotation
+    table_z_m: float = 0.0
+    clearance_m: float = 0.05
+    work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # where there is no workpiece
+
+
+@dc.dataclass
+class WorkpieceConfig:
+    """The workpiece as its CAD says, and how far the real one is from that."""
+
+    shape: str = "s"  # s, straight or l
+    length_mm: float = 300.0
+    pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BP as the fixture's drawing says
+    placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the plate on the fixture
+    groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the groove against the plate's datums
+    cut_at_mm: float | None = None  # the real part ends early at this arc length: contact is lost there
+
+
+@dc.dataclass
+class WeldingConfig:
+    """The welding job."""
+
+    speed_mm_s: float = 8.0
+    deflection_mm: float = 2.0  # delta_d of Eq. 16
+    axial_deflection_mm: float = 3.0
+    clearance_mm: float = 25.0  # height above the seam where the approach ends
+    seam_length_mm: float | None = None  # weld only this much of the seam
+
+
+@dc.dataclass
+class JobConfig:
+    """Which parts of the job run; a part that is off is not attempted."""
+
+    calibrate: bool = True
+    weld: bool = True
+    X_BC: PoseConfig | None = None  # a known calibration, where `calibrate` is off
+    maximum_time_s: float = 240.0
+
+
+@dc.dataclass
+class VisualizationConfig:
+    """What Meshcat records."""
+
+    recording_fps: float = 10.0
+    cloud_points: int = 20000
+
+
+@dc.dataclass
+class Scenario:
+    """One cell: arm, station drivers, calibration, workpiece, welding and job."""
+
+    description: str = ""
+    arm: str = "ur10e"
+    kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
+    flange: str = "iso9409-1-50-4-m6"  # of the arm
+    tool: str = "welding"  # welding or none
+    robot: Union[SimulatedUr, NoDevice] = dc.field(default_factory=SimulatedUr)
+    scanner: Union[RenderedScanner, NoDevice] = dc.field(default_factory=RenderedScanner)
+    finger_camera: Union[RenderedFingerCamera, NoDevice] = dc.field(default_factory=RenderedFingerCamera)
+    home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
+    calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
+    workpiece: WorkpieceConfig | None = None
+    welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
+    job: JobConfig = dc.field(default_factory=JobConfig)
+    visualization: VisualizationConfig = dc.field(default_factory=VisualizationConfig)
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that ship with weldcal."""
+    return sorted(path.stem for path in SCENARIO_FOLDER.glob("*.yaml"))
+
+
+def load_scenario(name: str, overrides: str = "") -> Scenario:
+    """Load a scenario by name or path; `overrides` is a second YAML text merged on top.
+
+    Raises:
+        InputError: unknown name, unknown key, wrong type; the sentence says which.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
+    if not path.is_file():
+        raise InputError(f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file.")
+    scenario = Scenario()
+    for label, text in ((str(path.name), path.read_text(encoding="utf-8")), ("the overrides", overrides)):
+        if not text.strip():
+            continue
+        try:
+            scenario = yaml_load_typed(schema=Scenario, data=text, defaults=scenario)
+        except Exception as error:  # Drake's loader raises several kinds; each text names the key
+            raise InputError(f"Scenario {label} cannot be read: {' '.join(str(error).split())}") from error
+    check_scenario(scenario)
+    return scenario
+
+
+def check_scenario(scenario: Scenario) -> None:
+    """Refuse what no cell could do, before any work.
+
+    Raises:
+        InputError: one sentence that says what to change.
+    """
+    if isinstance(scenario.robot, NoDevice):
+        raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
+    if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
+        raise InputError("This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off.")
+    if len(scenario.home_deg) != 6:
+        raise InputError("home_deg must hold six joint angles in degrees.")
+    calibration = scenario.calibration
+    if calibration.feature not in ("tool_ring", "flange"):
+        raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
+    if calibration.cost not in ("translation", "translation_and_rotation"):
+        raise InputError(f"calibration.cost must be translation or translation_and_rotation, not '{calibration.cost}'.")
+    if scenario.tool not in ("welding", "none"):
+        raise InputError(f"tool must be welding or none, not '{scenario.tool}'.")
+    if (calibration.feature == "tool_ring") != (scenario.tool == "welding"):
+        raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
+    if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:
+        raise InputError("calibration.minimum_scans must be at least 4 and not above calibration.maximum_scans.")
+    positive = {
+        "calibration.required_error_mm": calibration.required_error_mm,
+        "calibration.theta_max_deg": calibration.theta_max_deg,
+        "welding.speed_mm_s": scenario.welding.speed_mm_s,
+        "job.maximum_time_s": scenario.job.maximum_time_s,
+    }
+    for key, value in positive.items():
+        if not (math.isfinite(value) and value > 0.0):
+            raise InputError(f"{key} must be a positive number, not {value}.")
+    if scenario.job.weld and (scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)):
+        raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
+    if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
+        raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

@@ -1,0 +1,132 @@
+"""SeamPlanner: a scan of the workpiece in, the planned seam in the base out, with the arm's way to its beginning."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem, State
+
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.errors import WeldcalError
+from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces import Workpiece
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.welding.feasibility import check_feasible
+from weldcal.welding.registration import register_workpiece
+from weldcal.welding.seam import SeamCurve
+from weldcal.welding.touch import touch_start_pose
+from weldcal.welding.servo_state import ServoConfig
+
+
+class SeamPlanner(LeafSystem):
+    """Registers the workpiece's CAD to its scan and takes the seam into the base with the calibrated X_BC.
+
+    .. pydrake_system::
+
+        name: SeamPlanner
+        input_ports:
+        - scan
+        - job
+        - calibration_status
+        output_ports:
+        - planned_seam
+
+    Without calibration in the job, `X_BC_known` stands in for it.
+    """
+
+    def __init__(
+        self,
+        arm: ArmModel,
+        tool: WeldingTool,
+        workpiece: Workpiece,
+        X_BP_guess: RigidTransform,
+        config: ServoConfig,
+        q_near: NDArray[np.float64],
+        clearance_m: float,
+        seam_length_m: float | None,
+        X_BC_known: RigidTransform | None = None,
+        period_s: float = 0.02,
+    ) -> None:
+        super().__init__()
+        self._arm, self._tool, self._workpiece, self._config = arm, tool, workpiece, config
+        self._X_BP_guess, self._q_near, self._clearance_m = X_BP_guess, q_near, clearance_m
+        self._seam_length_m, self._X_BC_known = seam_length_m, X_BC_known
+        self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(PlannedSeam()))
+        self.DeclareAbstractOutputPort(
+            "planned_seam", lambda: AbstractValue.Make(PlannedSeam()), self._output, {self.abstract_state_ticket(self._state)}
+        )
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        scan: Scan = self._scan.Eval(context)
+        job: JobCommand = self._job.Eval(context)
+        newest: PlannedSeam = context.get_abstract_state(self._state).get_value()
+        if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
+            return
+        X_BC = self._X_BC_known if self._X_BC_known is not None else self._status.Eval(context).X_BC
+        state.get_mutable_abstract_state(self._state).set_value(self._plan(scan, X_BC))
+
+    def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
+        if X_BC is None:
+            return PlannedSeam(sequence=scan.sequence, reason="The seam cannot be taken into the base: the scanner is not calibrated.")
+        points_C = scan.points_C.reshape(-1, 3).astype(float)
+        points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
+        points_B = points_C @ X_BC.rotation().matrix().T + X_BC.translation()
+        try:
+            found = register_workpiece(points_B, self._workpiece, self._X_BP_guess)
+            seam = tip_seam(self._workpiece, found.X_BP, self._tool.tip_radius_m, self._seam_length_m)
+            check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)
+            q_start, q_above, q_retract = arm_waypoints(self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m)
+        except WeldcalError as error:
+            return PlannedSeam(sequence=scan.sequence, reason=str(error))
+        return PlannedSeam(
+            scan.sequence, seam, found.X_BP, found.rms_m, found.confidence, q_start, q_above, q_retract, points_B
+        )
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())
+
+
+class SeamOutOfReach(WeldcalError):
+    """The arm cannot hold the tool along the seam."""
+
+
+def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tip_radius_m: float, length_m: float | None) -> SeamCurve:
+    """The line on which the seated tip's centre runs, in B, cut to `length_m` of arc where given."""
+    line = workpiece.tip_line_P(tip_radius_m)
+    if length_m is not None:
+        line = line[workpiece.arc_length_m <= length_m]
+    up = X_BP.rotation().matrix()[:, 2]
+    return SeamCurve.from_points(line @ X_BP.rotation().matrix().T + X_BP.translation(), up=up)
+
+
+def arm_waypoints(
+    arm: ArmModel, tool: WeldingTool, seam: SeamCurve, config: ServoConfig, q_near: NDArray[np.float64], clearance_m: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Joint positions (6,) rad at the touch start, above it, and above the far end.
+
+    Raises:
+        SeamOutOfReach: where no inverse kinematics solution exists along the seam.
+    """
+    X_BT = touch_start_pose(seam, config)
+    solutions = []
+    q = q_near
+    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + np.array([0.0, 0.0, clearance_m]))
+    end = seam.frame(seam.length)
+    X_BE = RigidTransform(X_BT.rotation(), np.asarray(end.position) + np.array([0.0, 0.0, clearance_m + 0.05]))
+    for pose in (lifted, X_BT, X_BE):
+        found = nearest_solution(arm, pose @ tool.X_FT.inverse(), q)
+        if found is None:
+            raise SeamOutOfReach("The arm cannot reach the seam with the tool upright: move the workpiece towards the robot.")
+        solutions.append(found)
+        q = found
+    q_above, q_start, q_retract = solutions
+    return q_start, q_above, q_retract

@@ -1,0 +1,168 @@
+"""The station: arm, scanner and finger camera behind fixed ports; the scenario's driver configs say what is real."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+import inspect
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantValueSource
+
+from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.tool import WeldingTool
+from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
+from weldcal.systems.drivers.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.messages import Message
+from weldcal.systems.scenario import Scenario
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Truth(Message):
+    """What only a simulation knows; for reports and tests (`cheat.*`), never for an algorithm."""
+
+    X_BC: RigidTransform | None
+    X_BP: RigidTransform | None
+    workpiece: Workpiece | None  # the part as it really is
+
+
+@dc.dataclass(frozen=True, eq=False)
+class Station:
+    """The station's Diagram and the handles that the cell needs to build around it."""
+
+    diagram: Diagram
+    arm: ArmModel
+    tool: WeldingTool | None
+    cad: Workpiece | None  # the part as drawn
+    truth: Truth
+    world: SimulatedWorld
+
+
+def apply_driver_config(config: Any, build: StationBuild) -> Any:
+    """Call the ApplyDriverConfig that stands in the module of the config's class, as pydrake.manipulation does."""
+    module = inspect.getmodule(type(config))
+    apply = getattr(module, "ApplyDriverConfig", None)
+    return None if apply is None else apply(config, build)
+
+
+class CheatPoses(LeafSystem):
+    """Where tip, torch and flange truly are.
+
+    .. pydrake_system::
+
+        name: CheatPoses
+        input_ports:
+        - body_poses
+        output_ports:
+        - contact
+        - torch
+
+    `contact` (6): true tip centre in B (m) and its deflection from rest in T (m); `torch` (3): wire point in B, m.
+    """
+
+    def __init__(self, world: SimulatedWorld, tool: WeldingTool) -> None:
+        super().__init__()
+        plant = world.plant
+        self._tool = tool
+        self._flange = plant.GetBodyByName("flange", world.arm).index()
+        self._tip = plant.GetBodyByName("tip_z", world.tool).index() if world.tool is not None else self._flange
+        self._poses = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
+        self.DeclareVectorOutputPort("contact", 6, self._contact)
+        self.DeclareVectorOutputPort("torch", 3, self._torch)
+
+    def _contact(self, context: Context, output: BasicVector) -> None:
+        poses = self._poses.Eval(context)
+        X_BT = poses[self._flange] @ self._tool.X_FT
+        p_BTip = poses[self._tip].translation()
+        output.SetFromVector(np.concatenate([p_BTip, X_BT.inverse() @ p_BTip]))
+
+    def _torch(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(self._poses.Eval(context)[self._flange] @ self._tool.X_FT @ self._tool.p_TW)
+
+
+def make_station(scenario: Scenario, seed: int) -> Station:
+    """Build the station that the scenario describes; every random difference between world and drawing comes from `seed`.
+
+    Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
+    `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
+    `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
+    `query_object`.
+    """
+    rng = np.random.default_rng(seed)
+    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+    tool = WeldingTool() if scenario.tool == "welding" else None
+    cad, real, X_BP = _workpieces(scenario, rng)
+    q_home = np.deg2rad(scenario.home_deg)
+    builder = DiagramBuilder()
+    world = build_world(
+        builder,
+        arm,
+        tool,
+        scenario.robot,
+        q_home,
+        flange=scenario.flange,
+        table_z_m=scenario.calibration.table_z_m,
+        workpiece=real,
+        X_BP=X_BP,
+    )
+    build = StationBuild(builder, arm, tool, q_home, rng, world)
+    apply_driver_config(scenario.robot, build)
+    X_BC = apply_driver_config(scenario.scanner, build)
+    apply_driver_config(scenario.finger_camera, build)
+    truth = Truth(X_BC, X_BP, real)
+    _export(build, truth)
+    diagram = builder.Build()
+    diagram.set_name("station")
+    return Station(diagram, arm, tool, cad, truth, world)
+
+
+def _workpieces(scenario: Scenario, rng: np.random.Generator) -> tuple[Workpiece | None, Workpiece | None, RigidTransform | None]:
+    """The part as drawn, the part as it is, and where it lies."""
+    spec = scenario.workpiece
+    if spec is None:
+        return None, None, None
+    length = spec.length_mm * 1e-3
+    cad = make_workpiece(spec.shape, length_m=length)
+    X_PG = seeded_groove_error(rng, spec.groove_error.translation_mm * 1e-3, np.deg2rad(spec.groove_error.rotation_deg))
+    cut = None if spec.cut_at_mm is None else spec.cut_at_mm * 1e-3
+    real = make_workpiece(spec.shape, length_m=length, X_PG=X_PG, end_cut_m=cut)
+    placed = _lying_error(rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg))
+    return cad, real, spec.pose_guess.pose() @ placed
+
+
+def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
+    """A plate lies flat on its fixture: it may be moved and turned in its plane."""
+    error = random_pose_error(rng, translation_m, rotation_rad)
+    p = np.array(error.translation())
+    length = np.hypot(p[0], p[1])
+    p = np.array([p[0], p[1], 0.0]) * (translation_m / length if length > 0 else 0.0)
+    sign = 1.0 if rng.random() < 0.5 else -1.0
+    return RigidTransform(RollPitchYaw(0.0, 0.0, sign * rotation_rad), p)
+
+
+def _export(build: StationBuild, truth: Truth) -> None:
+    builder, world = build.builder, build.simulated_world()
+    for name, port in build.inputs.items():
+        builder.ExportInput(port, name)
+    for name, port in build.outputs.items():
+        builder.ExportOutput(port, name)
+    source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth)))
+    source.set_name("truth")
+    builder.ExportOutput(source.get_output_port(), "cheat.truth")
+    if truth.X_BC is not None:
+        camera = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth.X_BC)))
+        camera.set_name("true_X_BC")
+        builder.ExportOutput(camera.get_output_port(), "cheat.X_BC")
+    if build.tool is not None:
+        cheat = builder.AddSystem(CheatPoses(world, build.tool))
+        cheat.set_name("cheat_poses")
+        builder.Connect(world.plant.get_body_poses_output_port(), cheat.GetInputPort("body_poses"))
+        builder.ExportOutput(cheat.GetOutputPort("contact"), "cheat.contact")
+        builder.ExportOutput(cheat.GetOutputPort("torch"), "cheat.torch")
+    builder.ExportOutput(world.scene_graph.get_query_output_port(), "query_object")

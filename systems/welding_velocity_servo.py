@@ -1,0 +1,111 @@
+"""WeldingVelocityServo: planned seam and felt deformation in, the tip's spatial velocity and the torch switch out."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.tool import WeldingTool
+from weldcal.systems.aruco_deformation_estimator import Deformation
+from weldcal.systems.messages import JobCommand, Message, PlannedSeam
+from weldcal.welding.servo import welding_step
+from weldcal.welding.servo_state import Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+
+TELEMETRY = (
+    "phase", "torch_on", "s_tip", "s_torch", "e_t", "e_height", "n_d_dot_n_t", "conditioning", "omega",
+    "delta_n", "delta_axial", "torch_speed", "tip_speed", "gain", "n_points",
+)  # fmt: skip
+PHASE_CODES = {phase: float(k) for k, phase in enumerate(Phase)}
+
+
+@dc.dataclass(frozen=True, eq=False)
+class ServoReport(Message):
+    """What the servo says of itself to the sequencer, the viewer and the log; phase is IDLE outside a weld."""
+
+    phase: str = "IDLE"
+    torch_on: bool = False
+    reason: str | None = None
+    command: WeldingCommand | None = None
+    state: WeldingState | None = None
+
+
+class WeldingVelocityServo(LeafSystem):
+    """Algorithm 2 with the mended equations, at 125 Hz, while the job's mode is `weld`.
+
+    .. pydrake_system::
+
+        name: WeldingVelocityServo
+        input_ports:
+        - planned_seam
+        - deformation
+        - position_measured
+        - sample_time
+        - job
+        output_ports:
+        - V_BT
+        - servo_report
+        - telemetry
+        - torch_on
+
+    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B; `telemetry` as named in TELEMETRY (SI); `torch_on` (1) is the
+    process output: it needs the job's consent as well as the servo's.
+    """
+
+    def __init__(self, arm: ArmModel, tool: WeldingTool, config: ServoConfig) -> None:
+        super().__init__()
+        self._arm, self._tool, self._config = arm, tool, config
+        self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
+        self._deformation = self.DeclareAbstractInputPort("deformation", AbstractValue.Make(Deformation()))
+        self._q = self.DeclareVectorInputPort("position_measured", 6)
+        self._time = self.DeclareVectorInputPort("sample_time", 1)
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(ServoReport()))
+        ticket = {self.abstract_state_ticket(self._state)}
+        self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket)
+        self.DeclareAbstractOutputPort("servo_report", lambda: AbstractValue.Make(ServoReport()), self._report, ticket)
+        self.DeclareVectorOutputPort("telemetry", len(TELEMETRY), self._telemetry, ticket)
+        self.DeclareVectorOutputPort("torch_on", 1, self._torch, ticket | {self._job.ticket()})
+        self.DeclarePeriodicUnrestrictedUpdateEvent(config.period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        job: JobCommand = self._job.Eval(context)
+        old: ServoReport = context.get_abstract_state(self._state).get_value()
+        planned: PlannedSeam = self._seam.Eval(context)
+        if job.mode != "weld" or planned.seam is None:
+            if old.phase not in ("IDLE", Phase.DONE, Phase.FAULT):
+                report = dc.replace(old, phase="IDLE", torch_on=False, command=None)
+                state.get_mutable_abstract_state(self._state).set_value(report)
+            return
+        X_BT = forward_kinematics(self._arm, self._q.Eval(context)) @ self._tool.X_FT
+        sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample)
+        memory = old.state if old.state is not None else WeldingState()
+        memory, command = welding_step(memory, sample, planned.seam, self._config)
+        report = ServoReport(str(command.phase), command.torch_on, command.reason, command, memory)
+        state.get_mutable_abstract_state(self._state).set_value(report)
+
+    def _velocity(self, context: Context, output: BasicVector) -> None:
+        command = context.get_abstract_state(self._state).get_value().command
+        output.SetFromVector(np.zeros(6) if command is None else command.V_BT)
+
+    def _report(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())
+
+    def _telemetry(self, context: Context, output: BasicVector) -> None:
+        report: ServoReport = context.get_abstract_state(self._state).get_value()
+        values = np.full(len(TELEMETRY), np.nan)
+        values[:2] = (-1.0, 0.0)
+        if report.command is not None:
+            d = report.command.diagnostics
+            values[:2] = (PHASE_CODES[report.command.phase], float(report.torch_on))
+            values[2:] = [float(getattr(d, name)) for name in TELEMETRY[2:]]
+        output.SetFromVector(values)
+
+    def _torch(self, context: Context, output: BasicVector) -> None:
+        job: JobCommand = self._job.Eval(context)
+        report: ServoReport = context.get_abstract_state(self._state).get_value()
+        output.SetAtIndex(0, float(report.torch_on and job.process_on and not job.held))

@@ -1,0 +1,56 @@
+"""What every test may ask for: the repository, the measured data, a headless browser, one finished demo."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.browser import browser
+
+__all__ = ["browser"]
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The root folder of the repository."""
+    return Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data(repository: Path) -> Path:
+    """The folder of measured data beside the repository; the test is skipped where there is none."""
+    folder = repository.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip("the measured data (shared/data beside the repository) is not here")
+    return folder
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What a command left: its exit code, what it said, its JSON object and its result folder."""
+
+    returncode: int
+    stderr: str
+    summary: dict[str, Any]
+    folder: Path
+
+
+@pytest.fixture(scope="session")
+def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    """The README's first command, run once for all tests that look at what it leaves (no browser is opened)."""
+    folder = tmp_path_factory.mktemp("demo") / "result"
+    return run_weldcal("demo", "--no-browser", "--out", str(folder), folder=folder)
+
+
+def run_weldcal(*arguments: str, folder: Path, timeout_s: float = 400) -> FinishedRun:
+    """Runs a weldcal command with --json in a process of its own, as a person would."""
+    command = [sys.executable, "-P", "-m", "weldcal.tools", *arguments, "--json"]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=timeout_s)
+    lines = finished.stdout.splitlines()
+    return FinishedRun(finished.returncode, finished.stderr, json.loads(lines[-1]) if lines else {}, folder)

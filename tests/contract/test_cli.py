@@ -1,0 +1,203 @@
+"""The command line keeps its promises: quick help, one sentence for a mistake, one JSON line, the right exit code."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer.main
+from pydrake.math import RigidTransform
+
+from weldcal.models.errors import InputError
+from weldcal.tools import cli, console
+
+HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
+
+
+def weldcal(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """Runs the command as a person does."""
+    command = [sys.executable, "-P", "-m", "weldcal.tools", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, timeout=120)
+
+
+def leaves(command: Any, name: str = "weldcal") -> Iterator[tuple[str, Any]]:
+    """Every command that does something, with its full name."""
+    if hasattr(command, "commands"):
+        for word, child in command.commands.items():
+            yield from leaves(child, f"{name} {word}")
+    else:
+        yield name, command
+
+
+LEAVES = dict(leaves(typer.main.get_command(cli.app)))
+
+
+@pytest.mark.parametrize("name", LEAVES)
+def test_every_command_explains_itself_and_every_option(name: str) -> None:
+    command = LEAVES[name]
+    options = {option for parameter in command.params for option in parameter.opts}
+    assert command.help
+    assert all(parameter.help for parameter in command.params)
+    assert {"--json", "--debug"} <= options
+    assert name == "weldcal view" or {"--out", "--seed"} <= options
+
+
+def test_help_loads_no_heavy_library() -> None:
+    script = (
+        "import sys\nfrom weldcal.tools import cli\nsys.argv = ['weldcal', '--help']\n"
+        f"try:\n    cli.main()\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        f"loaded = [name for name in {HEAVY!r} if name in sys.modules]\nassert not loaded, loaded\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
+    assert finished.returncode == 0, finished.stderr
+    assert "calibrate" in finished.stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["dance"], ["demo", "--colour"], ["demo", "--seed", "-1"], ["calibrate"], ["calibrate", "a", "--scenario", "b"]],
+)
+def test_wrong_usage_ends_with_2_and_a_hint(arguments: list[str]) -> None:
+    finished = weldcal(*arguments)
+    assert finished.returncode == 2
+    assert "Usage:" in finished.stderr
+    assert "Traceback" not in finished.stderr
+
+
+@pytest.mark.parametrize(
+    "arguments", [["demo", "--scenario", "no_such"], ["calibrate", "no_such"], ["view", "no_such"]]
+)
+def test_a_mistake_ends_with_1_one_sentence_and_nothing_written(arguments: list[str], tmp_path: Path) -> None:
+    finished = weldcal(*arguments, cwd=tmp_path)
+    assert finished.returncode == 1
+    assert finished.stdout == ""
+    assert finished.stderr.startswith("weldcal: ")
+    assert len(finished.stderr.splitlines()) == 1
+    assert "no_such" in finished.stderr
+    assert "Internal error" not in finished.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_with_json_a_mistake_is_json_too(tmp_path: Path) -> None:
+    finished = weldcal("view", "no_such", "--json", cwd=tmp_path)
+    assert finished.returncode == 1
+    assert json.loads(finished.stdout.splitlines()[-1])["state"] == "failed"
+
+
+def test_view_finds_the_pages_of_a_result(tmp_path: Path) -> None:
+    for name in ("report.html", "recording.html"):
+        (tmp_path / name).write_text("<p>page</p>")
+    finished = weldcal("view", str(tmp_path), "--no-browser", "--json")
+    assert json.loads(finished.stdout)["pages"] == [str(tmp_path / "report.html"), str(tmp_path / "recording.html")]
+
+
+def test_an_earlier_result_is_never_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    first = cli.fresh_folder("demo", "s_groove", 7)
+    assert first == Path("weldcal-out/demo-s_groove-seed7")
+    first.mkdir(parents=True)
+    assert cli.fresh_folder("demo", "s_groove", 7) == Path("weldcal-out/demo-s_groove-seed7-2")
+    assert cli.fresh_folder("demo", "folder/mine.yaml", 0).name == "demo-mine-seed0"
+
+
+@pytest.mark.parametrize(
+    ("failure", "words"),
+    [
+        (InputError("Name a folder."), "weldcal: Name a folder.\n"),
+        (FileNotFoundError(2, "No such file or directory", "x/y"), "weldcal: No such file or directory: x/y."),
+        (RuntimeError("bad luck"), "weldcal: Internal error, not a mistake of yours: RuntimeError: bad luck."),
+    ],
+)
+def test_every_failure_is_a_sentence(failure: Exception, words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as end, console.boundary(json_wanted=False, debug=False):
+        raise failure
+    assert end.value.exit_code == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith(words)
+    assert "Traceback" not in said.err
+
+
+def test_debug_shows_where_it_happened(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit), console.boundary(json_wanted=False, debug=True):
+        raise RuntimeError("bad luck")
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_job_that_is_held_ends_with_1_and_says_why(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as end:
+        cli.finish("demo", {"state": "held", "reason": "The tag was not seen."}, Path("out"), json_wanted=True)
+    assert end.value.exit_code == 1
+    said = capsys.readouterr()
+    assert json.loads(said.out)["state"] == "held"
+    assert "The tag was not seen." in said.err
+
+
+def test_a_person_reads_short_values_with_their_units_and_every_refusal() -> None:
+    shown = console.rows(
+        {
+            "state": "done",
+            "n_used": 17,
+            "held_out_mm": {"median": 0.57123, "p95": 1.2},
+            "X_BC_error_mm": 0.08,
+            "nested": {"a": {"b": 1.0}},
+            "refused": [{"id": "pose04", "reason": "It is empty."}],
+            "X_BC": [[1.0, 0.0], [0.0, 1.0]],
+            "warnings": ["One.", "Two."],
+            "scanner_correction": None,
+        }
+    )
+    assert {name: text for name, text in shown.items() if text} == {
+        "scans used": "17",
+        "held-out error": "median 0.571, p95 1.2 mm",
+        "X_BC error": "0.08 mm",
+        "refused pose04": "It is empty.",
+        "warnings": "One.; Two.",
+    }
+
+
+class Colour(Enum):
+    """An example of an enumeration in a result."""
+
+    RED = "red"
+
+
+@dataclass(frozen=True)
+class Part:
+    """An example of a nested result."""
+
+    length_mm: float
+    where: Path
+
+
+def test_results_become_strict_json(capsys: pytest.CaptureFixture[str]) -> None:
+    console.emit_json(
+        {
+            "X_BC": RigidTransform(np.array([1.0, 2.0, 3.0])),
+            "numbers": np.array([1.5, np.nan, np.inf]),
+            "count": np.int64(3),
+            "ok": np.bool_(True),
+            "part": Part(0.5, Path("a/b")),
+            "colour": Colour.RED,
+            "ids": ("a", "b"),
+            "nothing": None,
+        }
+    )
+    assert json.loads(capsys.readouterr().out) == {
+        "X_BC": [[1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]],
+        "numbers": [1.5, None, None],
+        "count": 3,
+        "ok": True,
+        "part": {"length_mm": 0.5, "where": "a/b"},
+        "colour": "red",
+        "ids": ["a", "b"],
+        "nothing": None,
+    }

@@ -1,0 +1,130 @@
+"""What `pip install` of a wheel or an sdist brings: the whole package under weldcal/, its data, its command."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FOLDERS = ("models", "calibration", "welding", "systems", "tools")
+PROJECT_FILES = ("pyproject.toml", "README.md", "LICENSE", "NOTICE")
+
+
+@dataclass(frozen=True)
+class Built:
+    """The files that a build left."""
+
+    wheel: Path
+    sdist: Path
+
+
+def source_files() -> set[str]:
+    """Every file of the package that must arrive: Python, YAML, templates, styles, type markers."""
+    return {
+        path.relative_to(ROOT).as_posix()
+        for folder in FOLDERS
+        for path in (ROOT / folder).rglob("*")
+        if path.suffix in {".py", ".yaml", ".j2", ".css"} or path.name == "py.typed"
+    }
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Built:
+    """A wheel and an sdist, built from a copy so that nothing is left in the repository."""
+    copy = tmp_path_factory.mktemp("source") / "weldcal"
+    ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
+    for folder in FOLDERS:
+        shutil.copytree(ROOT / folder, copy / folder, ignore=ignored)
+    for name in PROJECT_FILES:
+        shutil.copy(ROOT / name, copy / name)
+    out = tmp_path_factory.mktemp("dist")
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "build",
+        "--no-isolation",
+        "--wheel",
+        "--sdist",
+        "--outdir",
+        str(out),
+        str(copy),
+    ]
+    finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert finished.returncode == 0, finished.stdout + finished.stderr
+    (wheel,) = out.glob("*.whl")
+    (sdist,) = out.glob("*.tar.gz")
+    return Built(wheel, sdist)
+
+
+def test_the_list_of_packages_is_complete() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    there = {
+        "weldcal." + path.parent.relative_to(ROOT).as_posix().replace("/", ".")
+        for folder in FOLDERS
+        for path in (ROOT / folder).rglob("__init__.py")
+    }
+    assert sorted(listed) == sorted(there)
+    assert not (ROOT / "__init__.py").exists(), "the root is a namespace, not a package"
+
+
+def test_each_folder_with_python_files_is_a_package() -> None:
+    for folder in FOLDERS:
+        for path in (ROOT / folder).rglob("*.py"):
+            assert (path.parent / "__init__.py").exists(), f"{path.parent.relative_to(ROOT)} lacks __init__.py"
+
+
+def test_the_wheel_holds_every_file_and_nothing_at_the_top(built: Built) -> None:
+    with zipfile.ZipFile(built.wheel) as wheel:
+        names = {name for name in wheel.namelist() if not name.endswith("/")}
+    assert {name.split("/")[0] for name in names} == {"weldcal", "weldcal-0.1.0.dist-info"}
+    packaged = {name.removeprefix("weldcal/") for name in names if name.startswith("weldcal/")}
+    assert packaged == source_files()
+
+
+def test_the_wheel_has_its_command_and_its_licences(built: Built) -> None:
+    with zipfile.ZipFile(built.wheel) as wheel:
+        commands = wheel.read("weldcal-0.1.0.dist-info/entry_points.txt").decode()
+        metadata = wheel.read("weldcal-0.1.0.dist-info/METADATA").decode()
+        licences = {name.rsplit("/", 1)[-1] for name in wheel.namelist() if "/licenses/" in name}
+    assert "weldcal = weldcal.tools.cli:main" in commands
+    assert "License-Expression: BSD-3-Clause" in metadata
+    assert licences == {"LICENSE", "NOTICE"}
+
+
+def test_the_sdist_holds_what_a_build_needs(built: Built) -> None:
+    with tarfile.open(built.sdist) as sdist:
+        names = {name.split("/", 1)[1] for name in sdist.getnames() if "/" in name}
+    assert source_files() <= names
+    assert set(PROJECT_FILES) <= names
+
+
+def test_an_installed_wheel_works_far_from_the_repository(built: Built, tmp_path: Path) -> None:
+    target = tmp_path / "site"
+    install = ["-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(target), str(built.wheel)]
+    subprocess.run([sys.executable, *install], check=True, capture_output=True, timeout=120)
+    # -S keeps this repository's editable install out of sight; the libraries are added by hand.
+    libraries = [path for path in sys.path if path.endswith("site-packages")]
+    script = (
+        "import sys; import weldcal.tools.cli as cli; from weldcal.tools.report.render import environment;"
+        "from weldcal.systems.scenario import SCENARIO_FOLDER;"
+        f"assert cli.__file__.startswith({str(target)!r}), cli.__file__;"
+        "assert environment().get_template('base.html.j2');"
+        "print(*sorted(path.name for path in SCENARIO_FOLDER.glob('*.yaml')))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(target), *libraries])}
+    command = [sys.executable, "-S", "-c", script]
+    finished = subprocess.run(
+        command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=60
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert set(finished.stdout.split()) == {path.name for path in (ROOT / "models" / "scenarios").glob("*.yaml")}

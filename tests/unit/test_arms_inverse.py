@@ -1,0 +1,152 @@
+"""Every flange pose a UR can reach is found from all sides, exactly, on nominal and on calibrated kinematics."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.models.arms.inverse import RESIDUAL, inverse_kinematics, nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm, sigma_min
+from weldcal.models.arms.kinematics import jacobian as arm_jacobian
+from weldcal.models.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def calibrated_arm(seed: int = 5) -> ArmModel:
+    """The nominal arm with each link moved by about a millimetre and turned by about a milliradian."""
+    arm = load_arm()
+    rng = np.random.default_rng(seed)
+    stack = np.array(
+        [
+            X @ RigidTransform(RollPitchYaw(rng.normal(0, 1e-3, 3)), rng.normal(0, 1e-3, 3)).GetAsMatrix4()
+            for X in arm.stack
+        ]
+    )
+    return replace(arm, stack=stack)
+
+
+def apart(q: Array, other: Array) -> float:
+    """Largest joint difference, full turns aside (rad)."""
+    return float(np.abs((q - other + np.pi) % (2 * np.pi) - np.pi).max())
+
+
+def residual(arm: ArmModel, q: Array, X_BF: RigidTransform) -> float:
+    X_error = X_BF.inverse() @ forward_kinematics(arm, q)
+    # The skew part, not arccos: it resolves angles below 1e-8.
+    R = X_error.rotation().matrix()
+    tilt = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    return float(max(tilt, np.linalg.norm(X_error.translation()), 0.0 if np.trace(R) > 1 else np.inf))
+
+
+def assert_solutions(arm: ArmModel, X_BF: RigidTransform, solutions: Array) -> None:
+    assert solutions.ndim == 2
+    assert solutions.shape[1] == 6
+    assert solutions.shape[0] <= 8
+    for i, q in enumerate(solutions):
+        assert residual(arm, q, X_BF) < RESIDUAL
+        assert (np.abs(q) <= np.pi + 1e-12).all()
+        assert (q >= arm.position_lower).all()
+        assert (q <= arm.position_upper).all()
+        assert all(apart(q, other) > 1e-6 for other in solutions[:i])
+
+
+def test_every_configuration_is_found_again_from_its_flange_pose() -> None:
+    arm = load_arm()
+    full = 0
+    for q in np.random.default_rng(0).uniform(-np.pi, np.pi, (500, 6)):
+        X_BF = forward_kinematics(arm, q)
+        solutions = inverse_kinematics(arm, X_BF)
+        assert_solutions(arm, X_BF, solutions)
+        # The closed form amplifies rounding by 1 / sin of the wrist and elbow angles; 1e-6 leaves ten digits for that.
+        assert min(apart(q, other) for other in solutions) < 1e-6
+        full += len(solutions) == 8
+    assert full > 250
+
+
+def test_calibrated_kinematics_are_solved_on_the_arm_itself() -> None:
+    arm = calibrated_arm()
+    checked = 0
+    for q in np.random.default_rng(1).uniform(-np.pi, np.pi, (200, 6)):
+        if sigma_min(arm_jacobian(arm, q)) < 0.03:
+            continue  # millimetres of calibration may merge two branches at a singularity
+        X_BF = forward_kinematics(arm, q)
+        solutions = inverse_kinematics(arm, X_BF)
+        assert_solutions(arm, X_BF, solutions)
+        assert min(apart(q, other) for other in solutions) < 1e-6
+        checked += 1
+    assert checked > 100
+
+
+def test_a_pose_out_of_reach_has_no_solution() -> None:
+    arm = load_arm()
+    R_down = RollPitchYaw(np.pi, 0, 0)
+    for p in ([1.6, 0.0, 0.3], [0.0, 0.0, 2.5], [0.0, 0.0, 0.4]):  # too far, too high, inside the shoulder's cylinder
+        X_BF = RigidTransform(R_down, p)
+        assert inverse_kinematics(arm, X_BF).shape == (0, 6)
+        assert nearest_solution(arm, X_BF, np.zeros(6)) is None
+
+
+def test_just_out_of_reach_is_out_of_reach() -> None:
+    arm = load_arm()
+    X_BF = forward_kinematics(arm, [0.3, -1.0, 0.0, -1.2, -1.5, 0.2])  # elbow stretched
+    p_shoulder = np.array([0.0, 0.0, arm.dh.d1])
+    outwards = (X_BF.translation() - p_shoulder) / np.linalg.norm(X_BF.translation() - p_shoulder)
+    beyond = RigidTransform(X_BF.rotation(), X_BF.translation() + 0.002 * outwards)
+    assert inverse_kinematics(arm, X_BF).shape[0] > 0
+    assert inverse_kinematics(arm, beyond).shape[0] == 0
+
+
+def test_the_nearest_solution_is_the_configuration_itself_turns_included() -> None:
+    arm = load_arm()
+    rng = np.random.default_rng(2)
+    for q in rng.uniform(arm.position_lower, arm.position_upper, (200, 6)):
+        found = nearest_solution(arm, forward_kinematics(arm, q), q)
+        assert found is not None
+        np.testing.assert_allclose(found, q, rtol=0, atol=1e-6)
+
+
+def test_the_nearest_solution_keeps_to_the_limits() -> None:
+    arm = load_arm()
+    q = np.array([6.2, -1.2, 1.5, -1.0, -1.5, -6.2])
+    past = q + np.array([0.2, 0, 0, 0, 0, -0.2])  # beyond the limits of joints 1 and 6
+    X_BF = forward_kinematics(arm, past)
+    found = nearest_solution(arm, X_BF, q)
+    assert found is not None
+    assert (np.abs(found) <= arm.position_upper).all()
+    assert residual(arm, found, X_BF) < RESIDUAL
+
+
+def test_at_the_wrist_singularity_the_free_joint_stays_where_it_is() -> None:
+    arm = load_arm()
+    q = np.array([0.3, -1.2, 1.5, -1.0, 0.0, 0.7])
+    X_BF = forward_kinematics(arm, q)
+    assert_solutions(arm, X_BF, inverse_kinematics(arm, X_BF))
+    found = nearest_solution(arm, X_BF, q)
+    assert found is not None
+    np.testing.assert_allclose(found, q, rtol=0, atol=1e-6)
+
+
+def test_near_means_cheap_for_the_slow_joints() -> None:
+    arm = load_arm()
+    q = np.array([0.3, -1.2, 1.5, -1.0, -1.5, 0.2])
+    X_BF = forward_kinematics(arm, q)
+    solutions = inverse_kinematics(arm, X_BF)
+    near = q + np.array([0.05, -0.05, 0.05, 0.1, -0.1, 0.3])
+    found = nearest_solution(arm, X_BF, near)
+    assert found is not None
+    cost = np.sum(((found - near) / arm.velocity_limit) ** 2)
+    assert all(cost <= np.sum(((other - near) / arm.velocity_limit) ** 2) for other in solutions)
+
+
+def test_angles_that_are_no_numbers_are_refused() -> None:
+    arm = load_arm()
+    X_BF = forward_kinematics(arm, np.zeros(6))
+    with pytest.raises(InputError, match="six finite"):
+        nearest_solution(arm, X_BF, [0, 0, 0, 0, 0, np.nan])
+    with pytest.raises(InputError, match="finite"):
+        inverse_kinematics(arm, RigidTransform([np.nan, 0, 0]))

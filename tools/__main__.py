@@ -1,0 +1,7 @@
+"""`python -m weldcal.tools` is `weldcal`."""
+
+from __future__ import annotations
+
+from weldcal.tools.cli import main
+
+main()

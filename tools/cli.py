@@ -1,0 +1,232 @@
+"""The command line: one short function per command, heavy imports inside it, so that help appears at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from weldcal.tools import console
+
+app = typer.Typer(
+    name="weldcal",
+    help="Calibrate a 3D scanner to a robot by its own flange, then feel along a weld seam.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
+app.add_typer(benchmarks, name="benchmark")
+
+OutOption = Annotated[
+    Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
+]
+SeedOption = Annotated[
+    int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
+DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")]
+BrowserOption = Annotated[
+    bool,
+    typer.Option(
+        "--browser/--no-browser", help="Open the live 3D view in the web browser, or not.", show_default="open it"
+    ),
+]
+RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
+ScenarioOption = Annotated[
+    str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
+]
+
+
+def main() -> None:
+    """Entry point of the `weldcal` console script and of `python -m weldcal.tools`."""
+    app(prog_name="weldcal")
+
+
+def version(wanted: bool) -> None:
+    """Prints the installed version and ends."""
+    if wanted:
+        from importlib.metadata import version as installed_version
+
+        typer.echo(f"weldcal {installed_version('weldcal')}")
+        raise typer.Exit()
+
+
+@app.callback()
+def weldcal(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Calibrate a 3D scanner to a robot by its own flange, then feel along a weld seam."""
+
+
+@app.command(short_help="The whole story in simulation, with a report at the end.")
+def demo(
+    scenario: ScenarioOption = "s_groove",
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    browser: BrowserOption = True,
+    realtime: RealtimeOption = False,
+    robot: Annotated[str, typer.Option("--robot", metavar="NAME", help="Which robot: simulated.")] = "simulated",
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """The whole story: calibrate, verify, scan the workpiece, plan, weld, retract; with a report at the end."""
+    with console.boundary(json_wanted=json, debug=debug):
+        from weldcal.tools.demo import DemoOptions, run_demo
+
+        options = DemoOptions(
+            scenario=scenario,
+            out=out or fresh_folder("demo", scenario, seed),
+            seed=seed,
+            browser=browser and not json,
+            realtime=realtime,
+            robot=robot,
+        )
+        with console.progress_bar("demo") as progress:
+            result = run_demo(options, progress)
+    finish("demo", result.summary(), result.folder, json_wanted=json)
+
+
+@app.command(short_help="Where is the scanner? From a dataset, or live.")
+def calibrate(
+    dataset: Annotated[Path | None, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/.")] = None,
+    scenario: Annotated[
+        str | None, typer.Option("--scenario", metavar="NAME", help="Calibrate live in this scenario instead.")
+    ] = None,
+    out: OutOption = None,
+    robot: Annotated[
+        str | None, typer.Option("--robot", metavar="NAME", help="Arm, where the dataset does not say it.")
+    ] = None,
+    flange: Annotated[
+        str | None,
+        typer.Option(
+            "--flange", metavar="NAME", help="Flange standard, such as iso9409-1-50-4-m6, where it is not said."
+        ),
+    ] = None,
+    centres: Annotated[
+        bool,
+        typer.Option("--centres", help="Also write centres.csv: the flange centre found in each scan of a dataset."),
+    ] = False,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Where is the scanner? From a folder of flange scans and robot poses, or live in a scenario."""
+    if (dataset is None) == (scenario is None):
+        raise typer.BadParameter("give either a dataset folder or --scenario NAME")
+    rows: dict[str, str] = {}
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("calibrate") as progress:
+        if dataset is not None:
+            from weldcal.tools.calibrate import calibrate_dataset
+
+            folder = out or fresh_folder("calibrate", dataset.resolve().name, seed)
+            report = calibrate_dataset(
+                dataset, folder, robot=robot, flange=flange, seed=seed, progress=progress, centres=centres
+            )
+            summary = report.summary()
+            if report.algorithm1 is not None:
+                rows["Algorithm 1"] = report.algorithm1.sentence
+        else:
+            from weldcal.tools.demo import DemoOptions, run_calibration_live
+
+            assert scenario is not None
+            folder = out or fresh_folder("calibrate", scenario, seed)
+            options = DemoOptions(scenario=scenario, out=folder, seed=seed, browser=False)
+            summary = run_calibration_live(options, progress).summary()
+    finish("calibrate", summary, folder, json_wanted=json, rows=rows)
+
+
+@app.command(short_help="Follow a seam in a scenario.")
+def weld(
+    scenario: ScenarioOption = "straight_groove",
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    browser: BrowserOption = True,
+    realtime: RealtimeOption = False,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Follow a seam in a scenario, with the scanner's pose taken as the scenario's mounting says."""
+    with console.boundary(json_wanted=json, debug=debug):
+        from weldcal.tools.demo import DemoOptions, run_weld
+
+        folder = out or fresh_folder("weld", scenario, seed)
+        options = DemoOptions(scenario=scenario, out=folder, seed=seed, browser=browser and not json, realtime=realtime)
+        with console.progress_bar("weld") as progress:
+            result = run_weld(options, progress)
+    finish("weld", result.summary(), result.folder, json_wanted=json)
+
+
+@benchmarks.command("cell")
+def benchmark_cell(
+    out: OutOption = None, seed: SeedOption = 0, json: JsonOption = False, debug: DebugOption = False
+) -> None:
+    """How fast the whole cell runs: real-time factor of the welding phase, finger camera included."""
+    folder = out or fresh_folder("benchmark", "cell", seed)
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark cell") as progress:
+        from weldcal.tools.benchmarks.cell import run_cell_benchmark
+
+        summary = run_cell_benchmark(folder, seed, progress)
+    finish("benchmark cell", summary, folder, json_wanted=json)
+
+
+@app.command(short_help="Show a finished run again.")
+def view(
+    result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],
+    browser: Annotated[
+        bool,
+        typer.Option("--browser/--no-browser", help="Open it, or only print where it is.", show_default="open it"),
+    ] = True,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Show a finished run again: its 3D recording and its report."""
+    with console.boundary(json_wanted=json, debug=debug):
+        from weldcal.tools.view import find_pages, open_pages
+
+        pages = find_pages(result)
+        opened = browser and open_pages(pages)
+        if browser and not opened:
+            console.emit_warning("No web browser could be opened here; open these files on a machine that has one.")
+        if json:
+            console.emit_json({"state": "done", "pages": pages, "opened": opened})
+        else:
+            for page in pages:
+                typer.echo(str(page))
+
+
+def fresh_folder(command: str, name: str, seed: int) -> Path:
+    """The first unused weldcal-out/<command>-<name>-seed<N>[-2, -3 ...]: an earlier result is never written over."""
+    first = Path("weldcal-out") / f"{command}-{Path(name).stem}-seed{seed}"
+    folder, number = first, 1
+    while folder.exists():
+        number += 1
+        folder = first.with_name(f"{first.name}-{number}")
+    return folder
+
+
+def finish(
+    command: str,
+    summary: Mapping[str, object],
+    folder: Path,
+    *,
+    json_wanted: bool,
+    rows: Mapping[str, str] | None = None,
+) -> None:
+    """Reports the outcome (with --json as JSON, else in rows) and ends with exit code 1 unless its `state` is done."""
+    state = str(summary.get("state", "done"))
+    if json_wanted:
+        console.emit_json(summary)
+    else:
+        console.emit_summary(
+            f"{command}: {state}", {**console.rows(summary), **(rows or {}), "written to": str(folder)}
+        )
+    if state != "done":
+        console.emit_warning(str(summary.get("reason") or f"The {command} ended {state}; the report says why."))
+        raise typer.Exit(1)

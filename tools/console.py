@@ -1,0 +1,167 @@
+"""How a command speaks to a person and to a program: progress, a short summary, one JSON line, one error boundary."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import typer
+
+from weldcal.models.errors import WeldcalError
+
+Progress = Callable[[str, float], None]
+"""Reports what is being done now and which fraction of the whole is behind us (0 to 1)."""
+
+
+def plain(value: object) -> object:
+    """The value in JSON's own types: arrays and poses as nested lists, non-finite numbers as null, paths as text."""
+    if value is None or isinstance(value, bool | int | str):
+        return value.value if isinstance(value, enum.Enum) else value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, enum.Enum):
+        return plain(value.value)
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(item) for item in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    for converter in ("tolist", "GetAsMatrix4"):  # a NumPy array or scalar; a RigidTransform
+        if hasattr(value, converter):
+            return plain(getattr(value, converter)())
+    raise TypeError(f"A {type(value).__name__} has no JSON form; convert it before it is reported.")
+
+
+def emit_json(result: Mapping[str, object]) -> None:
+    """Writes the result as one line of strict JSON (no NaN) on stdout."""
+    typer.echo(json.dumps(plain(result), allow_nan=False))
+
+
+def emit_summary(title: str, rows: Mapping[str, str]) -> None:
+    """Writes a heading and a two-column list for a person on stdout; empty texts are left out."""
+    width = max((len(name) for name in rows), default=0)
+    typer.secho(title, bold=True)
+    for name, text in rows.items():
+        if text:
+            typer.echo(f"  {name:<{width}}  {text}")
+
+
+NAMES = {
+    "n_used": "scans used",
+    "n_scans": "scans taken",
+    "held_out_mm": "held-out error",
+    "k_fold_mm": "k-fold error",
+    "tilt_deg": "tilt error",
+    "torch_speed_cv": "torch speed variation",
+    "peak_omega": "peak turning rate (rad/s)",
+    "wall_seconds": "seconds",
+}
+"""What a person calls a number of the JSON object, where its key says it too briefly."""
+
+
+def rows(result: Mapping[str, object]) -> dict[str, str]:
+    """The result's short values as a person reads them, name by name; matrices and `state` stay in the files.
+
+    A list of {id, reason} becomes one row per id, so that nothing that was refused goes unnamed.
+    """
+    found: dict[str, str] = {}
+    for key, value in result.items():
+        unit = next((unit for unit in ("mm", "deg") if key.endswith(f"_{unit}")), "")
+        name = NAMES.get(key) or key.removesuffix(f"_{unit}").replace("_error", " error").replace("torch_", "torch ")
+        if isinstance(value, list) and all(
+            isinstance(item, Mapping) and {"id", "reason"} <= set(item) for item in value
+        ):
+            found.update({f"{name} {item['id']}": str(item["reason"]) for item in value})
+        elif key not in ("state", "reason"):
+            found[name] = f"{_short(value)} {unit}".strip() if _short(value) else ""
+    return found
+
+
+def _short(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return {True: "yes", False: "no", None: ""}[value]
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, str | int):
+        return str(value)
+    if isinstance(value, Mapping):
+        numbers = {name: item for name, item in value.items() if isinstance(item, int | float)}
+        return (
+            ", ".join(f"{name} {_short(item)}" for name, item in numbers.items()) if len(numbers) == len(value) else ""
+        )
+    if isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
+        return "; ".join(value)
+    return ""
+
+
+def emit_warning(text: str) -> None:
+    """Writes one sentence on stderr that does not stop the work."""
+    typer.secho(f"weldcal: {text}", err=True, fg=typer.colors.YELLOW)
+
+
+@contextmanager
+def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
+    """Turns every failure inside the block into one sentence on stderr and exit code 1; with --json, into JSON too.
+
+    Raises:
+        typer.Exit: with code 1, for a WeldcalError, an OSError or (named an internal error) anything else.
+    """
+    try:
+        yield
+    except WeldcalError as problem:
+        sentence = str(problem)
+    except OSError as problem:
+        place = f": {problem.filename}" if problem.filename else ""
+        sentence = f"{problem.strerror or problem}{place}. Check that the path exists and may be written."
+    except (typer.Exit, typer.Abort, typer.BadParameter):
+        raise
+    except Exception as problem:
+        if debug:
+            traceback.print_exc()
+        advice = "" if debug else " Run the same command with --debug for the details, and report them."
+        sentence = f"Internal error, not a mistake of yours: {type(problem).__name__}: {problem}.{advice}"
+    else:
+        return
+    if json_wanted:
+        emit_json({"state": "failed", "reason": sentence})
+    typer.secho(f"weldcal: {sentence}", err=True, fg=typer.colors.RED)
+    raise typer.Exit(1)
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Progress]:
+    """A progress bar on stderr, or one line per new stage where stderr is not a terminal; yields the reporter."""
+    if not sys.stderr.isatty():
+        last = ""
+
+        def report_line(stage: str, fraction: float) -> None:
+            nonlocal last
+            if stage != last:
+                typer.echo(f"[{100 * fraction:3.0f} %] {title}: {stage}", err=True)
+                last = stage
+
+        yield report_line
+        return
+
+    from rich.console import Console
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=1.0)
+
+        def report_bar(stage: str, fraction: float) -> None:
+            bar.update(task, completed=fraction, description=f"{title}: {stage}")
+
+        yield report_bar

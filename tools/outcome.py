@@ -1,0 +1,142 @@
+"""What a run came to: the weld and the calibration measured against the truth that only a simulation knows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context
+
+from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
+from weldcal.systems.messages import CalibrationStatus, PlannedSeam
+from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport
+from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
+from weldcal.welding.seam import SeamCurve
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class WeldLog:
+    """The weld's time series, one row per log period; (N,) and (N, 3) arrays in B, SI units."""
+
+    time: Array
+    telemetry: dict[str, Array]
+    torch_on: NDArray[np.bool_]
+    p_BTip: Array  # the tip as the servo felt it: pose of the arm and tag
+    p_BRobot: Array  # origin of T: the "robot end effector" of the paper
+    p_BTorch: Array
+    deflection_T: Array
+    sigma_min: Array
+
+
+@dataclass(frozen=True, eq=False)
+class WeldOutcome:
+    """The weld against the true seam (simulation only)."""
+
+    log: WeldLog
+    true_seam: SeamCurve
+    planned: SeamCurve | None
+    error: PathError | None  # torch while it burned
+    speed: SpeedStatistics | None
+    plan_error: PathError | None
+
+
+@dataclass(frozen=True)
+class CalibrationError:
+    """X_BC against the truth: at the camera's origin, and for a point seen at the work point."""
+
+    translation_m: float
+    rotation_rad: float
+    at_work_m: float
+
+
+def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: Array) -> CalibrationError:
+    """Difference of two camera poses; `at_work_m` is how far a point that truly is at p_BWork lands from it."""
+    turn = RotationMatrix(X_BC_true.rotation().inverse() @ X_BC.rotation()).ToAngleAxis().angle()
+    landed = X_BC @ (X_BC_true.inverse() @ p_BWork)
+    return CalibrationError(
+        translation_m=float(np.linalg.norm(X_BC.translation() - X_BC_true.translation())),
+        rotation_rad=float(abs(turn)),
+        at_work_m=float(np.linalg.norm(landed - p_BWork)),
+    )
+
+
+def calibration_status(cell: Cell, root: Context) -> CalibrationStatus:
+    """The calibrator's status in a run's context."""
+    return cell.calibrator.status(cell.calibrator.GetMyContextFromRoot(root))
+
+
+def planned_seam(cell: Cell, root: Context) -> PlannedSeam:
+    """The seam planner's newest plan, empty in a cell that does not weld."""
+    if not cell.diagram.HasSubsystemNamed("seam_planner"):
+        return PlannedSeam()
+    planner = cell.diagram.GetSubsystemByName("seam_planner")
+    plan: PlannedSeam = planner.GetOutputPort("planned_seam").Eval(planner.GetMyContextFromRoot(root))
+    return plan
+
+
+def servo_report(cell: Cell, root: Context) -> ServoReport:
+    """The servo's newest report."""
+    if not cell.diagram.HasSubsystemNamed("welding_servo"):
+        return ServoReport()
+    servo = cell.diagram.GetSubsystemByName("welding_servo")
+    report: ServoReport = servo.GetOutputPort("servo_report").Eval(servo.GetMyContextFromRoot(root))
+    return report
+
+
+def true_seam(cell: Cell) -> SeamCurve | None:
+    """Where the torch should have run: above the real groove's root, in B."""
+    truth = cell.station.truth
+    if truth.workpiece is None or truth.X_BP is None:
+        return None
+    line = truth.workpiece.seam_P + np.array([0.0, 0.0, TORCH_ABOVE_ROOT_M])
+    R = truth.X_BP.rotation().matrix()
+    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=R[:, 2])
+
+
+def weld_log(cell: Cell, root: Context) -> WeldLog | None:
+    """The rows of the run in which the servo was at work, or None."""
+    if not cell.logs:
+        return None
+    series = {name: sink.FindLog(root) for name, sink in cell.logs.items()}
+    telemetry = series["telemetry"].data()
+    keep = telemetry[0] >= 0.0
+    if keep.sum() < 3:
+        return None
+    tool = cell.station.tool
+    assert tool is not None
+    X_BT = [forward_kinematics(cell.station.arm, q) @ tool.X_FT for q in series["position"].data()[:, keep].T]
+    deflection = series["deflection"].data()[:3, keep].T
+    return WeldLog(
+        time=np.array(series["telemetry"].sample_times()[keep]),
+        telemetry={name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)},
+        torch_on=np.array(series["torch_on"].data()[0, keep] > 0.5),
+        p_BTip=np.array([X @ d for X, d in zip(X_BT, deflection, strict=True)]),
+        p_BRobot=np.array([X.translation() for X in X_BT]),
+        p_BTorch=np.array(series["torch"].data()[:, keep].T),
+        deflection_T=np.array(deflection),
+        sigma_min=np.array(series["margin"].data()[0, keep]),
+    )
+
+
+def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
+    """Measure the weld against the truth; None where nothing was welded."""
+    log, seam = weld_log(cell, root), true_seam(cell)
+    if log is None or seam is None:
+        return None
+    plan = planned_seam(cell, root).seam
+    plan_error = None
+    if plan is not None:
+        seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m)  # type: ignore[union-attr]
+        line = plan.position(np.linspace(0.0, plan.length, 200)) - (seat - TORCH_ABOVE_ROOT_M) * np.array(
+            [0.0, 0.0, 1.0]
+        )
+        plan_error = path_error(line, seam)
+    if log.torch_on.sum() < 30:
+        return WeldOutcome(log, seam, plan, None, None, plan_error)
+    speed = speed_statistics(log.time, log.p_BTorch, log.torch_on, cell.servo_config.weld_speed_m_s)
+    return WeldOutcome(log, seam, plan, path_error(log.p_BTorch[log.torch_on], seam), speed, plan_error)

@@ -1,0 +1,95 @@
+"""Renders a report template to one self-contained HTML text, and writes files so that they are whole or not there."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import math
+import os
+import tempfile
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
+from markupsafe import Markup
+
+_MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
+
+
+def render(template: str, **context: object) -> str:
+    """The HTML of a template of this folder.
+
+    Everything from the context is escaped; a name that the template uses and the context lacks is an error. Pictures
+    are handed over as bytes (PNG, JPEG or SVG) and end inside the page, so that it needs no other file and no network.
+
+    Args:
+        template: file name in tools/report, such as "calibration.html.j2"; it extends "base.html.j2".
+        context: what the template shows.
+
+    Raises:
+        jinja2.UndefinedError: if the context lacks a name.
+    """
+    return environment().get_template(template).render(**context)
+
+
+def data_uri(picture: bytes) -> str:
+    """The picture as the text of a data: address.
+
+    Raises:
+        ValueError: if it is neither PNG, JPEG nor SVG.
+    """
+    head = picture[:1024]
+    for magic, media_type in _MEDIA_TYPES:
+        if head.startswith(magic) or (magic == b"<svg" and magic in head):
+            return f"data:{media_type};base64,{base64.b64encode(picture).decode('ascii')}"
+    raise ValueError("a picture in a report must be PNG, JPEG or SVG")
+
+
+def fixed(value: float | None, digits: int = 2) -> str:
+    """The number with so many decimals; a dash where there is none (None, NaN) and the sign for an infinite one."""
+    if value is None or math.isnan(value):
+        return "–"
+    if math.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    text = f"{value:.{digits}f}"
+    return text.replace("-", "−") if float(text) else f"{0:.{digits}f}"
+
+
+def write_atomic(path: Path, content: str | bytes) -> None:
+    """Writes a file, making its folder first: another process sees the old content or the new, never a part of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content.encode() if isinstance(content, str) else content)
+            file.flush()
+            os.fsync(file.fileno())
+        umask = os.umask(0)
+        os.umask(umask)
+        Path(temporary).chmod(0o666 & ~umask)  # mkstemp makes it private; a result is for everybody
+        Path(temporary).replace(path)
+    except BaseException:
+        with contextlib.suppress(FileNotFoundError):
+            Path(temporary).unlink()
+        raise
+
+
+def environment() -> Environment:
+    """The Jinja environment of the reports: everything escaped, every name required, one stylesheet."""
+    reports = Environment(
+        loader=PackageLoader("weldcal.tools.report", package_path="."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    reports.filters["data_uri"] = data_uri
+    reports.filters["fixed"] = fixed
+    reports.globals["stylesheet"] = _stylesheet
+    return reports
+
+
+@pass_environment
+def _stylesheet(reports: Environment) -> Markup:
+    loader = reports.loader
+    assert loader is not None
+    return Markup(loader.get_source(reports, "style.css")[0])

@@ -1,0 +1,1 @@
+"""The mathematics of following a seam: registration, deformation, refinement, servo law, guards."""

@@ -1,0 +1,197 @@
+"""How far the soft tip is pushed: an ArUco tag behind the tip, seen by the finger camera, gives a displacement."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.models.errors import InputError
+from weldcal.welding.vectors import Array, pose
+
+_DICTIONARIES = {
+    "4X4_50": cv2.aruco.DICT_4X4_50,
+    "4X4_100": cv2.aruco.DICT_4X4_100,
+    "5X5_50": cv2.aruco.DICT_5X5_50,
+    "6X6_50": cv2.aruco.DICT_6X6_50,
+    "APRILTAG_36h11": cv2.aruco.DICT_APRILTAG_36h11,
+}
+
+
+class TagError(InputError):
+    """A tag, an image or a camera matrix that cannot be used as it is."""
+
+
+@dataclass(frozen=True)
+class TagModel:
+    """The printed tag: its dictionary, its number and the length of its black side in m."""
+
+    dictionary: str = "4X4_50"
+    id: int = 0
+    size_m: float = 0.010
+
+    def __post_init__(self) -> None:
+        if self.dictionary not in _DICTIONARIES:
+            raise TagError(f"Unknown tag dictionary '{self.dictionary}'; use one of {', '.join(_DICTIONARIES)}.")
+        if not 0 <= self.id < len(_dictionary(self.dictionary).bytesList):
+            raise TagError(f"Tag id {self.id} is not in dictionary {self.dictionary}.")
+        if not (np.isfinite(self.size_m) and self.size_m > 0.0):
+            raise TagError(f"The side of a tag must be a positive length in metres, not {self.size_m}.")
+
+    @property
+    def corners_M(self) -> Array:
+        """The corners (4,3) m in the tag frame M (centre, x right, y up, z out of the print), in OpenCV's order."""
+        h = 0.5 * self.size_m
+        return np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+
+
+@dataclass(frozen=True)
+class TagLimits:
+    """What a detection must satisfy: reprojection error in px (rms), and distance from the camera in m."""
+
+    max_reprojection_px: float = 1.0
+    near_m: float = 0.005
+    far_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class TagObservation:
+    """One look at the tag.
+
+    Attributes:
+        valid: whether `X_KM` can be used.
+        reason: empty when valid, else one sentence.
+        X_KM: pose of the tag in the finger camera, None when not valid.
+        corners: (4,2) px, sub-pixel, centre of the first pixel at (0, 0); None when the tag was not seen.
+        reprojection_px: rms distance of the corners from the model's, in px; infinite when not seen.
+    """
+
+    valid: bool
+    reason: str
+    X_KM: RigidTransform | None = None
+    corners: Array | None = None
+    reprojection_px: float = float("inf")
+
+
+@lru_cache(maxsize=8)
+def _dictionary(name: str) -> Any:
+    return cv2.aruco.getPredefinedDictionary(_DICTIONARIES[name])
+
+
+@lru_cache(maxsize=8)
+def _detector(name: str) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    # The window follows the tag's cell (0.3 of it, at most 5 px): a larger one sees neighbouring edges.
+    parameters.cornerRefinementWinSize = 5
+    parameters.relativeCornerRefinmentWinSize = 0.3
+    parameters.cornerRefinementMaxIterations = 50
+    parameters.cornerRefinementMinAccuracy = 0.005
+    return cv2.aruco.ArucoDetector(_dictionary(name), parameters)
+
+
+def tag_cells(tag: TagModel) -> NDArray[np.bool_]:
+    """The print, cell by cell with its black border: (n+2, n+2), True is white, row 0 at the tag's top (+y of M)."""
+    dictionary = _dictionary(tag.dictionary)
+    n = int(dictionary.markerSize) + 2
+    return np.asarray(cv2.aruco.generateImageMarker(dictionary, tag.id, n, borderBits=1)) > 127
+
+
+def _grey(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
+        raise TagError("The finger camera image must be a (H, W) or (H, W, 3 or 4) array of uint8.")
+    if pixels.ndim == 2:
+        return np.ascontiguousarray(pixels)
+    if pixels.shape[2] == 1:
+        return np.ascontiguousarray(pixels[:, :, 0])
+    if pixels.shape[2] == 3:
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    if pixels.shape[2] == 4:
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGBA2GRAY), dtype=np.uint8)
+    raise TagError(f"The finger camera image has {pixels.shape[2]} channels; give 1, 3 or 4.")
+
+
+def detect_tag(
+    image: NDArray[np.uint8],
+    camera_matrix: ArrayLike,
+    tag: TagModel,
+    limits: TagLimits | None = None,
+    distortion: ArrayLike | None = None,
+) -> TagObservation:
+    """Find `tag` in one image and its pose in the camera.
+
+    ArUco corners refined to a fraction of a pixel, IPPE for a square, then Levenberg-Marquardt on the reprojection.
+    A tag square to the camera may tip either way (two poses explain it): its translation, which is all that
+    `deflection_from_tag` uses, is the same in both.
+
+    Args:
+        image: (H,W) or (H,W,3|4) uint8, RGB(A).
+        camera_matrix: (3,3), OpenCV's pixel convention.
+        tag: what to look for.
+        limits: what to refuse; TagLimits() when None.
+        distortion: OpenCV's coefficients, None for none.
+
+    Raises:
+        TagError: the image or camera matrix is not one.
+    """
+    bounds = limits or TagLimits()
+    K = np.asarray(camera_matrix, dtype=float)
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
+        raise TagError("The camera matrix must be a finite 3 x 3 array with positive focal lengths.")
+    lens = None if distortion is None else np.asarray(distortion, dtype=float)
+    found, ids, _ = _detector(tag.dictionary).detectMarkers(_grey(image))
+    hits = [] if ids is None else [c for c, i in zip(found, ids.ravel(), strict=True) if int(i) == tag.id]
+    if not hits:
+        return TagObservation(False, f"Tag {tag.id} is not in sight of the finger camera.")
+    if len(hits) > 1:
+        return TagObservation(False, f"Tag {tag.id} is seen {len(hits)} times; it must be unique.")
+    corners = np.asarray(hits[0], dtype=float).reshape(4, 2)
+
+    _, rotations, translations, errors = cv2.solvePnPGeneric(
+        tag.corners_M, corners, K, lens, flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    if not rotations:
+        return TagObservation(False, f"No pose explains the corners of tag {tag.id}.", None, corners)
+    best = int(np.argmin(np.asarray(errors).ravel()))
+    r, p = cv2.solvePnPRefineLM(tag.corners_M, corners, K, lens, rotations[best].copy(), translations[best].copy())
+    predicted, _ = cv2.projectPoints(tag.corners_M, r, p, K, lens)
+    gaps = np.linalg.norm(predicted.reshape(4, 2) - corners, axis=1)
+    error = float(np.sqrt(np.mean(gaps**2)))
+    position = np.asarray(p, dtype=float).reshape(3)
+    if not (np.isfinite(position).all() and np.isfinite(r).all()) or error > bounds.max_reprojection_px:
+        text = (
+            f"The corners of tag {tag.id} are {error:.2f} px from any pose; clean the tag or check the camera matrix."
+        )
+        return TagObservation(False, text, None, corners, error)
+    distance = float(np.linalg.norm(position))
+    if position[2] <= 0.0 or not bounds.near_m <= distance <= bounds.far_m:
+        text = f"Tag {tag.id} seems {1e3 * distance:.1f} mm away, out of its range; check the tag's size."
+        return TagObservation(False, text, None, corners, error)
+    X_KM = pose(cv2.Rodrigues(r)[0], position)
+    return TagObservation(True, "", X_KM, corners, error)
+
+
+def deflection_from_tag(
+    X_KM: RigidTransform, X_KM_rest: RigidTransform, R_TK: RotationMatrix, gain: float = 1.0
+) -> Array:
+    """The tip's displacement from rest, p_T(tip) - p_T(rest), (3,) m in the tip frame T.
+
+    The paper's delta (Eq. 15) is P_r - P_s: the negative of this, turned into the base.
+
+    Args:
+        X_KM: the tag now; X_KM_rest: the tag with the tip free.
+        R_TK: orientation of the finger camera in T.
+        gain: tag displacement per tip displacement, from the touch-on calibration.
+
+    Raises:
+        TagError: gain is zero or not finite.
+    """
+    if not np.isfinite(gain) or abs(gain) < 1e-3:
+        raise TagError(f"The gain from tip to tag must be a finite number away from zero, not {gain}.")
+    return np.asarray(R_TK.matrix() @ (np.asarray(X_KM.translation()) - np.asarray(X_KM_rest.translation())) / gain)

@@ -1,0 +1,151 @@
+"""The seam as the tip felt it: points committed only once the contact that gave them has proved itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.welding.vectors import Array
+
+_EMPTY_POINTS = np.zeros((0, 3))
+_EMPTY_ARC = np.zeros(0)
+
+
+class PendingPoint(NamedTuple):
+    """A point (3,) m in B that waits for the frames after it, and its arc parameter m."""
+
+    point: Array
+    arc: float
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """When a point counts, and how the path is smoothed.
+
+    Attributes:
+        frames_to_commit: further good frames a point waits for.
+        fit_sigma_m: width of the local fit's Gaussian; 0.4 of the plan's radius where that is less.
+        fit_sigma_max_m: how wide it may grow to find points.
+        fit_points: effective points it grows for.
+        bridge_from_m: farther than this from any point a gap is bridged on the moved plan instead.
+        slope_ridge: weight that holds the fitted slope to the plan's, in effective points at one fit width.
+    """
+
+    frames_to_commit: int = 4
+    fit_sigma_m: float = 1.5e-3
+    fit_sigma_max_m: float = 3.0e-3
+    fit_points: float = 5.0
+    bridge_from_m: float = 1.5e-3
+    slope_ridge: float = 0.2
+
+
+@dataclass(frozen=True)
+class RefinedSeam:
+    """Committed tactile points and those still pending. Grows by new values; nothing in it is ever changed.
+
+    Attributes:
+        points: (n,3) m in B, the tip's centre.
+        arc: (n,) m, the commanded tip progress at each point, increasing.
+        pending: points waiting for confirmation, oldest first.
+    """
+
+    points: Array
+    arc: Array
+    pending: tuple[PendingPoint, ...] = ()
+
+    @classmethod
+    def empty(cls) -> RefinedSeam:
+        """A seam nobody has touched yet."""
+        return cls(_EMPTY_POINTS, _EMPTY_ARC)
+
+    def __len__(self) -> int:
+        return len(self.arc)
+
+
+def tip_point(X_BT_at_capture: RigidTransform, deflection_T: Array) -> Array:
+    """REFINE (lines 16-17 of Algorithm 2): P_s = P_r - delta at the frame's own time, (3,) m; delta = -R deflection."""
+    return np.asarray(X_BT_at_capture.translation() + X_BT_at_capture.rotation().matrix() @ deflection_T)
+
+
+def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig) -> RefinedSeam:
+    """The seam after one more good frame: its point queues, and the oldest of a full queue is committed."""
+    pending = (*seam.pending, PendingPoint(point, arc))
+    if len(pending) <= config.frames_to_commit:
+        return replace(seam, pending=pending)
+    oldest, pending = pending[0], pending[1:]
+    # The path is a function of progress: a point that does not advance it would make the fit's slope meaningless.
+    if len(seam) and oldest.arc <= seam.arc[-1] + 1e-6:
+        return replace(seam, pending=pending)
+    return RefinedSeam(np.vstack([seam.points, oldest.point]), np.append(seam.arc, oldest.arc), pending)
+
+
+def drop_pending(seam: RefinedSeam) -> RefinedSeam:
+    """The seam after contact was lost: points felt while it was going are not the seam."""
+    return replace(seam, pending=()) if seam.pending else seam
+
+
+class LocalFit(NamedTuple):
+    """The refined path near one arc parameter.
+
+    Attributes:
+        point, tangent: (3,), the tangent of unit length along travel.
+        bend: (3,) second derivative 1/m.
+        speed: path length per arc parameter.
+        effective: effective number of points behind the fit.
+    """
+
+    point: Array
+    tangent: Array
+    bend: Array
+    speed: float
+    effective: float
+
+
+def local_fit(
+    seam: RefinedSeam, arc: float, plan_tangent: Array, radius: float, config: RefinementConfig
+) -> LocalFit | None:
+    """A quadratic fitted to the points around `arc`, on both sides of it (the tip is a chord ahead of the torch).
+
+    Args:
+        seam: committed points.
+        arc: parameter m.
+        plan_tangent: (3,) registered plan's tangent, towards which the slope is held.
+        radius: the plan's radius of curvature m there.
+        config: widths.
+
+    Returns:
+        None where even the widest window holds fewer than 3 effective points.
+    """
+    sigma = max(min(0.4 * radius, config.fit_sigma_m), 0.3e-3)
+    while True:
+        low, high = np.searchsorted(seam.arc, (arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
+        n = high - low
+        if n >= 3:
+            x = (seam.arc[low:high] - arc) / sigma
+            w = np.exp(-0.5 * x * x)
+            effective = float(w.sum() ** 2 / (w @ w))
+            if effective >= config.fit_points:
+                break
+        if sigma >= config.fit_sigma_max_m:
+            if n < 4 or effective < 3.0:
+                return None
+            break
+        sigma = min(1.5 * sigma, config.fit_sigma_max_m)
+    basis = np.stack([np.ones(n), x, x * x])
+    weighted = basis * w
+    normal = weighted @ basis.T
+    rhs = weighted @ (seam.points[low:high] - seam.points[low])
+    ridge = config.slope_ridge
+    normal[1, 1] += ridge
+    normal[2, 2] += 1e-6
+    rhs[1] += ridge * sigma * plan_tangent
+    c = np.linalg.solve(normal, rhs)
+    slope = c[1] / sigma
+    speed = math.sqrt(float(slope @ slope))
+    if not (math.isfinite(speed) and speed > 1e-3):
+        return None
+    return LocalFit(c[0] + seam.points[low], slope / speed, 2.0 * c[2] / sigma**2, speed, effective)

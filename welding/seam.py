@@ -1,0 +1,246 @@
+"""A weld seam as a curve in space: where it is, where it heads and which way is up, by its own arc length."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydrake.math import RigidTransform
+from scipy.interpolate import CubicSpline, make_smoothing_spline
+
+from weldcal.models.errors import InputError
+from weldcal.welding.vectors import Array, cross, dot, norm
+
+_REPEAT_M = 1e-6  # two neighbours closer than a micrometre are one point told twice
+_KNOT_M = 1e-3  # knots at most a millimetre apart: a 1 mm radius is still a curve
+
+
+class SeamError(InputError):
+    """The points do not make a seam."""
+
+
+class TooFewSeamPoints(SeamError):
+    """A cubic needs four points."""
+
+
+class RepeatedSeamPoints(SeamError):
+    """Neighbouring points coincide, so the seam has no direction there."""
+
+
+class NonFiniteSeamPoints(SeamError):
+    """A point or normal is not a number."""
+
+
+class SeamFrame(NamedTuple):
+    """The seam at one arc length: position (3,) m, unit tangent, in-plane left normal and up (3,), curvature 1/m."""
+
+    position: Array
+    tangent: Array
+    normal: Array
+    up: Array
+    curvature: float
+
+
+@dataclass(frozen=True)
+class SeamCurve:
+    """An arc-length cubic spline of a seam in one frame, straight beyond both ends.
+
+    Curvature is signed: positive where the seam turns towards its left normal (up x tangent).
+
+    Attributes:
+        knots: (n+1,) arc lengths in m, from 0 to `length`.
+        coefficients: (n, 4, 3) cubic coefficients in m, highest power first, by distance past each knot.
+        ups: (n+1, 3) up-normal at each knot, away from the work.
+    """
+
+    knots: Array
+    coefficients: Array
+    ups: Array
+
+    @classmethod
+    def from_points(cls, points: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0), smoothing: float | None = None) -> Self:
+        """The curve through `points` (N,3) m, in the order of travel.
+
+        Args:
+            points: (N,3) in m.
+            up: (3,), or (N,3) where the surface bends; need not be unit length.
+            smoothing: None interpolates; a number is the penalty of a cubic smoothing spline over arc length, in m^3
+                (features much shorter than its fourth root times the fourth root of the spacing are ironed out).
+
+        Raises:
+            TooFewSeamPoints, RepeatedSeamPoints, NonFiniteSeamPoints, SeamError: what the points lack.
+        """
+        p = np.asarray(points, dtype=float)
+        if p.ndim != 2 or p.shape[1] != 3:
+            raise SeamError(f"A seam needs an (N, 3) array of points in metres; this one has shape {p.shape}.")
+        if len(p) < 4:
+            raise TooFewSeamPoints(f"A seam needs at least 4 points; {len(p)} were given.")
+        b = np.broadcast_to(np.asarray(up, dtype=float), p.shape).copy()
+        if not (np.isfinite(p).all() and np.isfinite(b).all()):
+            raise NonFiniteSeamPoints("Remove the seam points or normals that are not finite numbers.")
+        steps = np.linalg.norm(np.diff(p, axis=0), axis=1)
+        if (steps < _REPEAT_M).any():
+            raise RepeatedSeamPoints(f"Remove the repeated seam point {int(np.argmin(steps)) + 1}.")
+        lengths = np.linalg.norm(b, axis=1)
+        if (lengths < 1e-9).any():
+            raise SeamError("Every up-normal of a seam needs a direction; one has length zero.")
+        b /= lengths[:, None]
+
+        s = np.concatenate([[0.0], np.cumsum(steps)])
+        if smoothing is not None and len(p) >= 5:
+            p = np.column_stack([make_smoothing_spline(s, p[:, k], lam=smoothing)(s) for k in range(3)])
+            s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
+        # Twice: measure the arc of the spline, lay knots evenly along it, spline again; its speed is 1 within 1e-4.
+        for _ in range(2):
+            curve = CubicSpline(s, np.column_stack([p, b]))
+            fine = np.linspace(0.0, s[-1], 8 * max(len(s), math.ceil(s[-1] / _KNOT_M)) + 1)
+            middle = 0.5 * (fine[1:] + fine[:-1])
+            speed = np.linalg.norm(curve(middle, 1)[:, :3], axis=1)
+            arc = np.concatenate([[0.0], np.cumsum(speed * np.diff(fine))])
+            n = max(len(s) - 1, math.ceil(arc[-1] / _KNOT_M), 3)
+            s_even = np.linspace(0.0, arc[-1], n + 1)
+            values = curve(np.interp(s_even, arc, fine))
+            s, p, b = s_even, values[:, :3], values[:, 3:]
+        b /= np.linalg.norm(b, axis=1, keepdims=True)
+        coefficients = np.ascontiguousarray(np.transpose(CubicSpline(s, p).c, (1, 0, 2)))
+        tangents = coefficients[:, 2]
+        if (np.abs(np.einsum("ij,ij->i", tangents, b[:-1])) > 0.9).any():
+            raise SeamError("The up-normal of a seam must stand across it; here it points along the seam.")
+        return cls(s, coefficients, b)
+
+    @property
+    def length(self) -> float:
+        """The arc length in m."""
+        return float(self.knots[-1])
+
+    def _pieces(self, s: Array) -> tuple[Array, Array, Array]:
+        """(index, distance past the knot, distance past the nearer end) for each arc length."""
+        inside = np.clip(s, 0.0, self.knots[-1])
+        # The knots are even, so the piece is a division; the last knot belongs to the last piece.
+        index = np.minimum((inside / self.knots[1]).astype(int), len(self.coefficients) - 1)
+        return index, inside - self.knots[index], s - inside
+
+    def position(self, s: ArrayLike) -> Array:
+        """Points (...,3) m at arc lengths s (...) m; straight on beyond the ends."""
+        index, x, beyond = self._pieces(np.asarray(s, dtype=float))
+        c, x = self.coefficients[index], x[..., None]
+        p = ((c[..., 0, :] * x + c[..., 1, :]) * x + c[..., 2, :]) * x + c[..., 3, :]
+        return np.asarray(p + beyond[..., None] * self.tangent(s) if np.any(beyond) else p)
+
+    def _derivative(self, s: ArrayLike) -> Array:
+        index, x, _ = self._pieces(np.asarray(s, dtype=float))
+        c, x = self.coefficients[index], x[..., None]
+        return np.asarray((3.0 * c[..., 0, :] * x + 2.0 * c[..., 1, :]) * x + c[..., 2, :])
+
+    def tangent(self, s: ArrayLike) -> Array:
+        """Unit tangents (...,3) at arc lengths s (...) m."""
+        d = self._derivative(s)
+        return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True))
+
+    def up(self, s: ArrayLike) -> Array:
+        """Up-normals (...,3), square to the tangent, at arc lengths s (...) m."""
+        index, x, _ = self._pieces(np.asarray(s, dtype=float))
+        share = (x / self.knots[1])[..., None]
+        b = self.ups[index] * (1.0 - share) + self.ups[index + 1] * share
+        t = self.tangent(s)
+        b = b - np.sum(b * t, axis=-1, keepdims=True) * t
+        return np.asarray(b / np.linalg.norm(b, axis=-1, keepdims=True))
+
+    def normal(self, s: ArrayLike) -> Array:
+        """In-plane left normals (...,3), up x tangent, at arc lengths s (...) m."""
+        return np.cross(self.up(s), self.tangent(s))
+
+    def curvature(self, s: ArrayLike) -> Array:
+        """Signed in-plane curvature (...) in 1/m, positive to the left; zero beyond the ends."""
+        index, x, beyond = self._pieces(np.asarray(s, dtype=float))
+        c = self.coefficients[index]
+        second = 6.0 * c[..., 0, :] * x[..., None] + 2.0 * c[..., 1, :]
+        bend = np.sum(second * self.normal(s), axis=-1)
+        return np.asarray(np.where(beyond == 0.0, bend, 0.0))
+
+    def frame(self, s: float) -> SeamFrame:
+        """Everything about the seam at one arc length s m, in about 15 microseconds."""
+        last = float(self.knots[-1])
+        inside = 0.0 if s < 0.0 else last if s > last else s
+        step = float(self.knots[1])
+        i = min(int(inside / step), len(self.coefficients) - 1)
+        x = inside - i * step
+        c0, c1, c2, c3 = self.coefficients[i]
+        d = (3.0 * x * c0 + 2.0 * c1) * x + c2
+        t = d / norm(d)
+        p = ((c0 * x + c1) * x + c2) * x + c3
+        bend = 0.0
+        share = x / step
+        b = (1.0 - share) * self.ups[i] + share * self.ups[i + 1]
+        b = b - dot(b, t) * t
+        b = b / norm(b)
+        n = cross(b, t)
+        if s == inside:
+            bend = dot(6.0 * x * c0 + 2.0 * c1, n)
+        else:
+            p = p + (s - inside) * t
+        return SeamFrame(p, t, n, b, bend)
+
+    def nearest(self, p: Array, s_near: float, window: float = 0.01) -> float:
+        """The arc length m of the point nearest to p (3,) m, by Newton's steps from s_near, never `window` m away."""
+        s, last = s_near, float(self.knots[-1])
+        step = float(self.knots[1])
+        for _ in range(3):
+            inside = 0.0 if s < 0.0 else last if s > last else s
+            i = min(int(inside / step), len(self.coefficients) - 1)
+            x = inside - i * step
+            c0, c1, c2, c3 = self.coefficients[i]
+            d = (3.0 * x * c0 + 2.0 * c1) * x + c2
+            gap = p - ((c0 * x + c1) * x + c2) * x - c3
+            slope = dot(d, d)
+            if s == inside:
+                # A bend towards p sharper than the distance would turn Newton's step round: keep half of the slope.
+                slope = max(slope - dot(gap, 6.0 * x * c0 + 2.0 * c1), 0.5 * slope)
+            step_s = dot(gap, d) / slope - (s - inside)
+            s = min(max(s + step_s, s_near - window), s_near + window)
+            if abs(step_s) < 1e-8:
+                break
+        return s
+
+    def project(self, p: ArrayLike, s_near: ArrayLike | None = None, window: float | None = None) -> Array:
+        """Arc lengths (...) m of the seam points nearest to p (...,3) m.
+
+        Args:
+            p: (...,3) in m.
+            s_near: (...) m, where to look; the whole seam and its straight extensions when None.
+            window: how far from s_near to look, in m; everywhere when None.
+        """
+        q = np.asarray(p, dtype=float)
+        centre = np.broadcast_to(0.5 * self.length if s_near is None else np.asarray(s_near, dtype=float), q.shape[:-1])
+        reach = window if window is not None and s_near is not None else self.length + float(np.max(np.abs(centre)))
+        n = max(5, min(2 * math.ceil(reach / (2.0 * _KNOT_M)) + 1, 2001))
+        trial = centre[..., None] + np.linspace(-reach, reach, n)
+        gaps = np.linalg.norm(q[..., None, :] - self.position(trial), axis=-1)
+        s = np.take_along_axis(trial, np.argmin(gaps, axis=-1)[..., None], axis=-1)[..., 0]
+        for _ in range(5):
+            t = self.tangent(s)
+            gap = q - self.position(s)
+            slope = np.maximum(1.0 - np.sum(gap * self.normal(s), axis=-1) * self.curvature(s), 0.5)
+            s = np.clip(s + np.sum(gap * t, axis=-1) / slope, centre - reach, centre + reach)
+        return np.asarray(s)
+
+    def transformed(self, X: RigidTransform) -> Self:
+        """The same seam seen from another frame: X maps this curve's frame into that one."""
+        R, p = X.rotation().matrix(), X.translation()
+        coefficients = self.coefficients @ R.T
+        coefficients[:, 3] += p
+        return type(self)(self.knots, coefficients, self.ups @ R.T)
+
+    def raised(self, height: float, left: float = 0.0) -> Self:
+        """The line `height` m above this seam and `left` m to its left, by arc length of its own."""
+        n = len(self.knots)
+        s = self.knots
+        points = self.position(s) + height * self.up(s) + left * self.normal(s)
+        return type(self).from_points(points, self.ups) if n >= 4 else self
+
+    def __post_init__(self) -> None:
+        for array in (self.knots, self.coefficients, self.ups):
+            array.flags.writeable = False

@@ -1,0 +1,275 @@
+"""The welding servo: one pure step from what is felt and where the tool is to its motion and the arc."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from weldcal.welding.contact import beyond_limit, contact_lost, is_new_frame, with_frame, with_point, with_progress
+from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
+from weldcal.welding.plan_fit import PlanFit
+from weldcal.welding.refinement import drop_pending
+from weldcal.welding.seam import SeamCurve, SeamFrame
+from weldcal.welding.servo_state import Diagnostics, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.touch import touch_step
+from weldcal.welding.track import guarded_motion, tip_frame, torch_target
+from weldcal.welding.vectors import Array, clip, dot, finite
+
+_MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
+
+
+def welding_step(
+    state: WeldingState, sample: ServoSample, plan: SeamCurve, config: ServoConfig
+) -> tuple[WeldingState, WeldingCommand]:
+    """One tick (125 Hz) of Algorithm 2, guarded: TOUCH, TRACK, COAST over gaps, FINISH past the end, DONE or FAULT.
+
+    Args:
+        state: what the last tick returned; `WeldingState()` at the start.
+        sample: time, pose of T in B, newest finger-camera frame.
+        plan: the planned seam in B; it is read at the first tick and kept.
+        config: settings.
+
+    Returns:
+        (state, command); every number of the command is finite. A fault takes the arc off at once, the motion within
+        `ramp_s`, and stays until a new state is made. Source: flange calibration and tactile welding paper, Section
+        2.2.2 and Algorithm 2, with the corrections of docs/weld_law.md.
+    """
+    dt = config.period_s if state.time is None else clip(sample.time - state.time, 0.0, 0.05)
+    if state.plan_fit is None:
+        state = _begin(state, sample, plan, config)
+    if not finite(sample.X_BT.translation()):
+        state = _fault(state, sample.time, "The robot's pose is not a number; check the robot's connection.")
+    state = replace(state, time=sample.time)
+
+    is_new = state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
+    before = state
+    if is_new:
+        state = with_frame(state, sample, _frame_at_tip(state), config)
+    state = _watch(state, sample, config)
+    if state.phase == Phase.TOUCH:
+        return _touch(state, sample, is_new, config, dt)
+    if is_new and state.phase in _MOVING:
+        state = _contact(before, state, config)
+    if state.phase in _MOVING:
+        return _weld(state, sample, config, dt)
+    return _rest(state, sample, config)
+
+
+def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: ServoConfig) -> WeldingState:
+    tip_line = plan.raised(config.tool.tip_seat_height_m) if config.tool.tip_seat_height_m else plan
+    state = replace(
+        state, plan_fit=PlanFit.start(tip_line), started=sample.time, s_tip=config.touch.arc_m, s_end=tip_line.length
+    )
+    try:
+        check_feasible(tip_line, config.tool.torch_offset_m, config.weld_speed_m_s)
+    except InfeasibleSeam as problem:
+        return _fault(state, sample.time, str(problem))
+    return state
+
+
+def _frame_at_tip(state: WeldingState) -> SeamFrame:
+    assert state.plan_fit is not None
+    return state.plan_fit.curve.frame(state.s_tip)
+
+
+def _fault(state: WeldingState, now: float, reason: str) -> WeldingState:
+    """The first fault is kept; the arc goes off in this very tick."""
+    if state.phase == Phase.FAULT:
+        return state
+    return replace(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_at=now)
+
+
+def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
+    """What stops a weld at any moment: a hidden tag, or a tip pushed too far."""
+    if state.phase in (Phase.DONE, Phase.FAULT):
+        return state
+    if beyond_limit(state, config) and state.phase != Phase.FINISH:
+        text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
+        return _fault(state, sample.time, text)
+    # Past the seam's end the tip has nothing more to say, and the tag is not needed.
+    blind = sample.time - max(state.frame_time, state.started)
+    if state.phase != Phase.FINISH and blind > config.contact.hidden_s:
+        text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
+        return _fault(state, sample.time, text)
+    return state
+
+
+def _touch(
+    state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
+) -> tuple[WeldingState, WeldingCommand]:
+    assert state.plan_fit is not None
+    seam = state.plan_fit.curve.frame(config.touch.arc_m)
+    state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
+    if problem is not None:
+        return _rest(_fault(state, sample.time, problem), sample, config)
+    state = _slewed(state, lateral, upward, config, dt)
+    V = np.concatenate([np.zeros(3), state.u_n * seam.normal + state.u_a * seam.up])
+    if seated:
+        assert state.plan_fit is not None
+        curve, p_BT = state.plan_fit.curve, np.asarray(sample.X_BT.translation())
+        s = curve.nearest(p_BT, config.touch.arc_m)
+        p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
+        s_torch = curve.nearest(p_BW, s - config.tool.torch_offset_m, 0.1)
+        state = replace(state, phase=Phase.TRACK, proven=True, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch)
+    return _answer(state, V, config, Diagnostics(omega=0.0))
+
+
+def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> WeldingState:
+    """What a new frame means for the phase."""
+    limits = config.contact
+    assert state.plan_fit is not None
+    if state.phase == Phase.TRACK:
+        if not contact_lost(before, state, config):
+            return with_point(state, config)
+        state = replace(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0)
+        if state.s_tip > state.s_end - limits.end_window_m:
+            assert before.measurement is not None
+            assert state.plan_fit is not None
+            last = state.plan_fit.curve.nearest(before.measurement.point, state.s_tip)
+            low, high = state.s_end - limits.end_window_m, state.s_end + limits.end_window_m
+            return replace(_finish(state), s_end=clip(last, low, high))
+        return replace(state, phase=Phase.COAST, lost_at=state.s_tip, residual_at_loss=_tip_residual(state))
+    if state.phase == Phase.COAST:
+        # Just after the loss the springs are still relaxing: that is no new contact.
+        settled = state.s_tip - state.lost_at > limits.regain_after_m
+        touching = settled and state.delta_axial > limits.regain_axial_m
+        regained = state.regained + 1 if touching else 0
+        if regained >= limits.regain_frames:
+            return replace(state, phase=Phase.TRACK, regained=0, proven=False)
+        return replace(state, regained=regained)
+    return state
+
+
+def _tip_residual(state: WeldingState) -> Array:
+    """How far the newest tactile points lie off the moved plan, (2,) m to the left and up."""
+    assert state.plan_fit is not None
+    points, curve = state.refined.points[-8:], state.plan_fit.curve
+    if not len(points):
+        return np.zeros(2)
+    s = curve.project(points, state.s_tip, 0.02)
+    gap = points - curve.position(s)
+    return np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
+
+
+def _finish(state: WeldingState) -> WeldingState:
+    return replace(state, phase=Phase.FINISH, steer=0.0, hold=np.full(2, math.nan))
+
+
+def _weld(
+    state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
+) -> tuple[WeldingState, WeldingCommand]:
+    assert state.plan_fit is not None
+    curve = state.plan_fit.curve
+    p_BT = np.asarray(sample.X_BT.translation())
+    at = p_BT
+    if state.phase == Phase.TRACK and state.measurement is not None:
+        # Inside a corner the tool cuts it, and is beside the second leg while the tip is still on the first.
+        at = state.measurement.point + (p_BT - state.measurement.p_BT)
+    s_tip = curve.nearest(at, state.s_tip)
+    seam = curve.frame(s_tip)
+    gap = p_BT - seam.position
+    off = np.array((dot(gap, seam.normal), dot(gap, seam.up)))
+    state = replace(state, s_tip=s_tip)
+    if state.phase == Phase.COAST and s_tip - state.lost_at > config.contact.coast_m:
+        text = (
+            f"Contact lost for {1e3 * config.contact.coast_m:.0f} mm in the middle of the seam; check the groove there."
+        )
+        return _rest(_fault(state, sample.time, text), sample, config)
+    beyond = config.contact.end_window_m if state.phase == Phase.TRACK else 0.0
+    if state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
+        state = _finish(state)
+    if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
+        state = replace(state, hold=off)
+
+    state = _slewed(state, *_servo(state, off, sample, config), config, dt)
+    p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
+    target = torch_target(state, curve, p_BW, config)
+    motion = guarded_motion(
+        state, sample.X_BT, tip_frame(seam, state.steer), target, (state.u_n, state.u_a), config, dt
+    )
+    e = p_BW - target.point
+    e_n, e_b = dot(e, target.normal), dot(e, target.up)
+    state = replace(
+        with_progress(state, sample.time, motion.v_tip, dt),
+        s_torch=target.s,
+        torch_arc=target.arc,
+        residual=target.residual,
+        v_tip=motion.v_tip,
+        omega=motion.omega,
+    )
+    error = math.hypot(e_n, e_b)
+    inside = 0.0 <= target.s < state.s_end
+    if state.torch_on and error > config.torch_error_max_m:
+        text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
+        return _rest(_fault(state, sample.time, text), sample, config)
+    state = replace(state, torch_on=inside and (state.torch_on or error < config.ignition_error_m))
+    if target.s >= state.s_end:
+        done = replace(state, phase=Phase.DONE, torch_on=False, V_stop=state.V, stopped_at=sample.time)
+        return _rest(done, sample, config)
+    diagnostics = Diagnostics(
+        e_t=e_n,
+        e_height=e_b,
+        n_d_dot_n_t=motion.conditioning.cos_torch,
+        conditioning=motion.conditioning.value,
+        omega=motion.omega,
+        torch_speed=motion.v_torch,
+        tip_speed=motion.v_tip,
+        p_BTorch_target=target.point,
+    )
+    return _answer(state, motion.V_BT, config, diagnostics)
+
+
+def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
+    """The tip's wanted lateral and upward speed, m/s: by feel in TRACK, by the moved plan in COAST and FINISH."""
+    if state.phase == Phase.TRACK:
+        # A frame later than two periods says where the tip was, not where it is: its correction fades out.
+        fresh = clip(2.0 - (sample.time - state.frame_time) / 0.1, 0.0, 1.0)
+        lateral = config.k_p * (config.delta_d_m - state.delta_n)
+        return fresh * lateral, fresh * config.k_z * (state.delta_axial - config.axial_d_m)
+    if state.phase == Phase.COAST:
+        wanted = state.residual_at_loss + np.array((0.0, -config.contact.hover_m))
+    else:
+        wanted = state.hold
+    gap = wanted - off
+    return config.k_follow * float(gap[0]), config.k_follow * float(gap[1])
+
+
+def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
+    """The servo speeds within their limit and slew."""
+    top, step = (
+        max(config.servo_speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
+        config.servo_slew_m_s2 * dt,
+    )
+    u_n = clip(clip(lateral, -top, top), state.u_n - step, state.u_n + step)
+    u_a = clip(clip(upward, -top, top), state.u_a - step, state.u_a + step)
+    return replace(state, u_n=u_n, u_a=u_a)
+
+
+def _rest(state: WeldingState, sample: ServoSample, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
+    """DONE and FAULT: the last motion fades to nothing; the arc is already off."""
+    share = clip(1.0 - (sample.time - state.stopped_at) / config.ramp_s, 0.0, 1.0)
+    return _answer(replace(state, torch_on=False), share * state.V_stop, config, Diagnostics())
+
+
+def _answer(
+    state: WeldingState, V: Array, config: ServoConfig, diagnostics: Diagnostics
+) -> tuple[WeldingState, WeldingCommand]:
+    if not finite(V):
+        now = state.time or 0.0
+        state = _fault(state, now, "The welding law gave no number here; this is a defect, report it with a recording.")
+        V = state.V_stop
+    measurement = state.measurement
+    diagnostics = replace(
+        diagnostics,
+        delta_n=state.delta_n,
+        delta_axial=state.delta_axial,
+        s_tip=state.s_tip,
+        s_torch=state.s_torch,
+        p_BTip=None if measurement is None else measurement.point,
+        gain=state.gain,
+        n_points=len(state.refined),
+    )
+    state = replace(state, V=V)
+    return state, WeldingCommand(V, state.torch_on, state.phase, state.reason, diagnostics)

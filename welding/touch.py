@@ -1,0 +1,153 @@
+"""TOUCH: come down beside the planned seam, feel sideways until the tip falls into the groove and leans on its wall."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.welding.seam import SeamCurve, SeamFrame
+from weldcal.welding.servo_state import GainFit, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.vectors import clip, dot, pose, unit
+
+_TAG_SIGMA_M = 0.05e-3  # what a frame's deflection may be off while the gain is fitted
+_SEATED_FRAMES = 3
+_WALL_FRAMES = 15
+
+
+def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
+    """X_BT to bring the arm to before the weld: above the face, on the -n side of the seam's start, torch behind.
+
+    Args:
+        plan: the planned seam in B.
+        config: geometry; the tip's line is `tool.tip_seat_height_m` above the plan.
+    """
+    touch, tool = config.touch, config.tool
+    frame = plan.frame(touch.arc_m)
+    behind = plan.frame(touch.arc_m - tool.torch_offset_m)
+    x = frame.position - behind.position
+    x = unit(x - dot(x, frame.up) * frame.up, frame.tangent)
+    R = np.column_stack([x, np.cross(frame.up, x), frame.up])
+    height = tool.tip_seat_height_m + tool.tip_drop_m + touch.height_m
+    p_BT = frame.position + height * frame.up + touch.offset_m * frame.normal
+    return pose(R, p_BT)
+
+
+def touch_step(
+    state: WeldingState, sample: ServoSample, is_new: bool, seam: SeamFrame, config: ServoConfig
+) -> tuple[WeldingState, float, float, str | None, bool]:
+    """One tick of the search.
+
+    Args:
+        seam: the tip's planned line at the touch arc; `is_new`: whether the state holds a frame of this tick.
+
+    Returns:
+        (state, wanted lateral speed, wanted upward speed m/s, fault sentence or None, whether the tip is seated).
+    """
+    touch, t = config.touch, state.touch
+    gap = sample.X_BT.translation() - seam.position
+    left, height = dot(gap, seam.normal), dot(gap, seam.up)
+    deep = state.delta_axial
+    depth_servo = clip(config.k_z * (deep - config.axial_d_m), -config.servo_speed_m_s, config.servo_speed_m_s)
+    if height < config.tool.tip_drop_m - touch.depth_m - config.axial_d_m:
+        return state, 0.0, 0.0, "Seam not found: the tip met no work; check the plan's height.", False
+
+    if t.step == "descend":
+        fast = height > config.tool.tip_drop_m + touch.slow_height_m and deep < 0.3 * config.axial_d_m
+        speed = touch.fast_m_s if fast else touch.slow_m_s
+        if is_new and deep > 0.9 * config.axial_d_m:
+            return _next(state, "settle", sample.time), 0.0, 0.0, None, False
+        return state, 0.0, -min(speed, config.k_z * max(0.0, config.axial_d_m - deep) + 0.3e-3), None, False
+
+    assert state.measurement is not None
+    tip_height = dot(state.measurement.point - seam.position, seam.up)
+    if t.step == "settle":
+        if sample.time - t.since < touch.settle_s:
+            return state, 0.0, depth_servo, None, False
+        t = replace(t, step="search", since=sample.time, face_height=tip_height, start_left=left)
+        return replace(state, touch=t), 0.0, depth_servo, None, False
+
+    if t.step == "search":
+        return _search(state, is_new, left, tip_height, depth_servo, config, sample.time)
+    return _press(state, sample, is_new, left, seam, config)
+
+
+def _search(
+    state: WeldingState,
+    is_new: bool,
+    left: float,
+    tip_height: float,
+    depth_servo: float,
+    config: ServoConfig,
+    now: float,
+) -> tuple[WeldingState, float, float, str | None, bool]:
+    touch, t = config.touch, state.touch
+    half_drop = 0.5 * config.tool.tip_drop_m
+    dropped = tip_height < t.face_height - half_drop or tip_height < half_drop
+    leaning = state.delta_n > 0.9 * config.delta_d_m
+    frames = t.seated_frames
+    if is_new:
+        pressed = abs(state.delta_axial - config.axial_d_m) < 0.25 * config.axial_d_m
+        frames = frames + 1 if leaning and (pressed or not dropped) else 0
+        t = replace(t, seated_frames=frames)
+        state = replace(state, touch=t)
+    if dropped and frames >= _SEATED_FRAMES:
+        if not touch.calibrate_gain:
+            return state, 0.0, depth_servo, None, True
+        return _next(state, "press up", now, left), 0.0, 0.0, None, False
+    if not dropped and frames >= _WALL_FRAMES:
+        return (
+            state,
+            0.0,
+            0.0,
+            "Seam not found: the tip met a wall but no groove; check the plan and clear the work.",
+            False,
+        )
+    if left - t.start_left > touch.range_m:
+        text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the work again."
+        return state, 0.0, 0.0, text, False
+    # While the tip falls there is little holding it down: wait for the depth servo, or it climbs out over the far wall.
+    held = clip(2.0 * state.delta_axial / config.axial_d_m - 0.5, 0.0, 1.0)
+    lateral = clip(config.k_p * (config.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
+    return state, held * lateral, depth_servo, None, False
+
+
+_LEGS = {"press up": ("press down", 1.0), "press down": ("press back", -1.0), "press back": ("", 0.0)}
+
+
+def _press(
+    state: WeldingState, sample: ServoSample, is_new: bool, left: float, seam: SeamFrame, config: ServoConfig
+) -> tuple[WeldingState, float, float, str | None, bool]:
+    """Press against the seated tip and back: its wall does not move, so deflection per motion is the tag's gain."""
+    touch, t = config.touch, state.touch
+    following, sign = _LEGS[t.step]
+    if is_new and state.measurement is not None and state.measurement.capture_time >= t.since - 1.0:
+        x = dot(state.measurement.p_BT - seam.position, seam.normal)
+        t = replace(t, gain_fit=_add(t.gain_fit, x, state.delta_n))
+        state = replace(state, touch=t)
+    target = t.start_left + sign * (touch.press_ratio - 1.0) * config.delta_d_m
+    gap = target - left
+    if abs(gap) > 0.05e-3:
+        return state, clip(config.k_p * gap, -touch.press_m_s, touch.press_m_s), 0.0, None, False
+    if following:
+        return _next(state, following, sample.time, t.start_left), 0.0, 0.0, None, False
+    return replace(state, gain=_gain(t.gain_fit, config)), 0.0, 0.0, None, True
+
+
+def _add(fit: GainFit, x: float, y: float) -> GainFit:
+    return GainFit(fit.n + 1, fit.x + x, fit.y + y, fit.xx + x * x, fit.xy + x * y)
+
+
+def _gain(fit: GainFit, config: ServoConfig) -> float:
+    """The slope of deflection on motion, drawn to 1 by its prior."""
+    if fit.n < 3:
+        return 1.0
+    sxx, sxy = fit.xx - fit.x**2 / fit.n, fit.xy - fit.x * fit.y / fit.n
+    information, prior = sxx / _TAG_SIGMA_M**2, 1.0 / config.touch.gain_sigma**2
+    return clip((sxy / _TAG_SIGMA_M**2 + prior) / (information + prior), 0.7, 1.3)
+
+
+def _next(state: WeldingState, step: str, now: float, left: float | None = None) -> WeldingState:
+    t = replace(state.touch, step=step, since=now, seated_frames=0)
+    return replace(state, touch=t if left is None else replace(t, start_left=left))

@@ -1,0 +1,199 @@
+"""The guarded law: torch speed first, its place always, and the tip speed and turning the rigid chord then needs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.welding.guard import SeamConditioning, seam_conditioning
+from weldcal.welding.lsq import box_least_squares
+from weldcal.welding.refinement import local_fit
+from weldcal.welding.seam import SeamCurve, SeamFrame
+from weldcal.welding.servo_state import ServoConfig, WeldingState
+from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
+
+_EDGE_POINTS = 20  # points on a gap's side: 5 mm at the nominal speed and frame rate
+
+
+class TorchTarget(NamedTuple):
+    """Where the torch should be: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m."""
+
+    point: Array
+    tangent: Array
+    normal: Array
+    up: Array
+    arc: float
+    s: float
+    residual: Array
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of one tick: V_BT (6,), tip and torch speed m/s, rate about the tool's up rad/s, conditioning."""
+
+    V_BT: Array
+    v_tip: float
+    v_torch: float
+    omega: float
+    conditioning: SeamConditioning
+
+
+def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: ServoConfig) -> TorchTarget:
+    """The refined path beside the torch; where the tip felt nothing, the moved plan plus what it was off nearby.
+
+    Args:
+        curve: the tip line of the plan, registered to the tactile points.
+        p_BW: torch point, (3,) m.
+    """
+    tool = config.tool
+    s = curve.nearest(p_BW - config.clearance_m * curve.frame(state.s_torch).up, state.s_torch)
+    plan = curve.frame(s)
+    seam = state.refined
+    residual, fit, arc = state.residual, None, state.torch_arc
+    if len(seam) >= 5:
+        first, last = float(seam.arc[0]), float(seam.arc[-1])
+        inside = clip(arc, first + 1e-3, max(last - 1e-3, first + 1e-3))
+        bend = max(abs(plan.curvature), 1e-6)
+        if _nearest_point(seam.arc, inside) < config.refinement.bridge_from_m:
+            fit = local_fit(seam, inside, plan.tangent, 1.0 / bend, config.refinement)
+        # Before the first point, and where the window is empty, the plan leads and carries the nearest residual.
+        if fit is not None:
+            here = curve.frame(curve.nearest(fit.point, s + inside - arc))
+            off = fit.point - here.position
+            residual = np.array((dot(off, here.normal), dot(off, here.up)))
+            if inside != arc:
+                fit = None
+        else:
+            # The change is spread over the path, so that the torch is not asked to step.
+            step = 0.05 * abs(s - state.s_torch)
+            residual = state.residual + np.clip(_bridged(state, curve, arc, s) - state.residual, -step, step)
+    if fit is None:
+        t, up = plan.tangent, plan.up
+        on_path = plan.position + residual[0] * plan.normal + residual[1] * up
+        step = s - state.s_torch
+    else:
+        t, on_path = fit.tangent, fit.point
+        up = unit(plan.up - dot(plan.up, t) * t, plan.up)
+        step = dot(p_BW - on_path, t) / fit.speed
+    n = cross(up, t)
+    point = on_path + config.clearance_m * up + tool.side_offset_m * n
+    ahead = dot(p_BW - point, t)
+    return TorchTarget(point + ahead * t, t, n, up, arc + clip(step, -2e-3, 2e-3), s, residual)
+
+
+def _nearest_point(arcs: Array, arc: float) -> float:
+    """How far the nearest of ascending arcs is, m."""
+    i = int(np.searchsorted(arcs, arc))
+    return min(abs(arc - float(arcs[k])) for k in (max(0, i - 1), min(i, len(arcs) - 1)))
+
+
+def _bridged(state: WeldingState, curve: SeamCurve, arc: float, s: float) -> Array:
+    """The residual (normal, up) m inside a gap: a cubic that leaves and meets the points on its two sides in line."""
+    seam = state.refined
+    i = int(np.searchsorted(seam.arc, arc))
+    edges: list[tuple[float, Array, Array]] = []
+    for low, high, edge in ((max(0, i - _EDGE_POINTS), i, i - 1), (i, min(len(seam), i + _EDGE_POINTS), i)):
+        if high - low < 3:
+            continue
+        points, at = seam.points[low:high], s + seam.arc[low:high] - arc
+        for _ in range(2):
+            at = at + np.sum((points - curve.position(at)) * curve.tangent(at), axis=1)
+        gap = points - curve.position(at)
+        off = np.column_stack([np.sum(gap * curve.normal(at), axis=1), np.sum(gap * curve.up(at), axis=1)])
+        x = seam.arc[low:high] - seam.arc[edge]
+        middle = x.mean()
+        slope = (x - middle) @ off / max(float((x - middle) @ (x - middle)), 1e-12)
+        edges.append((float(seam.arc[edge]), off.mean(axis=0) - slope * middle, slope))
+    if not edges:
+        return state.residual
+    if len(edges) == 1:
+        return edges[0][1]
+    (a0, y0, m0), (a1, y1, m1) = edges
+    width = max(a1 - a0, 1e-6)
+    x = clip((arc - a0) / width, 0.0, 1.0)
+    rise, leave, meet = x * x * (3.0 - 2.0 * x), x * (1.0 - x) ** 2, x * x * (x - 1.0)
+    return np.asarray(y0 + rise * (y1 - y0) + width * (leave * m0 + meet * m1))
+
+
+def tip_frame(seam: SeamFrame, steer: float) -> SeamFrame:
+    """The seam's frame at the tip, turned about its up by `steer` rad."""
+    if steer == 0.0:
+        return seam
+    c, s = math.cos(steer), math.sin(steer)
+    return seam._replace(tangent=c * seam.tangent + s * seam.normal, normal=c * seam.normal - s * seam.tangent)
+
+
+def guarded_motion(
+    state: WeldingState,
+    X_BT: RigidTransform,
+    tip: SeamFrame,
+    target: TorchTarget,
+    servo: tuple[float, float],
+    config: ServoConfig,
+    dt: float,
+) -> Motion:
+    """One tick of the guarded law in space (docs/weld_law.md, sections 3 and 4).
+
+    Unknown are the tip's speed along the seam and the rate about the tool's up; pitch is eliminated by the torch's
+    height, roll is free and holds the work angle. Nothing is divided by n_d . n_t.
+
+    Args:
+        tip: seam frame at the tip.
+        target: of the torch.
+        servo: the tip's lateral and upward speeds, m/s.
+    """
+    R = X_BT.rotation().matrix()
+    p_BT = X_BT.translation()
+    chord = -(R @ config.p_TW)
+    d = norm(chord)
+    u = chord / d
+    up = unit(tip.up + target.up, tip.up)
+    m = unit(cross(up, u), R[:, 1])
+    a = cross(u, m)
+    t, n, b = target.tangent, target.normal, target.up
+    e = p_BT - chord - target.point
+    limit = config.feedback_limit_m
+    back_n = -config.k_b * clip(dot(e, n), -limit, limit)
+    back_b = -config.k_h * clip(dot(e, b), -limit, limit)
+
+    # V_W = v t_s + V_0 - d w m + d w_p a. The height row gives w_p; putting it in leaves x -> x - (x.b)/(a.b) a.
+    ab = dot(a, b)
+    ab = ab if abs(ab) > 0.2 else math.copysign(0.2, ab)
+    tb = tip.tangent
+    base = servo[0] * tip.normal + servo[1] * tip.up
+    lean_n, lean_t = dot(a, n) / ab, dot(a, t) / ab
+    up_v, up_w, up_0 = dot(tb, b), -d * dot(m, b), dot(base, b) - back_b
+    n_v, n_w = dot(tb, n) - up_v * lean_n, -d * dot(m, n) - up_w * lean_n
+    t_v, t_w = dot(tb, t) - up_v * lean_t, -d * dot(m, t) - up_w * lean_t
+    n_0, t_0 = dot(base, n) - up_0 * lean_n, dot(base, t) - up_0 * lean_t
+
+    speed = config.weld_speed_m_s
+    radius = 1.0 / max(abs(tip.curvature), 1e-6)
+    top = min(config.tip_speed_max_m_s, max(config.tip_speed_floor * speed, config.turn_rate_max_rad_s * radius))
+    dv, dw, w_top = config.tip_acceleration_m_s2 * dt, config.omega_acceleration_rad_s2 * dt, config.omega_max_rad_s
+    v_low = max(0.0, state.v_tip - dv)
+    v_high = max(v_low, min(top, state.v_tip + dv))
+    w_low, w_high = max(-w_top, state.omega - dw), min(w_top, state.omega + dw)
+    v, w = box_least_squares(
+        (
+            (config.weight_lateral, n_v, n_w, back_n - n_0),
+            (config.weight_torch_speed, t_v, t_w, speed - t_0),
+            (config.weight_omega, 0.0, d, 0.0),
+            (config.weight_tip_speed, 1.0, 0.0, speed),
+        ),
+        (v_low, v_high),
+        (w_low, max(w_low, w_high)),
+    )
+    w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
+
+    # Roll about the level chord goes to the work angle; what yaw about a tilted tool axis adds to it is taken off.
+    level = unit(u - dot(u, up) * up, u)
+    lean = math.asin(clip(dot(R[:, 1], up), -1.0, 1.0)) - config.work_angle_rad
+    roll = clip(-config.k_roll * lean, -0.3, 0.3)
+    w_r = clip((roll - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
+    V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])
+    return Motion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))
