@@ -39,11 +39,11 @@ def fit_circle(
 ) -> CircleFit:
     """Fit a circle to (N, 2) points [m] by minimising the orthogonal distance, resisting up to 40 % outliers.
 
-    ``sigma`` (N,) are relative standard deviations of the points along the radius; the common scale is estimated from the
-    residuals. ``radius`` fixes the radius, ``radius_bounds`` limits the search for a start. ``initial`` is a start
-    (centre, radius) that makes the random search unnecessary. ``noise_floor`` [m] is the least scale believed.
-    Raises CircleFitError when there are fewer than 5 points or they do not fix a circle.
-    Method: least median of squares on seeded triples, then Gauss-Newton on the geometric residual with Tukey weights.
+    ``sigma`` (N,) are relative standard deviations of the points along the radius; the common scale is estimated from
+    the residuals. ``radius`` fixes the radius, ``radius_bounds`` limits the search for a start. ``initial`` is a start
+    (centre, radius) that makes the random search unnecessary. ``noise_floor`` [m] is the least scale believed. Raises
+    CircleFitError when there are fewer than 5 points or they do not fix a circle. Method: least median of squares on
+    seeded triples, then Gauss-Newton on the geometric residual with Tukey weights.
     """
     p = np.asarray(points, dtype=float)
     if p.ndim != 2 or p.shape[1] != 2 or len(p) < 5:
@@ -70,7 +70,8 @@ def fit_circle(
         weight = np.where(np.abs(t) < 1.0, (1.0 - t**2) ** 2, 0.0)
         J = -np.column_stack([d / rho[:, None], np.ones(len(q))])[:, :free] / s[:, None]
         N = J.T @ (weight[:, None] * J)
-        if np.linalg.cond(N) > 1e9:
+        values = np.linalg.eigvalsh(N)
+        if not values[0] > 1e-9 * values[-1]:
             raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
         step = np.linalg.solve(N, -J.T @ (weight * e))
         c = c + step[:2]
@@ -94,7 +95,8 @@ def fit_circle(
 
 
 def _covariance(d: Array, rho: Array, e: Array, s: Array, scale: float, free: int) -> Array:
-    """Sandwich covariance of an M-estimate (Huber 1981, eq. 7.6.2) with Tukey's psi; (3, 3), zero row for a fixed radius."""
+    """Sandwich covariance of an M-estimate (Huber 1981, eq. 7.6.2) with Tukey's psi; (3, 3), zero row for a fixed
+    radius."""
     t = e / (_TUKEY * scale)
     inside = np.abs(t) < 1.0
     psi = np.where(inside, e * (1.0 - t**2) ** 2, 0.0)

@@ -48,7 +48,8 @@ def lowest_point(bodies: list[Body], frames: list[RigidTransform]) -> float:
 
 
 def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
-    """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing); segments are sampled."""
+    """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing); segments are
+    sampled."""
     placed = [(b, np.linspace(*_ends(b, frames), len(_SAMPLES))) for b in bodies]
     gap = np.inf
     for i, (a, pa) in enumerate(placed):
@@ -61,7 +62,8 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
 
 
 def occludes(bodies: list[Body], frames: list[RigidTransform], eye: Array, targets: Array) -> tuple[bool, float]:
-    """Whether a body hides any of the targets (N, 3) from the eye (3,), and the smallest gap (m) from a body to the eye.
+    """Whether a body hides any of the targets (N, 3) from the eye (3,), and the smallest gap (m) from a body to the
+    eye.
 
     A body that holds or touches a target carries it and does not hide it: the face looks away from its own body.
     """

@@ -36,11 +36,12 @@ def find_cloud(folder: Path, id: str) -> Path:
 
 
 def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
-    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit, and remarks on what was dropped.
+    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit, and remarks on what was
+    dropped.
 
-    NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel centres
-    at whole numbers; zero or NaN depth is invalid. NaN rows are usual in organised files and are dropped with a remark.
-    Raises CloudError: unreadable, truncated, empty, mostly NaN in a list of points, infinite coordinates.
+    NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
+    centres at whole numbers; zero or NaN depth is invalid. NaN rows are usual in organised files and are dropped with a
+    remark. Raises CloudError: unreadable, truncated, empty, mostly NaN in a list of points, infinite coordinates.
     """
     try:
         points, declared = _read_npz(path) if path.suffix.lower() == ".npz" else _read_open3d(path)
@@ -100,7 +101,7 @@ def _read_open3d(path: Path) -> tuple[Array, int | None]:
     if ascii_rows:
         _check_rows(path, declared)
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        cloud = o3d.io.read_point_cloud(str(path), remove_nan_points=False, remove_infinite_points=False)
+        cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
     points = np.asarray(cloud.points, dtype=float)
     if len(points) == 0:
         raise CloudError(f"The file {path.name} cannot be read: it is damaged or truncated; export it again.")

@@ -26,7 +26,8 @@ _REACH_M = (0.001, 10.0)  # distances from the base that a robot flange can have
 
 @dataclass(frozen=True)
 class Pair:
-    """A centre already found: camera point (3,) m and the robot's pose of the feature (rotation identity where not given)."""
+    """A centre already found: camera point (3,) m and the robot's pose of the feature (rotation identity where not
+    given)."""
 
     id: str
     X_BR: RigidTransform
@@ -53,7 +54,8 @@ class Dataset:
         return RigidTransform(_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
 
     def cloud(self, id: str) -> tuple[Array, tuple[str, ...]]:
-        """Points of one cloud in metres, (N, 3) or organised (H, W, 3), with remarks. Raises CloudError with the reason."""
+        """Points of one cloud in metres, (N, 3) or organised (H, W, 3), with remarks. Raises CloudError with the
+        reason."""
         points, remarks = read_cloud(self.clouds[id])
         return points * UNITS[self.header.units.clouds], remarks
 
@@ -61,9 +63,10 @@ class Dataset:
 def load_dataset(folder: Path) -> Dataset:
     """Read and check a dataset folder (dataset.yaml, and poses.csv with clouds/, or pairs.csv).
 
-    Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown unit
-    or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses whose size shows
-    the wrong unit. A cloud without a pose is an error; a pose without a cloud is refused by name; clouds themselves are read later.
+    Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
+    unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
+    whose size shows the wrong unit. A cloud without a pose is an error; a pose without a cloud is refused by name;
+    clouds themselves are read later.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -79,7 +82,8 @@ def load_dataset(folder: Path) -> Dataset:
         clouds, refused = _match(folder / "clouds", poses)
         if not clouds:
             raise DatasetError(
-                f"No pose in '{folder.name}/poses.csv' has a cloud in clouds/; name the files after the ids, for example {next(iter(poses), 'pose01')}.pcd."
+                f"No pose in '{folder.name}/poses.csv' has a cloud in clouds/; name the files after the ids, for "
+                f"example {next(iter(poses), 'pose01')}.pcd."
             )
         hashes.update({f"clouds/{path.name}": _sha256(path) for path in clouds.values()})
         return Dataset(folder, header, poses, clouds, (), refused, hashes)
@@ -96,7 +100,8 @@ def load_dataset(folder: Path) -> Dataset:
 def _header(path: Path) -> DatasetHeader:
     if not path.is_file():
         raise DatasetError(
-            f"'{path.parent.name}' has no dataset.yaml; add one with schema, robot, flange, scanner, configuration and units."
+            f"'{path.parent.name}' has no dataset.yaml; add one with schema, robot, flange, scanner, configuration "
+            "and units."
         )
     try:
         header: DatasetHeader = yaml_load_typed(schema=DatasetHeader, filename=str(path), defaults=DatasetHeader())
@@ -110,7 +115,8 @@ def _header(path: Path) -> DatasetHeader:
             raise DatasetError(f"'{path.name}' gives the unit '{unit}' for {name}; write m or mm.")
     if header.configuration not in CONFIGURATIONS:
         raise DatasetError(
-            f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles {', '.join(CONFIGURATIONS)}."
+            f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles "
+            f"{', '.join(CONFIGURATIONS)}."
         )
     return header
 
@@ -129,7 +135,8 @@ def _rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
     missing = [c for c in required if c not in names]
     if missing:
         raise DatasetError(
-            f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}; the header is {','.join(required)}."
+            f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}; the header is "
+            f"{','.join(required)}."
         )
     if not rows:
         raise DatasetError(f"'{path.name}' holds no poses below its header.")
@@ -174,7 +181,8 @@ def _check_reach(points: Array, path: Path, unit: str) -> None:
     if reach > _REACH_M[1] or reach < _REACH_M[0]:
         other = "mm" if unit == "m" else "m"
         raise DatasetError(
-            f"The positions in '{path.name}' lie {reach:.4g} m from the robot's base, which no arm reaches: they look like {other}; correct units in dataset.yaml."
+            f"The positions in '{path.name}' lie {reach:.4g} m from the robot's base, which no arm reaches: they look "
+            f"like {other}; correct units in dataset.yaml."
         )
 
 
@@ -208,7 +216,8 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
     a, b = (float(np.median(np.linalg.norm(s - np.median(s, axis=0), axis=1))) for s in (spread_B, spread_C))
     if min(a, b) > 0.0 and not 0.02 < a / b < 50.0:
         raise DatasetError(
-            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in millimetres; correct units in dataset.yaml."
+            f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in "
+            "millimetres; correct units in dataset.yaml."
         )
     return tuple(pairs)
 
@@ -227,7 +236,8 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
     if orphans:
         names = ", ".join(p.name for p in orphans[:5])
         raise DatasetError(
-            f"'poses.csv' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or take the cloud away."
+            f"'poses.csv' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or take the "
+            "cloud away."
         )
     return clouds, tuple(refused)
 

@@ -15,7 +15,8 @@ class Units:
 
 @dataclass
 class Feature:
-    """Pose of the flange-like feature in the flange frame: position m and quaternion wxyz; identity for a bare flange."""
+    """Pose of the flange-like feature in the flange frame: position m and quaternion wxyz; identity for a
+    bare flange."""
 
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])

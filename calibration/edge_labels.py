@@ -1,4 +1,5 @@
-"""A circle as the border between pixels on a face and pixels off it: maximum likelihood, blind to pixels that are missing."""
+"""A circle as the border between pixels on a face and pixels off it: maximum likelihood, blind to pixels that are
+missing."""
 
 from __future__ import annotations
 
@@ -18,10 +19,11 @@ _SCALES = (1.0, 0.5, 0.25, 0.12, 0.06)  # width of the border, in pitches: from 
 def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch: float, *, outer: bool) -> CircleFit:
     """Circle (centre and radius) that best divides pixels (N, 2) m on the face from those off it, near its edge.
 
-    A pixel is on the face with the probability Phi(distance to the edge / width), or its label is wrong (2 %). The width is the one
-    of a short ladder that makes the labels most likely. Whether a pixel was measured at all may depend on where it is,
-    as at a sharp step, where scanners lose them: given its place, its label stays fair, so the centre is not pulled.
-    The covariance is the inverse of the expected information. Raises CircleFitError where it does not converge.
+    A pixel is on the face with the probability Phi(distance to the edge / width), or its label is wrong (2 %). The
+    width is the one of a short ladder that makes the labels most likely. Whether a pixel was measured at all may depend
+    on where it is, as at a sharp step, where scanners lose them: given its place, its label stays fair, so the centre
+    is not pulled. The covariance is the inverse of the expected information. Raises CircleFitError where it does not
+    converge.
     """
     side = np.where(on_face, -1.0, 1.0) * (1.0 if outer else -1.0)
     theta = np.array([*start.center, start.radius])
@@ -37,11 +39,12 @@ def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch
         raise CircleFitError("The pixels do not fix the edge of the face.")
     rho = np.hypot(xy[:, 0] - theta[0], xy[:, 1] - theta[1])
     right = side * (rho - theta[2]) > -3.0 * width
-    return CircleFit(theta[:2], float(theta[2]), np.linalg.inv(information), start.rms, right)
+    return CircleFit(theta[:2], float(theta[2]), np.asarray(np.linalg.inv(information), dtype=float), start.rms, right)
 
 
 def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, Array, float]:
-    """Fisher scoring with step halving at one border width: parameters (cx, cy, r), information (3, 3), log likelihood."""
+    """Fisher scoring with step halving at one border width: parameters (cx, cy, r), information (3, 3), log
+    likelihood."""
     value, gradient, information = _likelihood(xy, side, theta, width)
     for _ in range(12):
         step = np.linalg.lstsq(information, gradient, rcond=1e-10)[0]

@@ -50,8 +50,8 @@ def axes_cost(axes: tuple[int, ...], work_radius_m: float) -> Cost:
 class Algorithm1State:
     """What Algorithm 1 knows after k new scans; nothing in it is ever changed, a step makes the next one.
 
-    ``pool``: up to four pairs; ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite until a
-    registration succeeds; ``history`` has one (scans used, cost) entry per scan from the fourth on.
+    ``pool``: up to four pairs; ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite
+    until a registration succeeds; ``history`` has one (scans used, cost) entry per scan from the fourth on.
     """
 
     e_required: float
@@ -86,8 +86,8 @@ def algorithm1_step(
 ) -> Algorithm1State:
     """One new pair (paper, Algorithm 1, lines 5 to 15); the first four fill the pool (lines 2 and 3).
 
-    Each of the four is replaced in turn by the new pair; a replacement stays only if the cost falls. The new pair enters at
-    most once: with it twice, three distinct points would be left. A finished state is returned unchanged.
+    Each of the four is replaced in turn by the new pair; a replacement stays only if the cost falls. The new pair
+    enters at most once: with it twice, three distinct points would be left. A finished state is returned unchanged.
     """
     if state.done:
         return state

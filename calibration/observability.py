@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
-from weldcal.calibration.rigid import skew
+from weldcal.calibration.rigid import rotation_vector, skew
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,8 @@ def check_diversity(
     n = len(p_B)
     if n < min_poses:
         raise TooFewPoses(
-            f"A calibration needs at least {min_poses} usable poses whose flange centres do not lie in one plane; there {'is' if n == 1 else 'are'} {n}: add poses."
+            f"A calibration needs at least {min_poses} usable poses whose flange centres do not lie in one plane; "
+            f"there {'is' if n == 1 else 'are'} {n}: add poses."
         )
     distinct: list[Array] = []
     for p in p_B:
@@ -37,7 +38,8 @@ def check_diversity(
             distinct.append(p)
     if len(distinct) < min_poses:
         raise RepeatedPoses(
-            f"The {n} poses repeat only {len(distinct)} place{'s' if len(distinct) > 1 else ''} (within 2 mm); scan the flange at {min_poses} or more different places."
+            f"The {n} poses repeat only {len(distinct)} place{'s' if len(distinct) > 1 else ''} (within 2 mm); scan "
+            f"the flange at {min_poses} or more different places."
         )
     if allow_coplanar or n < 3:
         return
@@ -49,15 +51,17 @@ def check_diversity(
         )
     if spread[2] < limit:
         raise CoplanarPoses(
-            f"The {n} flange centres lie in one plane (within {1e3 * spread[2]:.1f} mm rms); move the flange towards and away from it between scans."
+            f"The {n} flange centres lie in one plane (within {1e3 * spread[2]:.1f} mm rms); move the flange towards "
+            "and away from it between scans."
         )
 
 
 def hidden_bias_sigma(poses: list[RigidTransform], sigma_position_m: float) -> Array:
-    """Standard deviation (3,) m, along x, y, z of the feature frame R, with which the poses would show a constant bias of the centre.
+    """Standard deviation (3,) m, along x, y, z of the feature frame R, with which the poses would show a constant bias
+    of the centre.
 
-    The bias b (in R) and the camera pose are estimated together: p_B + R_BR b = X_BC p_C; infinite where no pose differs in
-    orientation, because the bias then is a mere shift of the camera.
+    The bias b (in R) and the camera pose are estimated together: p_B + R_BR b = X_BC p_C; infinite where no pose
+    differs in orientation, because the bias then is a mere shift of the camera.
     """
     p = np.array([X.translation() for X in poses])
     rows = np.concatenate(
@@ -79,6 +83,12 @@ def hidden_bias_sigma(poses: list[RigidTransform], sigma_position_m: float) -> A
     return np.asarray(np.sqrt(terms.sum(axis=1)))
 
 
+def turn_deg(poses: list[RigidTransform]) -> float:
+    """Largest rotation (deg) of any pose from the first."""
+    first = poses[0].rotation().inverse()
+    return max(float(np.degrees(np.linalg.norm(rotation_vector(first @ X.rotation())))) for X in poses)
+
+
 def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float, normals: bool) -> tuple[str, ...]:
     """Sentences naming the errors that these poses cannot show; empty when there are none worth naming."""
     if len(poses) < 2:
@@ -87,18 +97,17 @@ def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float,
     sigma = hidden_bias_sigma(poses, max(sigma_position_m, 5e-5))
     axes = [name for name, s in zip("xyz", sigma, strict=True) if not s < HIDDEN_BIAS_M]
     out = []
-    if axes:
-        turn = max(
-            float(
-                np.arccos(
-                    np.clip((np.trace(poses[0].rotation().matrix().T @ X.rotation().matrix()) - 1.0) / 2.0, -1.0, 1.0)
-                )
-            )
-            for X in poses
+    if axes and np.isfinite(sigma).all():
+        seen = ", ".join(f"{n} to {1e3 * s:.1f} mm" for n, s in zip("xyz", sigma, strict=True) if n in axes)
+        out.append(
+            "A small constant bias of the flange centre in the flange frame (equally a TCP offset): the orientations of"
+            f" these poses show one only roughly, along {seen}."
         )
+    elif axes:
         out.append(
             f"A constant bias of the flange centre in the flange frame along {', '.join(axes)} (equally a TCP offset): "
-            f"the flange turned by only {np.degrees(turn):.1f} degrees between poses, so it would pass as a shift of the camera."
+            f"the flange turned by only {turn_deg(poses):.1f} degrees between poses, so it would pass as a shift of "
+            "the camera."
         )
     out.append("A rotation of the flange about its own axis: a circle does not show it.")
     if not normals:

@@ -19,9 +19,9 @@ class Observation:
     """A pair for eye-on-base calibration.
 
     ``X_BR``: pose of the flange feature R (origin at the circle centre in the face plane, z the outward normal) in the
-    base, from the robot at the time of capture. ``p_CR`` (3,) m and ``n_C`` (3,) or None: centre and outward unit normal
-    seen in the camera frame. ``center_covariance`` (3, 3) m^2 and ``normal_sigma`` rad per axis: noise of the fit, None
-    where unknown. Raises InputError for numbers that are not finite or a normal that is not a unit vector.
+    base, from the robot at the time of capture. ``p_CR`` (3,) m and ``n_C`` (3,) or None: centre and outward unit
+    normal seen in the camera frame. ``center_covariance`` (3, 3) m^2 and ``normal_sigma`` rad per axis: noise of the
+    fit, None where unknown. Raises InputError for numbers that are not finite or a normal that is not a unit vector.
     """
 
     id: str
@@ -53,6 +53,7 @@ class Observation:
 def observation_from_fit(
     id: str, X_BF: RigidTransform, fit: FlangeFit, X_FR: RigidTransform | None = None
 ) -> Observation:
-    """Pair a fitted flange with the flange pose of the robot; ``X_FR`` places the feature on the flange (identity: bare)."""
+    """Pair a fitted flange with the flange pose of the robot; ``X_FR`` places the feature on the flange (identity:
+    bare)."""
     X_BR = X_BF if X_FR is None else X_BF @ X_FR
     return Observation(id, X_BR, fit.center_C, fit.normal_C, fit.center_covariance, fit.normal_sigma)

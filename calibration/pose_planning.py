@@ -26,10 +26,11 @@ Array = NDArray[np.float64]
 class PlannerConfig:
     """Limits and weights of the planner; m and rad.
 
-    ``theta_max_rad``: largest angle between face normal and line of sight (paper, section 2.1.4). ``table_z_m``: height of
-    the table in B; ``margin_m`` above it. ``image_margin``: share of the image kept free at each side, and of the working
-    range at each end, for an uncertain X_BC. ``feature_radius_m``: outer radius of the flange or ring. ``max_travel_rad``: farthest
-    any joint may go from the start. The sigmas weigh positions and normals in the information.
+    ``theta_max_rad``: largest angle between face normal and line of sight (paper, section 2.1.4). ``table_z_m``: height
+    of the table in B; ``margin_m`` above it. ``image_margin``: share of the image kept free at each side, and of the
+    working range at each end, for an uncertain X_BC. ``feature_radius_m``: outer radius of the flange or ring.
+    ``max_travel_rad``: farthest any joint may go from the start. The sigmas weigh positions and normals in the
+    information.
     """
 
     seed: int = 0
@@ -52,8 +53,9 @@ class PlannerConfig:
 
 @dataclass(frozen=True, eq=False)
 class PlannedPose:
-    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR; ``gain`` in log determinant of the information of X_BC,
-    and ``sigma_m``, the predicted standard deviation (3-D) of a scanned point at the work point once this pose is in."""
+    """One pose to visit: flange X_BF, joints q (6,) rad, feature X_BR; ``gain`` in log determinant of the information
+    of X_BC, and ``sigma_m``, the predicted standard deviation (3-D) of a scanned point at the work point once this pose
+    is in."""
 
     X_BF: RigidTransform
     q: Array
@@ -73,12 +75,13 @@ def plan_calibration_poses(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> list[PlannedPose]:
-    """Plan ``n`` (>= 4) flange poses, most telling first: greedy D-optimal on the information of X_BC about the work point.
+    """Plan ``n`` (>= 4) flange poses, most telling first: greedy D-optimal on the information of X_BC about the work
+    point.
 
-    A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued. ``tool``
-    are capsules in the frame F that must clear the table and must not hide the feature. Deterministic for ``config.seed``.
-    Raises UnreachableScanner, one sentence naming the commonest obstacle, when fewer than ``n`` poses exist or they do
-    not span space, and InputError for n < 4.
+    A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued.
+    ``tool`` are capsules in the frame F that must clear the table and must not hide the feature. Deterministic for
+    ``config.seed``. Raises UnreachableScanner, one sentence naming the commonest obstacle, when fewer than ``n`` poses
+    exist or they do not span space, and InputError for n < 4.
     """
     if n < 4:
         raise InputError("A calibration needs at least 4 poses: ask for 4 or more.")
@@ -106,7 +109,8 @@ def next_best_pose(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> PlannedPose:
-    """The pose that adds most to the feature poses X_BR already scanned (``taken``); same limits and errors as above."""
+    """The pose that adds most to the feature poses X_BR already scanned (``taken``); same limits and errors
+    as above."""
     config = config or PlannerConfig()
     pool, why = _candidates(arm, X_FR, X_BC, scanner, q_start, config, tool)
     chosen = _greedy(pool, list(taken), 1, X_BC, config)
@@ -118,7 +122,7 @@ def next_best_pose(
 def predicted_sigma(
     feature_poses: Sequence[RigidTransform], X_BC: RigidTransform, config: PlannerConfig | None = None
 ) -> float:
-    """Predicted standard deviation (3-D, m) at the work point after scanning the given feature poses X_BR; inf if open."""
+    """Predicted standard deviation (3-D, m) at the work point after scanning feature poses X_BR; inf if open."""
     config = config or PlannerConfig()
     work = _work_point(config, X_BC, list(feature_poses))
     total = sum((_information(X, X_BC, work, config) for X in feature_poses), np.zeros((9, 9)))
@@ -257,7 +261,8 @@ def _greedy(
     if not pool:
         return []
     work = _work_point(config, X_BC, taken + [c.X_BR for c in pool])
-    # what is believed before the first scan: weak, so that four poses already span space; the bias is known to about 1 mm
+    # what is believed before the first scan: weak, so that four poses already span space; the bias is known to about 1
+    # mm
     prior = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
     total = prior + sum((_information(X, X_BC, work, config) for X in taken), np.zeros((9, 9)))
     gains = [_information(c.X_BR, X_BC, work, config) for c in pool]
@@ -293,4 +298,5 @@ def _value(information: Array) -> float:
 def _explain(why: Counter[str], found: int, wanted: int) -> str:
     reason = why.most_common(1)[0][0] if why else "the poses found lie too close together"
     amount = "No pose" if found == 0 else f"Only {found} of {wanted} poses"
-    return f"{amount} of the flange can be scanned, most often because {reason}; move the scanner or correct its guessed pose."
+    cure = "move the scanner or correct its guessed pose"
+    return f"{amount} of the flange can be scanned, most often because {reason}; {cure}."

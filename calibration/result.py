@@ -52,7 +52,8 @@ class IcpRecord:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """All that calibration.yaml holds. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera origin."""
+    """All that calibration.yaml holds. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
+    origin."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -166,9 +167,7 @@ def load_result(path: Path) -> CalibrationResult:
         held_out_mm=dict(d.get("held_out_mm") or {}),
         tilt_deg=dict(d.get("tilt_deg") or {}),
         poses=tuple(PoseRecord(**r) for r in d.get("poses") or []),
-        icp=tuple(
-            IcpRecord(**{k: tuple(v) if isinstance(v, list) else v for k, v in r.items()}) for r in d.get("icp") or []
-        ),
+        icp=tuple(_icp_record(r) for r in d.get("icp") or []),
         unobservable=tuple(d.get("unobservable") or ()),
         warnings=tuple(d.get("warnings") or ()),
         robot=str(d.get("robot", "")),
@@ -241,6 +240,11 @@ def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
 def _wxyz(X: RigidTransform) -> tuple[float, float, float, float]:
     q: Quaternion = X.rotation().ToQuaternion()
     return float(q.w()), float(q.x()), float(q.y()), float(q.z())
+
+
+def _icp_record(fields: dict[str, Any]) -> IcpRecord:
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+    return IcpRecord(**values)
 
 
 def _plain(record: dict[str, Any]) -> dict[str, Any]:

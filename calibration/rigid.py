@@ -12,9 +12,9 @@ Array = NDArray[np.float64]
 def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidTransform:
     """X_BC minimising the weighted sum of |p_B - X_BC p_C|^2 for points (N, 3) m, N >= 3; scale fixed to 1.
 
-    Source: paper, Eq. (10)-(12) (Umeyama 1991 with c = 1). With Sigma = U D V^T, R = U S V^T, and S = diag(1, 1, det(U V^T)) keeps R
-    a rotation, also for coplanar points, where det(Sigma) of Eq. (12) is zero. Raises ValueError for collinear points,
-    which leave a rotation open.
+    Source: paper, Eq. (10)-(12) (Umeyama 1991 with c = 1). With Sigma = U D V^T, R = U S V^T, and S = diag(1, 1, det(U
+    V^T)) keeps R a rotation, also for coplanar points, where det(Sigma) of Eq. (12) is zero. Raises ValueError for
+    collinear points, which leave a rotation open.
     """
     w = np.ones(len(p_B)) if weights is None else np.asarray(weights, dtype=float)
     w = w / w.sum()

@@ -1,4 +1,5 @@
-"""Where the edges of a flat face are: mask crossings on organised clouds, outermost points per sector on unordered ones."""
+"""Where the edges of a flat face are: mask crossings on organised clouds, outermost points per sector on unordered
+ones."""
 
 from __future__ import annotations
 
@@ -12,12 +13,13 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SMOOTHING_PX = 1.0  # of the face mask before its edge is located
-_SECTOR_PITCHES = 2.5  # a sector is this many point pitches wide, so that each one holds an edge point
+_SECTOR_PITCHES = 6.0  # a sector is this many point pitches wide, so that each one holds an edge point
 
 
 @dataclass(frozen=True)
 class FacePixels:
-    """Pixels about a face seen through a grid: place under their rays in the plane (N, 2) m, which is on the face, ``slide``."""
+    """Pixels about a face seen through a grid: place under their rays in the plane (N, 2) m, which is on the face,
+    ``slide``."""
 
     points: Array
     on_face: Mask
@@ -28,8 +30,9 @@ class FacePixels:
 class EdgePoints:
     """Edge points of a face seen through a pixel grid, in the plane's axes.
 
-    ``points`` (N, 2) m; ``step`` (N, 2) m, one step of the grid across the edge; ``slide`` (N, 2), how far along the plane
-    a point moves per metre that the plane is raised under its ray; ``beyond`` (N,) m, height of the pixel past the edge.
+    ``points`` (N, 2) m; ``step`` (N, 2) m, one step of the grid across the edge; ``slide`` (N, 2), how far along the
+    plane a point moves per metre that the plane is raised under its ray; ``beyond`` (N,) m, height of the pixel past
+    the edge.
     """
 
     points: Array
@@ -75,9 +78,10 @@ class RayModel:
 def organised_edges(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> EdgePoints:
     """Edge points of the mask ``face`` (H, W) of an organised cloud (H, W, 3), in the plane's axes about ``point``.
 
-    The mask is smoothed (Gaussian) and its level 1/2 is found between neighbours along rows and columns: unbiased at a straight
-    edge, and a circle only shrinks a little all round. Pixels that say nothing (see ``unknown_pixels``) take no part: a scanner
-    loses pixels at a sharp step and keeps them where a chamfer softens it, which would pull the centre to one side.
+    The mask is smoothed (Gaussian) and its level 1/2 is found between neighbours along rows and columns: unbiased at a
+    straight edge, and a circle only shrinks a little all round. Pixels that say nothing (see ``unknown_pixels``) take
+    no part: a scanner loses pixels at a sharp step and keeps them where a chamfer softens it, which would pull the
+    centre to one side.
     """
     axes = np.column_stack(plane_axes(normal))
     known = np.asarray(~unknown_pixels(points), dtype=np.float64)
@@ -115,9 +119,10 @@ def face_pixels(points: Array, face: Mask, rays: RayModel, point: Array, normal:
 
 
 def unknown_pixels(points: Array) -> Mask:
-    """Pixels (H, W) without a reading that tell nothing of an edge: small gaps. One that holds 3 x 3 pixels is void, not face."""
+    """Pixels (H, W) without a reading that tell nothing of an edge: small gaps. One that holds 3 x 3 pixels is void,
+    not face."""
     gap = np.isnan(points[..., 2])
-    void = ndimage.binary_opening(np.pad(gap, 2, constant_values=True), np.ones((3, 3)))[2:-2, 2:-2]
+    void = ndimage.binary_opening(np.pad(gap, 2, constant_values=True), np.ones((3, 3), dtype=bool))[2:-2, 2:-2]
     return np.asarray(gap & ~void)
 
 
@@ -151,20 +156,20 @@ def coverage(points: Array, center: Array, sectors: int = 72) -> float:
 
 
 def connected_parts(xy: Array, cell: float) -> NDArray[np.intp]:
-    """Label (N,) of the connected part each point (N, 2) m belongs to, on a raster of ``cell`` [m]; largest part is 0."""
+    """Label (N,) of the connected part each point (N, 2) m belongs to, on a raster of ``cell`` [m]; largest
+    part is 0."""
     grid = np.floor((xy - xy.min(axis=0)) / cell).astype(int) + 1
     image = np.zeros(grid.max(axis=0) + 2, dtype=bool)
     image[grid[:, 0], grid[:, 1]] = True
     labels, _ = ndimage.label(image, structure=np.ones((3, 3)))
-    part = labels[grid[:, 0], grid[:, 1]]
-    return _by_size(part)
+    return _by_size(np.asarray(labels[grid[:, 0], grid[:, 1]], dtype=np.intp))
 
 
 def connected_pixels(mask: Mask) -> NDArray[np.intp]:
     """Connected parts of a pixel mask (H, W): label image, largest part 0, next 1, ...; -1 outside the mask."""
     labels, _ = ndimage.label(mask)
     out = np.full(mask.shape, -1)
-    out[mask] = _by_size(labels[mask])
+    out[mask] = _by_size(np.asarray(labels[mask], dtype=np.intp))
     return out
 
 

@@ -19,13 +19,15 @@ Flags = NDArray[np.bool_]
 
 _GATE = 8.0  # in sigma per axis: only gross outliers go; what a scanner's distortion does at the rim of its field stays
 _HUBER = 2.0
+_WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
 _NORMAL_FLOOR_RAD = 1e-6
 
 
 @dataclass(frozen=True)
 class SolveConfig:
-    """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that agree)."""
+    """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
+    agree)."""
 
     seed: int = 0
     max_outliers: float = 0.40
@@ -54,8 +56,8 @@ class CalibrationEstimate:
     ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
     base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
     ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
-    observations; ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot and scanner
-    together beyond the noise of the fits, estimated from the residuals.
+    observations; ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot and
+    scanner together beyond the noise of the fits, estimated from the residuals.
     """
 
     X_BC: RigidTransform
@@ -100,12 +102,12 @@ def estimate_eye_on_base(
 ) -> CalibrationEstimate:
     """Estimate X_BC from sightings of the flange at n poses; positions and (where seen) normals are used together.
 
-    Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share of the poses. Then
-    Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and of normals are
-    estimated from the residuals (Helmert's simplified estimator, each group divided by its own redundancy), never
-    set by taste. Held-out errors repeat the weighted fit without each pose in turn. Deterministic for ``config.seed``.
-    Raises TooFewPoses, RepeatedPoses, CoplanarPoses (see observability.check_diversity) and InconsistentPoses when no
-    rigid transform explains enough of the poses.
+    Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
+    of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
+    of normals are estimated from the residuals (Helmert's simplified estimator, each group divided by its own
+    redundancy), never set by taste. Held-out errors repeat the weighted fit without each pose in turn. Deterministic
+    for ``config.seed``. Raises TooFewPoses, RepeatedPoses, CoplanarPoses (see observability.check_diversity) and
+    InconsistentPoses when no rigid transform explains enough of the poses.
     """
     config = config or SolveConfig()
     observations = tuple(observations)
@@ -117,7 +119,14 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position; check units, pose order and that the camera did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position; check units, pose order and that "
+            "the camera did not move."
+        )
+    spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
+        raise InconsistentPoses(
+            f"The poses disagree by {1e3 * np.sqrt(solution.var_p):.0f} mm per axis; check units, pose order, the quaternion"
+            " order and that the camera did not move."
         )
     if not inliers.all():
         check_diversity(

@@ -70,8 +70,9 @@ def k_fold(
 class Convergence:
     """Errors against the number of scans (m): rows are seeded orders of the scans, columns ``counts``; NaN where open.
 
-    ``held_out``: median error of this software's calibration on the scans not used. ``figure``: Algorithm 1's own figure at its
-    verification pose. ``figure_true``: median true error of Algorithm 1's calibration on the scans outside its pool.
+    ``held_out``: median error of this software's calibration on the scans not used. ``figure``: Algorithm 1's own
+    figure at its verification pose. ``figure_true``: median true error of Algorithm 1's calibration on the scans
+    outside its pool.
     """
 
     counts: Array
@@ -97,7 +98,8 @@ class Algorithm1Run:
 def run_algorithm1(
     observations: Sequence[Observation], verification: Verifier, *, cost: Cost = translation_cost
 ) -> Algorithm1Run | None:
-    """Feed all observations, in order, to Algorithm 1 without a stop at a required error; None if it never registered."""
+    """Feed all observations, in order, to Algorithm 1 without a stop at a required error; None if it never
+    registered."""
     state = algorithm1_start(e_required=1e-12, k_max=max(1, len(observations)))
     counts, figures, medians = [], [], []
     for used, o in enumerate(observations, start=1):

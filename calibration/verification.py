@@ -1,4 +1,4 @@
-"""Algorithm 1's own figure, an ICP of one flange against its model (Eq. 13), and how much of a real error it can see."""
+"""Algorithm 1's own figure: an ICP of one flange against its model (Eq. 13), and how much of a real error it sees."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ _BLIND = 0.5  # a component of which less than half shows is called unseen
 class VerificationError:
     """Where a calibration puts the verification flange, relative to where the robot says it is.
 
-    ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature frame R;
-    all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or None.
-    ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance.
+    ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature
+    frame R; all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or
+    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance.
     """
 
     value: Array
@@ -103,7 +103,8 @@ def make_verification(
 ) -> Verification:
     """A verification scan against the standard's own surface (face and chamfers), both thinned to ``max_points``.
 
-    ``points_C`` (N, 3) m: the flange alone (crop the scene first). Raises InputError when fewer than 100 points are finite.
+    ``points_C`` (N, 3) m: the flange alone (crop the scene first). Raises InputError when fewer than 100 points are
+    finite.
     """
     points = np.asarray(points_C, dtype=float).reshape(-1, 3)
     points = points[np.isfinite(points).all(axis=1)]
@@ -120,19 +121,22 @@ def make_verification(
 def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationError:
     """Register the verification cloud, placed by ``X_BC``, to the model placed by the robot (paper, Eq. (13)).
 
-    Iterations and stop rule are Open3D's defaults (30, relative change 1e-6), as in the paper's code. A registration that
-    matches less than 30 % of the points has failed: the error is then infinite, never the identity. The six numbers are
-    taken at the flange centre, not at the camera origin, where rotation and translation mix over the working distance.
+    Iterations and stop rule are Open3D's defaults (30, relative change 1e-6), as in the paper's code. A registration
+    that matches less than 30 % of the points has failed: the error is then infinite, never the identity. The six
+    numbers are taken at the flange centre, not at the camera origin, where rotation and translation mix over the
+    working distance.
     """
     X_RC = verification.X_BR.inverse() @ X_BC
     source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((X_RC @ verification.points_C.T).T))
     target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(verification.model_R))
     target.normals = o3d.utility.Vector3dVector(verification.model_normals_R)
     registration = o3d.pipelines.registration
-    if verification.method == "point_to_plane":
-        estimation = registration.TransformationEstimationPointToPlane()
-    else:
-        estimation = registration.TransformationEstimationPointToPoint()
+    plane_like = verification.method == "point_to_plane"
+    estimation = (
+        registration.TransformationEstimationPointToPlane()
+        if plane_like
+        else registration.TransformationEstimationPointToPoint()
+    )
     result = registration.registration_icp(source, target, verification.max_distance_m, np.eye(4), estimation)
     if result.fitness < _MIN_FITNESS or not np.isfinite(result.transformation).all():
         return FAILED

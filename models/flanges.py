@@ -34,8 +34,9 @@ class FlangeStandard:
     """A tool flange or a flange-like ring, in metres and radians (angles about z of frame R, from x).
 
     `outer_m` and `bore_m` are the diameters ISO calls d2 and d3; the flat face between the chamfers is narrower by one
-    chamfer at each edge. `hole_m` is the visible hole diameter (the nominal thread). A plain ring has no holes and no
-    pin (`pin_m` = 0), and its bore goes through (`bore_depth_m` = inf).
+    chamfer at each edge. `hole_m` is the visible hole diameter: the nominal thread, as a countersunk
+    hole shows it (some CAD draws the tap drill, 5 mm for M6). A plain ring has no holes and no pin (`pin_m` = 0), and
+    its bore goes through (`bore_depth_m` = inf).
     """
 
     designation: str

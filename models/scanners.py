@@ -4,9 +4,9 @@ One pixel convention everywhere: OpenCV's, the centre of the first pixel at (0, 
 that converts it to what Drake's camera wants.
 
 Sources: Photoneo's data sheets for the PhoXi 3D Scanner S and M (range, scan area at the optimum distance, calibration
-accuracy, temporal noise); one pixel spans the scan width over 2064, and pixels are square, so the image is as high as
-the sensor's shape makes it and not exactly the sheet's scan area. The MotionCam-3D M rows keep its published
-resolutions; their distances and noise are unconfirmed. Azure Kinect: Microsoft's specification of the narrow unbinned mode, and a
+accuracy, temporal noise). One pixel spans the scan width over 2064 and pixels are square, so the image is as high as
+the sensor's shape makes it, not exactly the sheet's scan area. The MotionCam-3D M rows keep its published resolutions;
+their distances and noise are unconfirmed. Azure Kinect: Microsoft's specification of the narrow unbinned mode, and a
 repeatability of about 1 mm at 1 m.
 """
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform, RotationMatrix, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arms.urdf import Capsule
@@ -31,6 +31,11 @@ class WeldingTool:
     ring_height_m: float = 0.008  # the ring's face stands this far above the plate, towards the scanner
     tip_reach_m: float = 0.170  # p_FT along +z_F, tip at rest
     tip_radius_m: float = 0.0025
+    tip_modulus_Pa: float = 1e7  # hydroelastic modulus of the soft tip
+    # How the loaded tip sits in the groove: below where a hard ball would, and towards the wall it leans on. The tag cannot
+    # see either, so both are calibrated once, on a straight groove whose place is known (test_soft_tip.py measures them).
+    seat_sink_m: float = 0.00099
+    seat_side_m: float = 0.00004
     tip_mass_kg: float = 0.005
     lateral_stiffness_N_per_m: float = 600.0
     axial_stiffness_N_per_m: float = 300.0
@@ -91,8 +96,8 @@ class WeldingTool:
 class FingerCamera:
     """Pinhole intrinsics of the finger camera (OpenCV convention) and its timing."""
 
-    width: int = 640
-    height: int = 480
+    width: int = 400  # the window that is read out of a 640 x 480 sensor: the tag and as far as it can move
+    height: int = 300
     focal_px: float = 450.0
     rate_hz: float = 30.0
     latency_s: float = 0.040

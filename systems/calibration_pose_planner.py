@@ -43,7 +43,9 @@ class CalibrationPosePlanner(LeafSystem):
         super().__init__()
         self._plan = plan
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(NextPose(-1, 0, "pose01", plan[0].q if plan else None)))
+        self._state = self.DeclareAbstractState(
+            AbstractValue.Make(NextPose(-1, 0, "pose01", plan[0].q if plan else None))
+        )
         self.DeclareAbstractOutputPort(
             "next_pose", lambda: AbstractValue.Make(NextPose()), self._output, {self.abstract_state_ticket(self._state)}
         )

@@ -13,6 +13,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, Outpu
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, LogVectorOutput, VectorLogSink
 
 from weldcal.calibration.pose_planning import PlannedPose, PlannerConfig, plan_calibration_poses
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator
@@ -92,7 +93,7 @@ class Cell:
     X_FR: RigidTransform
     servo_config: ServoConfig
     sequencer: JobSequencer
-    calibrator: IterativeCalibrator | None
+    calibrator: IterativeCalibrator
     logs: dict[str, VectorLogSink]
 
 
@@ -113,12 +114,13 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
     tool, welding = station.tool, scenario.welding
     if tool is None or station.cad is None:
         return ServoConfig()
-    seat = station.cad.tip_height(tool.tip_radius_m)
+    seat = station.cad.tip_height(tool.tip_radius_m) - tool.seat_sink_m
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
         tip_drop_m=station.cad.depth_m + tool.tip_radius_m - seat,
         torch_clearance_m=TORCH_ABOVE_ROOT_M - seat,
+        side_offset_m=-tool.seat_side_m,
     )
     return ServoConfig(
         tool=geometry,
@@ -135,7 +137,10 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
         UnreachableScanner: no such set of poses exists for the scanner where the scenario says it stands.
     """
     c, tool = scenario.calibration, station.tool
-    preset = get_scanner(scenario.scanner.preset, width=scenario.scanner.width, height=scenario.scanner.height)
+    scanner = scenario.scanner
+    if isinstance(scanner, NoDevice):
+        raise InputError("A calibration needs a scanner: write scanner: !RenderedScanner {} in the scenario.")
+    preset = get_scanner(scanner.preset, width=scanner.width, height=scanner.height)
     config = PlannerConfig(
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),
@@ -179,7 +184,11 @@ def make_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None)
     config = servo_config(scenario, station)
     wiring = Wiring(builder, station, scenario, config)
     out, arm, c, job = station.diagram.GetOutputPort, station.arm, scenario.calibration, scenario.job
-    X_FR, standard, X_BC_guess = feature_on_flange(scenario, station), feature_standard(scenario), c.mounting_guess.pose()
+    X_FR, standard, X_BC_guess = (
+        feature_on_flange(scenario, station),
+        feature_standard(scenario),
+        c.mounting_guess.pose(),
+    )
     poses = plan_poses(scenario, station, seed) if job.calibrate else ()
     q_measured, v_measured = out("ur10e.position_measured"), out("ur10e.velocity_measured")
 
@@ -189,8 +198,12 @@ def make_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None)
     sequencer = wiring.add("job_sequencer", JobSequencer(job_plan(scenario)))
     command = sequencer.GetOutputPort("job")
 
-    estimator = wiring.add("flange_estimator", FlangeEstimator(arm, X_FR, standard, X_BC_guess, c.guess_radius_mm * 1e-3))
-    calibrator = wiring.add("iterative_calibrator", IterativeCalibrator(arm, X_FR, standard, calibrator_config(scenario)))
+    estimator = wiring.add(
+        "flange_estimator", FlangeEstimator(arm, X_FR, standard, X_BC_guess, c.guess_radius_mm * 1e-3)
+    )
+    calibrator = wiring.add(
+        "iterative_calibrator", IterativeCalibrator(arm, X_FR, standard, calibrator_config(scenario))
+    )
     status = calibrator.GetOutputPort("calibration_status")
     wiring.connect(estimator, scan=out("scanner.scan"), job=command, history=history, calibration_status=status)
     wiring.connect(calibrator, flange_estimate=estimator.GetOutputPort("flange_estimate"), history=history)
@@ -266,6 +279,7 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
         cost=c.cost,
     )
 
+
 def _add_welding(wiring: Wiring, sequencer: JobSequencer, status: OutputPort, history: OutputPort) -> WeldingPorts:
     """Seam planner, deformation estimator, servo and guard; constants stand in for them in a cell without a tool."""
     station, scenario, config = wiring.station, wiring.scenario, wiring.servo_config
@@ -293,9 +307,13 @@ def _add_welding(wiring: Wiring, sequencer: JobSequencer, status: OutputPort, hi
         ),
     )
     wiring.connect(planner, scan=out("scanner.scan"), job=command, calibration_status=status)
-    finger = wiring.add("deformation_estimator", ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera()))
+    finger = wiring.add(
+        "deformation_estimator", ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera())
+    )
     wiring.connect(finger, image=out("finger_camera.image"), history=history)
-    wiring.builder.Connect(sequencer.GetOutputPort("streaming"), station.diagram.GetInputPort("finger_camera.streaming"))
+    wiring.builder.Connect(
+        sequencer.GetOutputPort("streaming"), station.diagram.GetInputPort("finger_camera.streaming")
+    )
     servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config))
     wiring.connect(
         servo,

@@ -157,7 +157,9 @@ class CellVisualizer(LeafSystem):
         self._draw_camera(f"{status.sequence:02d}", status.estimate.X_BC, status.estimate.covariance, time)
         return drawn.but(status=status.sequence)
 
-    def _draw_camera(self, name: str, X_BC: RigidTransform, covariance: NDArray[np.float64] | None, time: float) -> None:
+    def _draw_camera(
+        self, name: str, X_BC: RigidTransform, covariance: NDArray[np.float64] | None, time: float
+    ) -> None:
         """The camera frame as a triad; its 3-sigma position ellipsoid is drawn 100 times its size, or nothing could be seen."""
         path = f"{ROOT}/camera/{name}"
         for axis, rgba in enumerate((Rgba(0.9, 0.2, 0.2, 1), Rgba(0.2, 0.75, 0.2, 1), Rgba(0.2, 0.4, 0.95, 1))):
@@ -176,7 +178,9 @@ class CellVisualizer(LeafSystem):
         if time > 0.0:
             self._show(path, time)
 
-    def _draw_weld(self, drawn: _Drawn, planned: PlannedSeam, servo: ServoReport, q: NDArray[np.float64], time: float) -> _Drawn:
+    def _draw_weld(
+        self, drawn: _Drawn, planned: PlannedSeam, servo: ServoReport, q: NDArray[np.float64], time: float
+    ) -> _Drawn:
         if planned.sequence > drawn.seam and planned.seam is not None:
             line = planned.seam.position(np.linspace(0.0, planned.seam.length, 200))
             self._meshcat.SetLine(f"{ROOT}/seam/planned", np.asarray(line).T, 3.0, PLANNED)

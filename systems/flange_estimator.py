@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses as dc
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
-from weldcal.calibration.flange_fit import FlangeGuess, FlangeNotFound, fit_flange
+from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
@@ -52,7 +55,10 @@ class FlangeEstimator(LeafSystem):
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(FlangeEstimate()))
         self.DeclareAbstractOutputPort(
-            "flange_estimate", lambda: AbstractValue.Make(FlangeEstimate()), self._output, {self.abstract_state_ticket(self._state)}
+            "flange_estimate",
+            lambda: AbstractValue.Make(FlangeEstimate()),
+            self._output,
+            {self.abstract_state_ticket(self._state)},
         )
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
@@ -83,17 +89,24 @@ def estimate_flange(
     guess_radius_m: float,
 ) -> FlangeEstimate:
     """Fit the feature in one scan; a scan that cannot be used comes back with its reason, never as an exception."""
-    base = dict(sequence=scan.sequence, capture_time=scan.capture_time, purpose=job.scan_purpose, label=job.scan_label)
+    base = FlangeEstimate(scan.sequence, scan.capture_time, job.scan_purpose, job.scan_label)
     if X_BF is None:
-        return FlangeEstimate(**base, reason="the arm's pose at the time of the scan is not known")
+        return dc.replace(base, reason="the arm's pose at the time of the scan is not known")
     X_CR = X_BC.InvertAndCompose(X_BF @ X_FR)
     radius = guess_radius_m + 0.5 * standard.outer_m
     guess = FlangeGuess(center_C=X_CR.translation(), radius_m=radius, normal_C=X_CR.rotation().matrix()[:, 2])
+    points = scan.points_C.astype(float)
     try:
-        fit = fit_flange(scan.points_C, standard, guess=guess)
+        fit = fit_flange(points, standard, guess=guess)
     except FlangeNotFound as error:
-        return FlangeEstimate(**base, reason=str(error))
-    points = scan.points_C.reshape(-1, 3).astype(float)
-    points = points[np.all(np.isfinite(points), axis=1)]
-    near = np.linalg.norm(points - fit.center_C, axis=1) < 0.75 * standard.outer_m
-    return FlangeEstimate(**base, fit=fit, points_C=points[near])
+        return dc.replace(base, reason=str(error))
+    return dc.replace(base, fit=fit, points_C=face_of(points.reshape(-1, 3), fit, standard))
+
+
+def face_of(points_C: NDArray[np.float64], fit: FlangeFit, standard: FlangeStandard) -> NDArray[np.float64]:
+    """The points (N, 3) m of the fitted face and its edges, without what lies in front of or behind it."""
+    p = points_C[np.isfinite(points_C).all(axis=1)] - fit.center_C
+    height = p @ fit.normal_C
+    reach = np.linalg.norm(p - height[:, None] * fit.normal_C, axis=1)
+    keep = (np.abs(height) < 1.5 * standard.chamfer_m + 0.001) & (reach < 0.5 * standard.outer_m + 0.001)
+    return np.asarray(p[keep] + fit.center_C)

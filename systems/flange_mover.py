@@ -28,7 +28,9 @@ class _Move(Message):
     q_goal: NDArray[np.float64] = dc.field(default_factory=lambda: np.zeros(6))
 
 
-def move_duration(q_start: NDArray[np.float64], q_goal: NDArray[np.float64], speed: float, acceleration: float) -> float:
+def move_duration(
+    q_start: NDArray[np.float64], q_goal: NDArray[np.float64], speed: float, acceleration: float
+) -> float:
     """Shortest duration (s) of a quintic rest-to-rest path within joint speed (rad/s) and acceleration (rad/s^2).
 
     The quintic 10 s^3 - 15 s^4 + 6 s^5 peaks at 15/8 of the mean speed and at 10/sqrt(3) of distance / duration^2.
@@ -37,7 +39,9 @@ def move_duration(q_start: NDArray[np.float64], q_goal: NDArray[np.float64], spe
     return max(1.875 * distance / speed, float(np.sqrt(10.0 / np.sqrt(3.0) * distance / acceleration)), 0.05)
 
 
-def quintic(q_start: NDArray[np.float64], q_goal: NDArray[np.float64], u: float, duration: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def quintic(
+    q_start: NDArray[np.float64], q_goal: NDArray[np.float64], u: float, duration: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Position (6,) and velocity (6,) of the path at the fraction u in [0, 1] of its duration."""
     s = u**3 * (10.0 - 15.0 * u + 6.0 * u * u)
     ds = 30.0 * u * u * (1.0 - u) ** 2 / duration

@@ -11,7 +11,13 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
-from weldcal.calibration.iterative import Algorithm1State, algorithm1_start, algorithm1_step, translation_and_rotation_cost, translation_cost
+from weldcal.calibration.iterative import (
+    Algorithm1State,
+    algorithm1_start,
+    algorithm1_step,
+    translation_and_rotation_cost,
+    translation_cost,
+)
 from weldcal.calibration.observation import Observation, observation_from_fit
 from weldcal.calibration.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.verification import make_verification
@@ -20,7 +26,6 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
 from weldcal.systems.pose_recorder import PoseHistory
-
 
 WORK_RADIUS_M = 0.2  # of the cost metric that adds the rotation's displacement at this distance
 
@@ -53,7 +58,12 @@ class IterativeCalibrator(LeafSystem):
     """
 
     def __init__(
-        self, arm: ArmModel, X_FR: RigidTransform, standard: FlangeStandard, config: CalibratorConfig, period_s: float = 0.02
+        self,
+        arm: ArmModel,
+        X_FR: RigidTransform,
+        standard: FlangeStandard,
+        config: CalibratorConfig,
+        period_s: float = 0.02,
     ) -> None:
         super().__init__()
         self._arm, self._X_FR, self._config = arm, X_FR, config
@@ -140,7 +150,9 @@ def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransf
     return VerificationResult(seen.label, error, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
-def _algorithm_1(status: CalibrationStatus, observation: Observation, config: CalibratorConfig) -> Algorithm1State | None:
+def _algorithm_1(
+    status: CalibrationStatus, observation: Observation, config: CalibratorConfig
+) -> Algorithm1State | None:
     """One step of the published algorithm, where its verification cloud was seen."""
     if status.verification_cloud is None:
         return None

@@ -68,7 +68,13 @@ def _move(state: JobState, seen: Seen, phase: str, q_goal: NDArray[np.float64]) 
 
 def _scan(state: JobState, seen: Seen, phase: str, purpose: str, label: str) -> JobState:
     return _enter(
-        state, seen, phase, mode="hold", scan_sequence=state.command.scan_sequence + 1, scan_purpose=purpose, scan_label=label
+        state,
+        seen,
+        phase,
+        mode="hold",
+        scan_sequence=state.command.scan_sequence + 1,
+        scan_purpose=purpose,
+        scan_label=label,
     )
 
 
@@ -95,7 +101,9 @@ def _to_next_pose(state: JobState, seen: Seen, phase: str) -> JobState:
     if seen.next_pose.after_sequence < seen.calibration.sequence:
         return state  # the planner has not looked at the newest status yet
     if seen.next_pose.q is None:
-        return hold(state, seen, "The planned calibration poses are used up: plan more of them or free more of the workspace.")
+        return hold(
+            state, seen, "The planned calibration poses are used up: plan more of them or free more of the workspace."
+        )
     return _move(state, seen, phase, seen.next_pose.q)
 
 
@@ -149,7 +157,9 @@ def _verified(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if worst.error_m > plan.verification_limit_m:
         limit = plan.verification_limit_m * 1e3
         return hold(
-            state, seen, f"The calibration is {worst.error_m * 1e3:.2f} mm off at the unseen pose '{worst.label}' (limit {limit:.2f} mm)."
+            state,
+            seen,
+            f"The calibration is {worst.error_m * 1e3:.2f} mm off at the unseen pose '{worst.label}' (limit {limit:.2f} mm).",
         )
     return _move(state, seen, "park", plan.q_home)
 
@@ -191,7 +201,12 @@ def _welding(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if seen.servo.phase == "FAULT":
         return hold(state, seen, seen.servo.reason or "The welding servo stopped.")
     if seen.servo.phase == "DONE" and seen.seam.q_retract is not None:
-        return _move(dc.replace(state, command=dc.replace(state.command, process_on=False, streaming=False)), seen, "retract", seen.seam.q_retract)
+        return _move(
+            dc.replace(state, command=dc.replace(state.command, process_on=False, streaming=False)),
+            seen,
+            "retract",
+            seen.seam.q_retract,
+        )
     return state
 
 
@@ -230,7 +245,11 @@ def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if not seen.robot.ready:
         return hold(state, seen, f"The robot stopped: {seen.robot.fault or seen.robot.safety_mode}.")
     if seen.time > plan.maximum_time_s:
-        return hold(state, seen, f"The job took longer than its {plan.maximum_time_s:.0f} s, in the phase '{state.command.phase}'.")
+        return hold(
+            state,
+            seen,
+            f"The job took longer than its {plan.maximum_time_s:.0f} s, in the phase '{state.command.phase}'.",
+        )
     return PHASES[state.command.phase](state, seen, plan)
 
 

@@ -107,10 +107,14 @@ class CalibrationStatus(Message):
     observations: tuple[Observation, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     estimate: CalibrationEstimate | None = None
-    predicted_error_m: float = np.inf  # expected error of a point at the work point, from the estimate's own covariance and noise
+    predicted_error_m: float = (
+        np.inf
+    )  # expected error of a point at the work point, from the estimate's own covariance and noise
     verification_cloud: Verification | None = None  # P_v of Algorithm 1
     algorithm_1: Algorithm1State | None = None
-    history: tuple[tuple[int, float, float, float], ...] = ()  # scans, predicted error, held-out median, Algorithm 1's figure; m
+    history: tuple[
+        tuple[int, float, float, float], ...
+    ] = ()  # scans, predicted error, held-out median, Algorithm 1's figure; m
     verifications: tuple[VerificationResult, ...] = ()
     done: bool = False
     message: str = ""

@@ -51,7 +51,10 @@ def add_phase_label(meshcat: Meshcat, path: str, phase: str) -> None:
     png = cv2.imencode(".png", label_image(TEXT.get(phase, phase)))[1].tobytes()
     mesh = InMemoryMesh(
         mesh_file=MemoryFile(obj, ".obj", f"{name}.obj"),
-        supporting_files={f"{name}.mtl": MemoryFile(mtl, ".mtl", f"{name}.mtl"), f"{name}.png": MemoryFile(png, ".png", f"{name}.png")},
+        supporting_files={
+            f"{name}.mtl": MemoryFile(mtl, ".mtl", f"{name}.mtl"),
+            f"{name}.png": MemoryFile(png, ".png", f"{name}.png"),
+        },
     )
     meshcat.SetObject(path, Mesh(mesh))
     meshcat.SetTransform(path, X_WS)

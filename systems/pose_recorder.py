@@ -57,7 +57,10 @@ class PoseRecorder(LeafSystem):
         self._time = self.DeclareVectorInputPort("sample_time", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(PoseHistory()))
         self.DeclareAbstractOutputPort(
-            "history", lambda: AbstractValue.Make(PoseHistory()), self._output, {self.abstract_state_ticket(self._state)}
+            "history",
+            lambda: AbstractValue.Make(PoseHistory()),
+            self._output,
+            {self.abstract_state_ticket(self._state)},
         )
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._record)
 

@@ -3,7 +3,6 @@
 import dataclasses as dc
 import math
 from pathlib import Path
-from typing import Union
 
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
@@ -31,7 +30,9 @@ class PoseConfig:
             InputError: if it is not three finite metres and three finite degrees.
         """
         if len(self.xyz_m) != 3 or len(self.rpy_deg) != 3 or not all(map(math.isfinite, self.xyz_m + self.rpy_deg)):
-            raise InputError("Write every pose of the scenario as three finite numbers xyz_m and three finite numbers rpy_deg.")
+            raise InputError(
+                "Write every pose of the scenario as three finite numbers xyz_m and three finite numbers rpy_deg."
+            )
         return RigidTransform(RollPitchYaw([math.radians(a) for a in self.rpy_deg]), self.xyz_m)
 
 
@@ -71,7 +72,9 @@ class WorkpieceConfig:
     pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BP as the fixture's drawing says
     placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the plate on the fixture
     groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the groove against the plate's datums
-    cut_at_mm: float | None = None  # the real part ends early at this arc length: contact is lost there
+    hole_from_mm: float | None = (
+        None  # from this arc length on the real groove has no walls, unseen by the scan: contact is lost
+    )
 
 
 @dc.dataclass
@@ -112,9 +115,9 @@ class Scenario:
     kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
     flange: str = "iso9409-1-50-4-m6"  # of the arm
     tool: str = "welding"  # welding or none
-    robot: Union[SimulatedUr, NoDevice] = dc.field(default_factory=SimulatedUr)
-    scanner: Union[RenderedScanner, NoDevice] = dc.field(default_factory=RenderedScanner)
-    finger_camera: Union[RenderedFingerCamera, NoDevice] = dc.field(default_factory=RenderedFingerCamera)
+    robot: SimulatedUr | NoDevice = dc.field(default_factory=SimulatedUr)
+    scanner: RenderedScanner | NoDevice = dc.field(default_factory=RenderedScanner)
+    finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
@@ -136,7 +139,9 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
     if not path.is_file():
-        raise InputError(f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file.")
+        raise InputError(
+            f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file."
+        )
     scenario = Scenario()
     for label, text in ((str(path.name), path.read_text(encoding="utf-8")), ("the overrides", overrides)):
         if not text.strip():
@@ -158,7 +163,9 @@ def check_scenario(scenario: Scenario) -> None:
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
-        raise InputError("This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off.")
+        raise InputError(
+            "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
+        )
     if len(scenario.home_deg) != 6:
         raise InputError("home_deg must hold six joint angles in degrees.")
     calibration = scenario.calibration
@@ -181,7 +188,9 @@ def check_scenario(scenario: Scenario) -> None:
     for key, value in positive.items():
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{key} must be a positive number, not {value}.")
-    if scenario.job.weld and (scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)):
+    if scenario.job.weld and (
+        scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
+    ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
         raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

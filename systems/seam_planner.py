@@ -19,8 +19,8 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.welding.feasibility import check_feasible
 from weldcal.welding.registration import register_workpiece
 from weldcal.welding.seam import SeamCurve
-from weldcal.welding.touch import touch_start_pose
 from weldcal.welding.servo_state import ServoConfig
+from weldcal.welding.touch import touch_start_pose
 
 
 class SeamPlanner(LeafSystem):
@@ -61,7 +61,10 @@ class SeamPlanner(LeafSystem):
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(PlannedSeam()))
         self.DeclareAbstractOutputPort(
-            "planned_seam", lambda: AbstractValue.Make(PlannedSeam()), self._output, {self.abstract_state_ticket(self._state)}
+            "planned_seam",
+            lambda: AbstractValue.Make(PlannedSeam()),
+            self._output,
+            {self.abstract_state_ticket(self._state)},
         )
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
@@ -76,15 +79,19 @@ class SeamPlanner(LeafSystem):
 
     def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
         if X_BC is None:
-            return PlannedSeam(sequence=scan.sequence, reason="The seam cannot be taken into the base: the scanner is not calibrated.")
+            return PlannedSeam(
+                sequence=scan.sequence, reason="The seam cannot be taken into the base: the scanner is not calibrated."
+            )
         points_C = scan.points_C.reshape(-1, 3).astype(float)
         points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
         points_B = points_C @ X_BC.rotation().matrix().T + X_BC.translation()
         try:
             found = register_workpiece(points_B, self._workpiece, self._X_BP_guess)
-            seam = tip_seam(self._workpiece, found.X_BP, self._tool.tip_radius_m, self._seam_length_m)
+            seam = tip_seam(self._workpiece, found.X_BP, self._tool, self._seam_length_m)
             check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)
-            q_start, q_above, q_retract = arm_waypoints(self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m)
+            q_start, q_above, q_retract = arm_waypoints(
+                self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m
+            )
         except WeldcalError as error:
             return PlannedSeam(sequence=scan.sequence, reason=str(error))
         return PlannedSeam(
@@ -99,9 +106,9 @@ class SeamOutOfReach(WeldcalError):
     """The arm cannot hold the tool along the seam."""
 
 
-def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tip_radius_m: float, length_m: float | None) -> SeamCurve:
+def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
     """The line on which the seated tip's centre runs, in B, cut to `length_m` of arc where given."""
-    line = workpiece.tip_line_P(tip_radius_m)
+    line = workpiece.tip_line_P(tool.tip_radius_m) - np.array([0.0, 0.0, tool.seat_sink_m])
     if length_m is not None:
         line = line[workpiece.arc_length_m <= length_m]
     up = X_BP.rotation().matrix()[:, 2]
@@ -109,7 +116,12 @@ def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tip_radius_m: float, le
 
 
 def arm_waypoints(
-    arm: ArmModel, tool: WeldingTool, seam: SeamCurve, config: ServoConfig, q_near: NDArray[np.float64], clearance_m: float
+    arm: ArmModel,
+    tool: WeldingTool,
+    seam: SeamCurve,
+    config: ServoConfig,
+    q_near: NDArray[np.float64],
+    clearance_m: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Joint positions (6,) rad at the touch start, above it, and above the far end.
 
@@ -125,7 +137,9 @@ def arm_waypoints(
     for pose in (lifted, X_BT, X_BE):
         found = nearest_solution(arm, pose @ tool.X_FT.inverse(), q)
         if found is None:
-            raise SeamOutOfReach("The arm cannot reach the seam with the tool upright: move the workpiece towards the robot.")
+            raise SeamOutOfReach(
+                "The arm cannot reach the seam with the tool upright: move the workpiece towards the robot."
+            )
         solutions.append(found)
         q = found
     q_above, q_start, q_retract = solutions

@@ -27,7 +27,9 @@ class SingularityGuard(LeafSystem):
     Jacobian, and 1.0 while the arm is stopped. The seam's own singularity (n_d . n_t -> 0) is guarded inside the servo.
     """
 
-    def __init__(self, arm: ArmModel, X_FT: RigidTransform, config: ArmGuardConfig | None = None, speed_share: float = 0.5) -> None:
+    def __init__(
+        self, arm: ArmModel, X_FT: RigidTransform, config: ArmGuardConfig | None = None, speed_share: float = 0.5
+    ) -> None:
         super().__init__()
         self._arm, self._p_FT = arm, np.array(X_FT.translation())
         self._config, self._limit = config or ArmGuardConfig(), speed_share * arm.velocity_limit

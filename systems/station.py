@@ -14,9 +14,11 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Message
@@ -99,12 +101,15 @@ def make_station(scenario: Scenario, seed: int) -> Station:
     tool = WeldingTool() if scenario.tool == "welding" else None
     cad, real, X_BP = _workpieces(scenario, rng)
     q_home = np.deg2rad(scenario.home_deg)
+    robot = scenario.robot
+    if not isinstance(robot, SimulatedUr):
+        raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     builder = DiagramBuilder()
     world = build_world(
         builder,
         arm,
         tool,
-        scenario.robot,
+        robot,
         q_home,
         flange=scenario.flange,
         table_z_m=scenario.calibration.table_z_m,
@@ -122,7 +127,9 @@ def make_station(scenario: Scenario, seed: int) -> Station:
     return Station(diagram, arm, tool, cad, truth, world)
 
 
-def _workpieces(scenario: Scenario, rng: np.random.Generator) -> tuple[Workpiece | None, Workpiece | None, RigidTransform | None]:
+def _workpieces(
+    scenario: Scenario, rng: np.random.Generator
+) -> tuple[Workpiece | None, Workpiece | None, RigidTransform | None]:
     """The part as drawn, the part as it is, and where it lies."""
     spec = scenario.workpiece
     if spec is None:
@@ -130,9 +137,13 @@ def _workpieces(scenario: Scenario, rng: np.random.Generator) -> tuple[Workpiece
     length = spec.length_mm * 1e-3
     cad = make_workpiece(spec.shape, length_m=length)
     X_PG = seeded_groove_error(rng, spec.groove_error.translation_mm * 1e-3, np.deg2rad(spec.groove_error.rotation_deg))
-    cut = None if spec.cut_at_mm is None else spec.cut_at_mm * 1e-3
-    real = make_workpiece(spec.shape, length_m=length, X_PG=X_PG, end_cut_m=cut)
-    placed = _lying_error(rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg))
+    real = make_workpiece(spec.shape, length_m=length, X_PG=X_PG)
+    if spec.hole_from_mm is not None:
+        short = make_workpiece(spec.shape, length_m=length, X_PG=X_PG, end_cut_m=spec.hole_from_mm * 1e-3)
+        real = dc.replace(real, groove_mesh=short.groove_mesh)
+    placed = _lying_error(
+        rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
+    )
     return cad, real, spec.pose_guess.pose() @ placed
 
 

@@ -1,4 +1,5 @@
-"""`weldcal calibrate DATASET`: from a folder of scans to X_BC, its uncertainty, and a report; written whole or not at all."""
+"""`weldcal calibrate DATASET`: from a folder of scans to X_BC, its uncertainty, and a report; written whole or not at
+all."""
 
 from __future__ import annotations
 
@@ -12,11 +13,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.clouds import CloudError
 from weldcal.calibration.dataset import Dataset, load_dataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
 from weldcal.calibration.flange_fit import FlangeFit, fit_flange
+from weldcal.calibration.observability import turn_deg
 from weldcal.calibration.observation import Observation, observation_from_fit
 from weldcal.calibration.result import (
     CalibrationResult,
@@ -51,16 +54,19 @@ from weldcal.tools.report.plots_calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
 
 Array = NDArray[np.float64]
+_TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 Progress = Callable[[str, float], None]
 """Told what is being done and which fraction of the whole is behind us (0 to 1)."""
 
 
 @dataclass(frozen=True)
 class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its own figure beside the truth on poses outside its pool, and the figure's blind spots.
+    """Algorithm 1 on the same data: its own figure beside the truth on poses outside its pool, and the figure's blind
+    spots.
 
-    ``verification``: id of the pose held out for it. ``figure_mm`` is what Algorithm 1 reports; ``true_mm`` the errors at the
-    flange on poses it did not use; ``unseen`` the components of a true error of which less than half enters the figure.
+    ``verification``: id of the pose held out for it. ``figure_mm`` is what Algorithm 1 reports; ``true_mm`` the errors
+    at the flange on poses it did not use; ``unseen`` the components of a true error of which less than half enters the
+    figure.
     """
 
     verification: str
@@ -172,9 +178,10 @@ def calibrate_dataset(
     algorithm1, verifier, icp = _algorithm1(observations, inliers, clouds, fits, standard, seed)
     curve = convergence(inliers, verifier, orders=5 if not clouds else 3, seed=seed)
     warnings += list(estimate.warnings)
-    if estimate.unobservable and "bias of the flange centre" in estimate.unobservable[0]:
+    if turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
-            "The poses hardly differ in orientation: a constant error of the flange centre would not show in these figures."
+            "The poses hardly differ in orientation: a constant error of the flange centre would not show in these "
+            "figures."
         )
     result = CalibrationResult(
         X_BC=estimate.X_BC,
@@ -280,7 +287,8 @@ def _algorithm1(
     standard: FlangeStandard,
     seed: int,
 ) -> tuple[Algorithm1Outcome | None, Verifier | None, tuple[IcpRecord, ...]]:
-    """Algorithm 1 with one pose held out for verification: the one nearest the middle, where the arm will mostly work."""
+    """Algorithm 1 with one pose held out for verification: the one nearest the middle, where the arm will
+    mostly work."""
     if len(inliers) < 6:
         return None, None, ()
     middle = np.median([o.p_BR for o in inliers], axis=0)

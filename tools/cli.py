@@ -176,6 +176,23 @@ def benchmark_cell(
     finish("benchmark cell", summary, folder, json_wanted=json)
 
 
+@benchmarks.command("seeds")
+def benchmark_seeds(
+    scenario: ScenarioOption = "s_groove",
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="How many seeds, from 0 on.")] = 11,
+    out: OutOption = None,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """The demo over many seeds: does every run end done, and how far off are calibration and torch at worst."""
+    folder = out or fresh_folder("benchmark", f"seeds-{scenario}", 0)
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark seeds") as progress:
+        from weldcal.tools.benchmarks.seeds import run_seeds
+
+        summary = run_seeds(scenario, folder, range(runs), progress)
+    finish("benchmark seeds", summary, folder, json_wanted=json)
+
+
 @app.command(short_help="Show a finished run again.")
 def view(
     result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],

@@ -77,13 +77,14 @@ def rows(result: Mapping[str, object]) -> dict[str, str]:
     found: dict[str, str] = {}
     for key, value in result.items():
         unit = next((unit for unit in ("mm", "deg") if key.endswith(f"_{unit}")), "")
-        name = NAMES.get(key) or key.removesuffix(f"_{unit}").replace("_error", " error").replace("torch_", "torch ")
+        name = NAMES.get(key) or key.removesuffix(f"_{unit}").replace("_error", " error").replace("torch_", "torch ").replace("_at_", " at ")
         if isinstance(value, list) and all(
             isinstance(item, Mapping) and {"id", "reason"} <= set(item) for item in value
         ):
             found.update({f"{name} {item['id']}": str(item["reason"]) for item in value})
         elif key not in ("state", "reason"):
-            found[name] = f"{_short(value)} {unit}".strip() if _short(value) else ""
+            text = f"{_short(value)} {unit}".strip() if _short(value) else ""
+            found[name] = ", ".join(part for part in (found.get(name, ""), text) if part)
     return found
 
 

@@ -12,9 +12,10 @@ from pydrake.systems.framework import Context
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
-from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport
+from weldcal.systems.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
 from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam import SeamCurve
+from weldcal.welding.servo_state import Phase
 
 Array = NDArray[np.float64]
 
@@ -104,7 +105,7 @@ def weld_log(cell: Cell, root: Context) -> WeldLog | None:
         return None
     series = {name: sink.FindLog(root) for name, sink in cell.logs.items()}
     telemetry = series["telemetry"].data()
-    keep = telemetry[0] >= 0.0
+    keep = (telemetry[0] >= 0.0) & (telemetry[0] != PHASE_CODES[Phase.DONE])
     if keep.sum() < 3:
         return None
     tool = cell.station.tool
@@ -131,7 +132,7 @@ def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
     plan = planned_seam(cell, root).seam
     plan_error = None
     if plan is not None:
-        seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m)  # type: ignore[union-attr]
+        seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m) - cell.station.tool.seat_sink_m  # type: ignore[union-attr]
         line = plan.position(np.linspace(0.0, plan.length, 200)) - (seat - TORCH_ABOVE_ROOT_M) * np.array(
             [0.0, 0.0, 1.0]
         )

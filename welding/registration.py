@@ -32,10 +32,9 @@ Floats = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 PLANE_BAND_M = 0.0015
-CHECK_OFFSET_M = 0.003
 
 
-class WorkpieceNotFound(WeldcalError):  # noqa: N818
+class WorkpieceNotFound(WeldcalError):
     """The scan does not show this workpiece near the guess."""
 
 
@@ -165,17 +164,14 @@ def _refine(
     flat = np.abs(p[:, 2]) < band
     raster = _rasterise(p, flat, p[:, 2] < -0.003, pitch)
     rims, edges = _outermost(p[flat][:, :2], outline, 0.008, pitch)
-    supported, contradicted = _check(raster, outline, _displaced(rims, edges, outline, inset, 0.0003 + 0.5 * pitch))
+    displaced = _displaced(rims, edges, outline, inset, 0.0003 + 0.5 * pitch, raster)
+    supported, contradicted = _check(raster, outline, displaced)
     if contradicted > config.max_contradicted:
-        raise WorkpieceNotFound(
-            not_found
-            + f"{100 * contradicted:.0f} % of its outline disagree with the scan; check which workpiece this is."
-        )
+        disagree = f"{100 * contradicted:.0f} % of its outline disagree with the scan"
+        raise WorkpieceNotFound(not_found + disagree + "; check which workpiece this is.")
     if supported < config.min_supported:
-        raise WorkpieceNotFound(
-            not_found
-            + f"only {100 * supported:.0f} % of its outline can be seen; clear the view or scan from higher up."
-        )
+        visible = f"only {100 * supported:.0f} % of its outline can be seen"
+        raise WorkpieceNotFound(not_found + visible + "; clear the view or scan from higher up.")
     inside = inside_loops(p[:, :2], [core])
     on_face = flat & inside
     return WorkpieceRegistration(
@@ -195,20 +191,16 @@ def _into(X_AB: RigidTransform, p_A: Floats) -> Floats:
     return np.asarray((p_A - X_AB.translation()) @ X_AB.rotation().matrix(), dtype=np.float64)
 
 
-def _pose(R: Floats, p: Floats) -> RigidTransform:
-    return RigidTransform(RotationMatrix(R), p)  # type: ignore[arg-type]
-
-
 def _turned(x: float, y: float, yaw: float) -> RigidTransform:
-    return _pose(np.asarray(RotationMatrix.MakeZRotation(yaw).matrix(), dtype=np.float64), np.array([x, y, 0.0]))
+    return RigidTransform(RotationMatrix.MakeZRotation(yaw), np.array([x, y, 0.0]))
 
 
 def _plane_frame(normal: Floats, center: Floats) -> RigidTransform:
     """The guess frame moved on to a plane by the shortest way: z becomes the normal, x stays as near as it can."""
     x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     x /= np.linalg.norm(x)
-    height = float(normal @ center) / normal[2]
-    return _pose(np.column_stack([x, np.cross(normal, x), normal]), np.array([0.0, 0.0, height]))
+    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
+    return RigidTransform(R, np.array([0.0, 0.0, float(normal @ center) / normal[2]]))
 
 
 def _planes(sample: Floats, config: RegistrationConfig, rng: np.random.Generator) -> list[RigidTransform]:
@@ -274,12 +266,10 @@ def _rasterise(p: Floats, face: Mask, below: Mask, pitch: float) -> _Raster:
     cell = max(2.0 * pitch, 0.001)
     corner = p[:, :2].min(axis=0) - 4.0 * cell
     width, height = (np.ceil((p[:, :2].max(axis=0) - corner) / cell).astype(int) + 4).tolist()
-    layers = []
-    for which in (face, below):
+    layers = np.zeros((2, height, width), dtype=np.uint8)
+    for layer, which in zip(layers, (face, below), strict=True):
         i = ((p[which, :2] - corner) / cell).astype(np.int64)
-        layer = np.zeros((height, width), dtype=np.uint8)
         layer[i[:, 1], i[:, 0]] = 1
-        layers.append(layer)
     closed = cv2.morphologyEx(layers[0], cv2.MORPH_CLOSE, np.ones((3, 3), dtype=np.uint8))
     return _Raster(closed.astype(bool), layers[1].astype(bool), cell, corner)
 
@@ -382,17 +372,25 @@ def _fit_outline(
     return _turned(*fit.x[:3]), float(fit.x[3]), float(np.sqrt(np.mean(np.square(off))))
 
 
-def _displaced(rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, inset: float, tolerance: float) -> set[int]:
-    """Edges that most of their outermost points (M,2) put further than the tolerance from where they are drawn."""
-    depth = np.einsum("ij,ij->i", rims - outline[edges], _inward(outline)[edges]) - inset
-    seen = [k for k in range(len(outline)) if np.count_nonzero(edges == k) >= 10]
-    return {k for k in seen if abs(float(np.median(depth[edges == k]))) > tolerance}
+def _displaced(
+    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, inset: float, tolerance: float, raster: _Raster
+) -> set[int]:
+    """Edges that most of their outermost points (M,2) put further than the tolerance from where they are drawn.
+
+    Only points that end the face count: lower ground is seen just beyond them, not the shadow of something in front.
+    """
+    inward = _inward(outline)[edges]
+    depth = np.einsum("ij,ij->i", rims - outline[edges], inward) - inset
+    beyond = rims[:, None, :] - np.arange(0.002, 0.0125, 0.002)[:, None] * inward[:, None, :]
+    ends = raster.look(raster.below, beyond).any(axis=1) | (depth < -tolerance)
+    seen = [k for k in range(len(outline)) if np.count_nonzero(ends & (edges == k)) >= 10]
+    return {k for k in seen if abs(float(np.median(depth[ends & (edges == k)]))) > tolerance}
 
 
 def _check(raster: _Raster, outline: Floats, displaced: set[int]) -> tuple[float, float]:
     """Shares of the outline where the face ends as drawn, and where the scan shows that it does not."""
     at, inward, edge = _along(outline, 0.002)
-    offset = max(CHECK_OFFSET_M, 2.0 * raster.cell) * inward
+    offset = max(0.003, 2.0 * raster.cell) * inward
     face_in, face_out = raster.look(raster.face, at + offset), raster.look(raster.face, at - offset)
     missing = ~face_in & raster.look(raster.below, at + offset)
     denied = face_out | missing | np.isin(edge, sorted(displaced))

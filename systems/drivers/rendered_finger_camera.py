@@ -20,13 +20,15 @@ from weldcal.systems.messages import Image, Message
 class RenderedFingerCamera:
     """`!RenderedFingerCamera`: the camera in the tool, looking at the tag."""
 
-    width: int = 640
-    height: int = 480
+    width: int = 400  # the window that is read out of a 640 x 480 sensor: the tag and as far as it can move
+    height: int = 300
     focal_px: float = 450.0
     rate_hz: float = 30.0
     latency_s: float = 0.040
     noise_grey: float = 2.0
-    hidden_from_s: float | None = None  # spatter on the lens: from this time after the camera started, the tag is not seen
+    hidden_from_s: float | None = (
+        None  # spatter on the lens: from this time after the camera started, the tag is not seen
+    )
 
     def camera(self) -> FingerCamera:
         """The camera as numbers."""
@@ -64,7 +66,9 @@ class StreamingColourCamera(LeafSystem):
         self._seed = seed
         self._plant_period_s = plant_period_s
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
-        self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(config.width, config.height)))
+        self._color = self.DeclareAbstractInputPort(
+            "color_image", AbstractValue.Make(ImageRgba8U(config.width, config.height))
+        )
         self._state = self.DeclareAbstractState(AbstractValue.Make(_Stream()))
         ticket = {self.abstract_state_ticket(self._state), self.time_ticket()}
         self.DeclareAbstractOutputPort("image", lambda: AbstractValue.Make(Image()), self._image, ticket)
@@ -85,7 +89,9 @@ class StreamingColourCamera(LeafSystem):
         else:
             rgba = self._color.Eval(context).data
             grey = rgba[:, :, 1].astype(np.float32)  # the tag is black on white: one channel says it all
-        noisy = np.clip(grey + self._config.noise_grey * rng.standard_normal(shape, dtype=np.float32), 0, 255).astype(np.uint8)
+        noisy = np.clip(grey + self._config.noise_grey * rng.standard_normal(shape, dtype=np.float32), 0, 255).astype(
+            np.uint8
+        )
         step = self._plant_period_s
         taken = np.floor(now / step + 1e-6) * step
         frame = Image(sequence=stream.count + 1, capture_time=taken, pixels=noisy)
@@ -113,14 +119,18 @@ def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None
         return
     camera = config.camera()
     K = camera.camera_matrix
-    info = CameraInfo(config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)  # half pixel: VTK's convention
+    info = CameraInfo(
+        config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
+    )  # half pixel: VTK's convention
     core = RenderCameraCore(FINGER_RENDERER, info, ClippingRange(0.005, 0.5), RigidTransform())
     color, depth = ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.01, 0.4))
     plate = world.plant.GetBodyByName("tool_plate", world.tool)
     frame = world.plant.GetBodyFrameIdOrThrow(plate.index())
     sensor = build.builder.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
     sensor.set_name("finger_camera_colour")
-    stream = build.builder.AddSystem(StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step()))
+    stream = build.builder.AddSystem(
+        StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step())
+    )
     stream.set_name("finger_camera")
     build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.builder.Connect(sensor.color_image_output_port(), stream.GetInputPort("color_image"))

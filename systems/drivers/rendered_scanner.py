@@ -6,13 +6,21 @@ from typing import Any
 import numpy as np
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import ClippingRange, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.geometry import (
+    Box,
+    ClippingRange,
+    DepthRange,
+    DepthRenderCamera,
+    GeometryInstance,
+    MakePhongIllustrationProperties,
+    RenderCameraCore,
+)
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, RgbdSensor
 
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
-from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER
+from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER, SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 
@@ -26,7 +34,9 @@ class RenderedScanner:
     height: int | None = 616
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.95])  # nominal X_BC
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, -90.0])
-    mounting_translation_mm: float = 15.0  # the true pose differs from the nominal one by this much, drawn from the seed
+    mounting_translation_mm: float = (
+        15.0  # the true pose differs from the nominal one by this much, drawn from the seed
+    )
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
 
@@ -91,14 +101,26 @@ class TriggeredDepthScanner(LeafSystem):
         output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
+def _show_housing(world: SimulatedWorld, X_BC: RigidTransform) -> None:
+    """The scanner's body where it truly stands: for the viewer only, so that it does not see itself."""
+    scene_graph = world.scene_graph
+    source = scene_graph.RegisterSource("scanner_housing")
+    housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), Box(0.41, 0.08, 0.09), "scanner_housing")
+    housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 1.0])))
+    scene_graph.RegisterAnchoredGeometry(source, housing)
+
+
 def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
     """Stand a depth camera in the world at its true pose (known to `cheat.X_BC` alone) and add the scanner behind it."""
     world = build.simulated_world()
     preset = get_scanner(config.preset, width=config.width, height=config.height)
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
-    error = random_pose_error(build.rng, config.mounting_translation_mm * 1e-3, np.deg2rad(config.mounting_rotation_deg))
+    error = random_pose_error(
+        build.rng, config.mounting_translation_mm * 1e-3, np.deg2rad(config.mounting_rotation_deg)
+    )
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
     k = drake_intrinsics(preset)
+    _show_housing(world, X_BC)
     core = RenderCameraCore(
         SCANNER_RENDERER,
         CameraInfo(k.width, k.height, k.focal_x, k.focal_y, k.center_x, k.center_y),

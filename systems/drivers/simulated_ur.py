@@ -18,7 +18,9 @@ class SimulatedUr:
     """`!SimulatedUr`: the arm as a MultibodyPlant with gravity compensated."""
 
     control_period_s: float = 0.002  # 500 Hz, as the real controller
-    stiffness: list[float] = dc.field(default_factory=lambda: [2e5, 2e5, 1e5, 2e4, 2e4, 1e4])  # N m / rad, of the joint servos
+    stiffness: list[float] = dc.field(
+        default_factory=lambda: [2e5, 2e5, 1e5, 2e4, 2e4, 1e4]
+    )  # N m / rad, of the joint servos
     damping: list[float] = dc.field(default_factory=lambda: [4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2])  # N m s / rad
     following_error_rad: float = 0.05  # beyond this the controller stops the arm
 
@@ -68,7 +70,10 @@ class SpeedJointServo(LeafSystem):
         measured = self._arm_state.Eval(context)
         command = self._command.Eval(context)
         fault = old[25]
-        if not np.all(np.isfinite(command)) or np.max(np.abs(old[:6] - measured[:6])) > self._config.following_error_rad:
+        if (
+            not np.all(np.isfinite(command))
+            or np.max(np.abs(old[:6] - measured[:6])) > self._config.following_error_rad
+        ):
             fault = 1.0
         wanted = np.zeros(6) if fault else np.clip(command, -self._arm.velocity_limit, self._arm.velocity_limit)
         step = self._arm.acceleration_limit * dt

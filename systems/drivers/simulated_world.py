@@ -74,7 +74,9 @@ def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents=mesh.to_obj(), extension=".obj", filename_hint=name)))
 
 
-def _show(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]) -> None:
+def _show(
+    plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]
+) -> None:
     """Give a body something to see, in Meshcat and in the rendered images alike."""
     plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
 
@@ -107,8 +109,11 @@ def _add_tool(
     """Plate, ring, camera, torch (welded to the flange) and the soft tip on three sprung prismatic joints."""
     instance = plant.AddModelInstance("tool")
     flange_frame = plant.GetFrameByName("flange", arm)
-    inertia = SpatialInertia(tool.mass_kg, np.array([0.03, 0.0, 0.05]), UnitInertia.SolidBox(0.25, 0.08, 0.12).ShiftFromCenterOfMass(
-        np.array([-0.03, 0.0, -0.05])))
+    inertia = SpatialInertia(
+        tool.mass_kg,
+        np.array([0.03, 0.0, 0.05]),
+        UnitInertia.SolidBox(0.25, 0.08, 0.12).ShiftFromCenterOfMass(np.array([-0.03, 0.0, -0.05])),
+    )
     plate = plant.AddRigidBody("tool_plate", instance, inertia)
     plant.WeldFrames(flange_frame, plate.body_frame())
     t, r = tool.plate_thickness_m, tool.ring_offset_m
@@ -118,12 +123,33 @@ def _add_tool(
     _show(plant, plate, RigidTransform([r, 0.0, t / 2]), Cylinder(0.0375, t), "ring_base", DARK)
     _show(plant, plate, tool.X_FR, mesh_shape(ring, "ring.obj"), "flange_like_ring", STEEL)
     camera_z = tool.X_FK.translation()[2]
-    _show(plant, plate, RigidTransform([0.0, 0.0, t + (camera_z - 0.006 - t) / 2]), Box(0.026, 0.026, camera_z - 0.006 - t), "camera", DARK)
+    _show(
+        plant,
+        plate,
+        RigidTransform([0.0, 0.0, t + (camera_z - 0.006 - t) / 2]),
+        Box(0.026, 0.026, camera_z - 0.006 - t),
+        "camera",
+        DARK,
+    )
     for side in (-1.0, 1.0):  # the frame that carries the soft metamaterial, outside the camera's view
-        _show(plant, plate, RigidTransform([0.0, side * 0.034, (t + tool.tag_reach_m) / 2]), Box(0.012, 0.004, tool.tag_reach_m - t), f"post{side:+.0f}", DARK)
+        _show(
+            plant,
+            plate,
+            RigidTransform([0.0, side * 0.034, (t + tool.tag_reach_m) / 2]),
+            Box(0.012, 0.004, tool.tag_reach_m - t),
+            f"post{side:+.0f}",
+            DARK,
+        )
     p_FW = tool.X_FT @ tool.p_TW
     length = p_FW[2] - 0.012 - t
-    _show(plant, plate, RigidTransform([p_FW[0] / 2 - 0.01, 0.0, t / 2 + t]), Box(-p_FW[0] + 0.02, 0.03, t), "torch_arm", DARK)
+    _show(
+        plant,
+        plate,
+        RigidTransform([p_FW[0] / 2 - 0.01, 0.0, t / 2 + t]),
+        Box(-p_FW[0] + 0.02, 0.03, t),
+        "torch_arm",
+        DARK,
+    )
     _show(plant, plate, RigidTransform([p_FW[0], 0.0, t + length / 2]), Cylinder(0.009, length), "torch_body", COPPER)
     _show(plant, plate, RigidTransform([p_FW[0], 0.0, p_FW[2] - 0.006]), Cylinder(0.0006, 0.012), "torch_wire", STEEL)
 
@@ -148,11 +174,20 @@ def _add_tool(
     _show(plant, body, RigidTransform([0.0, 0.0, reach - 0.0015]), Cylinder(0.026, 0.002), "membrane", SOFT)
     tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
     X_TM = RigidTransform([0.0, 0.0, reach])
-    _show(plant, body, X_TM @ RigidTransform([0.0, 0.0, -0.0003]), Box(0.016, 0.016, 0.0005), "tag_white", (1.0, 1.0, 1.0, 1.0))
+    _show(
+        plant,
+        body,
+        X_TM @ RigidTransform([0.0, 0.0, -0.0003]),
+        Box(0.016, 0.016, 0.0005),
+        "tag_white",
+        (1.0, 1.0, 1.0, 1.0),
+    )
     _show(plant, body, X_TM, mesh_shape(_tag_mesh(tag), "tag.obj"), "tag_dark", (0.02, 0.02, 0.02, 1.0))
     contact = ProximityProperties()
     AddContactMaterial(dissipation=1.0, friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=contact)
-    AddCompliantHydroelasticProperties(resolution_hint=contact_hint_m, hydroelastic_modulus=5e6, properties=contact)
+    AddCompliantHydroelasticProperties(
+        resolution_hint=contact_hint_m, hydroelastic_modulus=tool.tip_modulus_Pa, properties=contact
+    )
     plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), "tip_contact", contact)
     return instance, tuple(joints)
 
@@ -213,7 +248,9 @@ def build_world(
         rigid = ProximityProperties()
         AddContactMaterial(friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=rigid)
         AddRigidHydroelasticProperties(resolution_hint=0.002, properties=rigid)
-        plant.RegisterCollisionGeometry(world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid)
+        plant.RegisterCollisionGeometry(
+            world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
+        )
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
         servo.set_controller_gains(PdControllerGains(p=robot.stiffness[k], d=robot.damping[k]))

@@ -65,7 +65,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
 
 
 def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for p in report.result.poses:
         fit = report.fits.get(p.id)
         rows.append(
@@ -128,7 +128,8 @@ def _residual_bars(report: CalibrationReport) -> bytes:
 
 
 def _residual_field(report: CalibrationReport) -> bytes:
-    """Residuals in the camera frame, across the field of view and along the line of sight: a scanner's own error has a pattern."""
+    """Residuals in the camera frame, across the field of view and along the line of sight: a scanner's own error has a
+    pattern."""
     e = report.estimate
     R = e.X_BC.rotation().matrix()
     seen = np.array([o.p_CR for o in report.observations])[e.inliers]

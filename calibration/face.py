@@ -1,0 +1,287 @@
+"""Is this flat face a flange? Its concentric edges, located as well as the scan allows, and the tests it must pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.circle import CircleFit, fit_circle
+from weldcal.calibration.edge_labels import refine_circle
+from weldcal.calibration.errors import CircleFitError, PlaneFitError
+from weldcal.calibration.plane import PlaneFit, fit_plane
+from weldcal.calibration.rim import EdgePoints, FacePixels, coverage, plane_axes, sector_edges
+from weldcal.calibration.scene import Scene
+from weldcal.models.flanges import FlangeStandard
+
+Array = NDArray[np.float64]
+
+_CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
+_CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so
+_WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
+_SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
+
+
+@dataclass(frozen=True)
+class FlangeFitConfig:
+    """What counts as a flange. Lengths in m; the defaults suit structured-light scanners and admit time-of-
+    flight ones."""
+
+    seed: int = 0
+    hypothesis_tolerance_m: float = 0.0008
+    radius_tolerance: float = 0.05
+    min_coverage: float = 0.5
+    max_plane_rms_m: float = 0.0015
+    max_rim_rms_m: float = 0.0006
+    max_guess_tilt_rad: float = 0.8
+    min_points: int = 120
+
+
+@dataclass
+class Refusal:
+    """The most telling reason so far: a candidate that failed a late test says more than one that failed early."""
+
+    stage: int = -1
+    text: str = ""
+
+    def note(self, stage: int, text: str) -> None:
+        """Keep a reason unless a later test has already spoken."""
+        if stage > self.stage:
+            self.stage, self.text = stage, text
+
+
+@dataclass(frozen=True)
+class Face:
+    """A flange face: its plane, its edges (centres (2,) in the plane's axes), share of the outer edge seen, and its
+    quality."""
+
+    plane: PlaneFit
+    outer: CircleFit
+    bore: CircleFit | None
+    coverage: float
+    n_points: int
+    quality: float
+
+
+def thickness(plane: PlaneFit) -> float:
+    """How far (m) from the plane a point of the face may lie."""
+    return max(3.0 * plane.rms, 0.0002)
+
+
+def faces_on_plane(
+    scene: Scene,
+    seed_point: Array,
+    normal: Array,
+    standard: FlangeStandard,
+    config: FlangeFitConfig,
+    refusal: Refusal,
+) -> list[Face]:
+    """Flange faces on one plane (point and normal (3,)): every connected part of about the flange's size is tried."""
+    d = scene.points - seed_point
+    around = np.einsum("nk,nk->n", d, d) < (1.2 * standard.outer_m) ** 2
+    try:
+        plane = fit_plane(scene.points[around], (seed_point, normal), tolerance=3.0 * config.hypothesis_tolerance_m)
+    except PlaneFitError as e:
+        refusal.note(1, str(e))
+        return []
+    if plane.rms > config.max_plane_rms_m:
+        refusal.note(1, f"The face is not flat: {1e3 * plane.rms:.2f} mm rms from its plane.")
+        return []
+    xy, pitch, part = scene.parts(plane, thickness(plane), seed_point, 2.0 * standard.outer_m)
+    if len(xy) < config.min_points:
+        refusal.note(1, f"Only {len(xy)} points lie on the largest flat face; the flange needs {config.min_points}.")
+        return []
+    faces = []
+    for k in range(min(3, int(part.max()) + 1)):
+        mine = xy[part == k]
+        if len(mine) < config.min_points // 2:
+            break
+        outer = _first_circle(mine, pitch, standard, config, refusal)
+        if outer is None:
+            continue
+        center = plane.point + np.column_stack(plane_axes(plane.normal)) @ outer.center
+        close = scene.near(center, 0.68 * standard.outer_m + 3.0 * pitch)
+        face = _measure(close, plane, outer, pitch, standard, config, refusal)
+        if face is not None:
+            faces.append(face)
+    return faces
+
+
+def _bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[float, float]:
+    """Radii that the outer edge may have: between the flat face and the cylinder, and some slack."""
+    slack = max(config.radius_tolerance * standard.outer_radius_m, 1.5 * pitch)
+    return standard.face_outer_radius_m - slack, standard.outer_radius_m + slack
+
+
+def _first_circle(
+    part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal
+) -> CircleFit | None:
+    """The outer edge of a connected part (N, 2), roughly."""
+    bounds = _bounds(pitch, standard, config)
+    extent = float(np.ptp(part, axis=0).max())
+    wanted = f"the flange has {1e3 * standard.outer_m:.0f} mm"
+    if extent < bounds[0]:
+        refusal.note(2, f"The largest flat face is {1e3 * extent:.3g} mm across; {wanted}.")
+        return None
+    if extent > _WIDEST * standard.outer_m:
+        refusal.note(2, f"The flat faces found are {1e3 * extent:.3g} mm across and more; {wanted}.")
+        return None
+    middle = 0.5 * (part.min(axis=0) + part.max(axis=0))
+    band = (0.3 * standard.outer_radius_m, 4.0 * standard.outer_radius_m)
+    rim = sector_edges(part, middle, pitch, outer=True, band=band)
+    try:
+        return fit_circle(rim, radius_bounds=bounds, noise_floor=0.2 * pitch, hypotheses=100, seed=config.seed)
+    except CircleFitError:
+        refusal.note(
+            3, f"The flat face is {1e3 * extent:.3g} mm across and has no circular edge of that size; {wanted}."
+        )
+        return None
+
+
+def _measure(
+    scene: Scene,
+    plane: PlaneFit,
+    outer: CircleFit,
+    pitch: float,
+    standard: FlangeStandard,
+    config: FlangeFitConfig,
+    refusal: Refusal,
+) -> Face | None:
+    """Plane and edges in turn, twice; then the tests."""
+    bounds = _bounds(pitch, standard, config)
+    slack = bounds[1] - standard.outer_radius_m
+    bore: CircleFit | None = None
+    xy, count = np.zeros((0, 2)), 0
+    for final in (False, True):
+        center3 = plane.point + np.column_stack(plane_axes(plane.normal)) @ outer.center
+        inner = standard.bore_radius_m if bore is None else bore.radius
+        ring = _between(
+            scene.points - center3,
+            plane.normal,
+            inner + 0.5 * pitch,
+            outer.radius - 0.5 * pitch,
+            2.0 * thickness(plane),
+        )
+        try:
+            plane = fit_plane(scene.points[ring], (plane.point, plane.normal), tolerance=2.0 * thickness(plane))
+            count = int(ring.sum())
+            center = (center3 - plane.point) @ np.column_stack(plane_axes(plane.normal))
+            t = thickness(plane)
+            xy, edges, pixels = scene.edges(plane, t, center3, 0.7 * standard.outer_m, labels=final)
+            outer = _edge(xy, edges, pixels, center, outer.radius, pitch, t, _clear(standard, pitch, True), outer=True)
+        except (PlaneFitError, CircleFitError) as e:
+            refusal.note(4, str(e))
+            return None
+        try:
+            radius = standard.face_inner_radius_m if bore is None else bore.radius
+            bore = _edge(xy, edges, pixels, outer.center, radius, pitch, t, _clear(standard, pitch, False), outer=False)
+        except CircleFitError:
+            bore = None
+        if bore is not None and (
+            abs(bore.radius - standard.face_inner_radius_m) > slack + standard.chamfer_m
+            or float(np.linalg.norm(bore.center - outer.center)) > 0.25 * slack + pitch
+        ):
+            bore = None
+    return _tested(plane, outer, bore, xy, count, pitch, standard, config, refusal)
+
+
+def _between(d: Array, normal: Array, inner: float, outer: float, height: float) -> NDArray[np.bool_]:
+    h = d @ normal
+    rho2 = np.einsum("nk,nk->n", d, d) - h * h
+    return np.asarray((rho2 < outer**2) & (rho2 > inner**2) & (np.abs(h) < height))
+
+
+def _clear(standard: FlangeStandard, pitch: float, outer: bool) -> float:
+    """Half width (m) of the ring about an edge that holds no screw hole."""
+    gaps = [
+        standard.face_outer_radius_m - np.hypot(x, y) - r
+        if outer
+        else np.hypot(x, y) - r - standard.face_inner_radius_m
+        for x, y, r in standard.openings()
+    ]
+    return float(max(min([2.5 * pitch, *gaps]), 1.2 * pitch))
+
+
+def _edge(
+    xy: Array,
+    edges: EdgePoints | None,
+    pixels: FacePixels | None,
+    center: Array,
+    radius: float,
+    pitch: float,
+    height: float,
+    clear: float,
+    *,
+    outer: bool,
+) -> CircleFit:
+    """One edge near an expected circle. Raises CircleFitError where too little of it was seen."""
+    width = 2.0 * pitch + 0.0012
+    if edges is None:
+        found = sector_edges(xy, center, pitch, outer=outer, band=(radius - width, radius + width))
+        return fit_circle(found, initial=(center, radius), noise_floor=0.1 * pitch)
+    d = edges.points - center
+    rho = np.hypot(d[:, 0], d[:, 1])
+    near = np.abs(rho - radius) < width
+    if int(near.sum()) < 12:
+        raise CircleFitError("Too little of the edge was seen.")
+    # where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
+    # sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole
+    beyond = edges.beyond[near]
+    beyond = beyond[np.isfinite(beyond)]
+    share = float(np.mean((beyond < 0.0) & (beyond > -_CHAMFER_M))) if len(beyond) else 0.0
+    lowered = height if share > _CHAMFER_SHARE else 0.0
+    points = edges.points[near] - lowered * edges.slide[near]
+    sigma = np.hypot((edges.step[near] * d[near]).sum(axis=1) / rho[near], 0.3 * pitch)
+    start = fit_circle(points, sigma=sigma, initial=(center, radius), noise_floor=0.03 * pitch)
+    if pixels is None:
+        return start
+    places = pixels.points - lowered * pixels.slide
+    d = places - start.center
+    close = np.abs(np.hypot(d[:, 0], d[:, 1]) - start.radius) < clear
+    fit = refine_circle(places[close], pixels.on_face[close], start, pitch, outer=outer)
+    return replace(fit, covariance=_SHARED * fit.covariance)
+
+
+def _tested(
+    plane: PlaneFit,
+    outer: CircleFit,
+    bore: CircleFit | None,
+    xy: Array,
+    count: int,
+    pitch: float,
+    standard: FlangeStandard,
+    config: FlangeFitConfig,
+    refusal: Refusal,
+) -> Face | None:
+    """The face if its size, its edge and its bore are a flange's; else None, with the reason noted."""
+    bounds = _bounds(pitch, standard, config)
+    rho = np.linalg.norm(xy - outer.center, axis=1)
+    seen = coverage(xy[np.abs(rho - outer.radius) < 2.0 * pitch + 0.0005], outer.center)
+    core = 0.7 * standard.bore_radius_m
+    filled = int((rho < core).sum()) / core**2
+    density = max(count, 1) / (outer.radius**2 - standard.bore_radius_m**2)
+    rough = max(config.max_rim_rms_m, 0.7 * pitch)
+    if not bounds[0] < outer.radius < bounds[1]:
+        refusal.note(
+            5,
+            f"The circle found is {2e3 * outer.radius:.1f} mm across; the flange has {1e3 * standard.outer_m:.0f} mm.",
+        )
+    elif count < config.min_points:
+        refusal.note(5, f"Only {count} points lie on the face; the flange needs {config.min_points}.")
+    elif seen < config.min_coverage:
+        refusal.note(
+            6, f"Only {100 * seen:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are needed."
+        )
+    elif outer.rms > rough:
+        refusal.note(
+            6,
+            f"The edge is too rough: {1e3 * outer.rms:.2f} mm rms from its circle; at most {1e3 * rough:.2f} mm is "
+            "allowed.",
+        )
+    elif filled > 0.4 * density:
+        refusal.note(6, f"The disc found has no bore of {1e3 * standard.bore_m:.1f} mm: it is not the flange.")
+    else:
+        quality = seen + (1.0 if bore is not None else 0.0) - outer.rms / rough
+        return Face(plane, outer, bore, seen, count, quality)
+    return None

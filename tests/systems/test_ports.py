@@ -1,0 +1,245 @@
+"""Every system has exactly the ports that its docstring shows, of the size and kind that the rest of the cell counts on."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import textwrap
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pydrake.common.yaml import yaml_load
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDataType
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+
+import weldcal.systems
+from weldcal.models.flanges import get_flange
+from weldcal.models.scanners import get_scanner
+from weldcal.models.workpieces import make_workpiece
+from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
+from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, NextPose
+from weldcal.systems.cell_visualizer import CellVisualizer
+from weldcal.systems.command_arbiter import CommandArbiter
+from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
+from weldcal.systems.drivers.rendered_scanner import TriggeredDepthScanner
+from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
+from weldcal.systems.flange_estimator import FlangeEstimator
+from weldcal.systems.flange_mover import FlangeMover
+from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
+from weldcal.systems.job_sequencer import JobPlan, JobSequencer, JobState
+from weldcal.systems.messages import (
+    CalibrationStatus,
+    FlangeEstimate,
+    Image,
+    JobCommand,
+    PlannedSeam,
+    Scan,
+    UrStatus,
+)
+from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
+from weldcal.systems.scenario import VisualizationConfig
+from weldcal.systems.seam_planner import SeamPlanner
+from weldcal.systems.singularity_guard import SingularityGuard
+from weldcal.systems.slew_limiter import SlewLimiter
+from weldcal.systems.station import CheatPoses
+from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
+from weldcal.welding.guard import SlewLimits
+from weldcal.welding.servo_state import ServoConfig
+
+from .cells import Q_HOME, TOOL, plain_station, the_arm
+
+X = RigidTransform()
+IDEAL = get_scanner("ideal", width=206, height=154)
+CALIBRATOR = CalibratorConfig(1e-4, 6, 10, np.zeros(3))
+JOB = JobPlan(True, True, Q_HOME, 10, 1, 5e-4, 1e-4)
+
+MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
+    SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
+    TriggeredDepthScanner: lambda: TriggeredDepthScanner(IDEAL, 0, 0.1),
+    StreamingColourCamera: lambda: StreamingColourCamera(RenderedFingerCamera(), 0, 0.002),
+    PoseRecorder: PoseRecorder,
+    FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
+    IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, get_flange("tool-ring-63"), CALIBRATOR),
+    CalibrationPosePlanner: lambda: CalibrationPosePlanner(()),
+    SeamPlanner: lambda: SeamPlanner(
+        the_arm(), TOOL, make_workpiece("straight"), X, ServoConfig(), Q_HOME, 0.025, None
+    ),
+    ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
+    WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
+    SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
+    CommandArbiter: CommandArbiter,
+    FlangeMover: FlangeMover,
+    SlewLimiter: lambda: SlewLimiter(SlewLimits()),
+    JobSequencer: lambda: JobSequencer(JOB),
+    CellVisualizer: lambda: CellVisualizer(
+        Meshcat(MeshcatParams(host="localhost", port=0)), the_arm(), TOOL, X, 0.03, VisualizationConfig()
+    ),
+    CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
+}
+
+# What travels on each port: a vector of that many numbers, or a message of that type.
+KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
+    SpeedJointServo: {
+        "velocity_command": 6,
+        "arm_state": 12,
+        "desired_state": 12,
+        "position_measured": 6,
+        "velocity_measured": 6,
+        "X_BF": RigidTransform,
+        "sample_time": 1,
+        "status": UrStatus,
+    },
+    TriggeredDepthScanner: {"trigger": 1, "depth_image": ImageDepth32F, "scan": Scan},
+    StreamingColourCamera: {"streaming": 1, "color_image": ImageRgba8U, "image": Image, "capture_time": 1},
+    PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
+    FlangeEstimator: {
+        "scan": Scan,
+        "job": JobCommand,
+        "history": PoseHistory,
+        "calibration_status": CalibrationStatus,
+        "flange_estimate": FlangeEstimate,
+    },
+    IterativeCalibrator: {
+        "flange_estimate": FlangeEstimate,
+        "history": PoseHistory,
+        "calibration_status": CalibrationStatus,
+    },
+    CalibrationPosePlanner: {"calibration_status": CalibrationStatus, "next_pose": NextPose},
+    SeamPlanner: {
+        "scan": Scan,
+        "job": JobCommand,
+        "calibration_status": CalibrationStatus,
+        "planned_seam": PlannedSeam,
+    },
+    ArucoDeformationEstimator: {"image": Image, "history": PoseHistory, "deformation": Deformation, "deflection": 5},
+    WeldingVelocityServo: {
+        "planned_seam": PlannedSeam,
+        "deformation": Deformation,
+        "position_measured": 6,
+        "sample_time": 1,
+        "job": JobCommand,
+        "V_BT": 6,
+        "servo_report": ServoReport,
+        "telemetry": len(TELEMETRY),
+        "torch_on": 1,
+    },
+    SingularityGuard: {"V_BT": 6, "position_measured": 6, "velocity": 6, "margin": 2, "guarded": 8},
+    CommandArbiter: {
+        "job": JobCommand,
+        "robot_status": UrStatus,
+        "mover_velocity": 6,
+        "servo_velocity": 6,
+        "velocity_wanted": 6,
+    },
+    FlangeMover: {
+        "job": JobCommand,
+        "position_measured": 6,
+        "velocity_measured": 6,
+        "velocity": 6,
+        "settled_goal": 1,
+    },
+    SlewLimiter: {"velocity_wanted": 6, "velocity_command": 6},
+    JobSequencer: {
+        "robot_status": UrStatus,
+        "settled_goal": 1,
+        "position_measured": 6,
+        "next_pose": NextPose,
+        "calibration_status": CalibrationStatus,
+        "planned_seam": PlannedSeam,
+        "servo_report": ServoReport,
+        "job": JobCommand,
+        "job_state": JobState,
+        "scan_trigger": 1,
+        "streaming": 1,
+    },
+    CellVisualizer: {
+        "job_state": JobState,
+        "calibration_status": CalibrationStatus,
+        "flange_estimate": FlangeEstimate,
+        "scan": Scan,
+        "planned_seam": PlannedSeam,
+        "servo_report": ServoReport,
+        "position_measured": 6,
+    },
+    CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},
+}
+
+# The only ways through which an output follows an input at once; everything else has at least a tick between.
+FEEDTHROUGH: dict[type[LeafSystem], set[tuple[str, str]]] = {
+    SingularityGuard: {(i, o) for i in ("V_BT", "position_measured") for o in ("velocity", "margin", "guarded")},
+    CommandArbiter: {(i, "velocity_wanted") for i in ("job", "robot_status", "mover_velocity", "servo_velocity")},
+    WeldingVelocityServo: {("job", "torch_on")},  # the process goes off in the very tick in which the job says so
+    CheatPoses: {("body_poses", "contact"), ("body_poses", "torch")},
+}
+
+# A port that only carries one calculation to two others, and is nobody's to connect.
+SHARED_CALCULATIONS = {SingularityGuard: {"guarded"}}
+
+every_system = pytest.mark.parametrize("kind", list(MAKERS), ids=lambda kind: kind.__name__)
+
+
+def inputs(system: LeafSystem) -> list[InputPort]:
+    return [system.get_input_port(k) for k in range(system.num_input_ports())]
+
+
+def outputs(system: LeafSystem) -> list[OutputPort]:
+    return [system.get_output_port(k) for k in range(system.num_output_ports())]
+
+
+def documented(kind: type[LeafSystem]) -> dict[str, list[str] | str]:
+    """The `.. pydrake_system::` block of a class's docstring."""
+    lines = inspect.cleandoc(kind.__doc__ or "").splitlines()
+    start = lines.index(".. pydrake_system::") + 1
+    block = []
+    for line in lines[start:]:
+        if line and not line.startswith(" "):
+            break
+        block.append(line)
+    return dict(yaml_load(data=textwrap.dedent("\n".join(block))))
+
+
+def test_every_system_of_this_room_is_tested_here() -> None:
+    found = set()
+    for module in pkgutil.walk_packages(weldcal.systems.__path__, "weldcal.systems."):
+        members = inspect.getmembers(importlib.import_module(module.name), inspect.isclass)
+        found |= {c for _, c in members if issubclass(c, LeafSystem) and c.__module__.startswith("weldcal.")}
+    assert found == set(MAKERS) == set(KINDS)
+
+
+@every_system
+def test_the_docstring_shows_the_ports_in_their_order(kind: type[LeafSystem]) -> None:
+    block, system = documented(kind), MAKERS[kind]()
+    private = SHARED_CALCULATIONS.get(kind, set())
+    assert block["name"] == kind.__name__
+    assert block["input_ports"] == [port.get_name() for port in inputs(system)]
+    shown = [name for name in block.get("output_ports", []) if name not in private]
+    assert shown == [port.get_name() for port in outputs(system) if port.get_name() not in private]
+
+
+@every_system
+def test_each_port_carries_what_the_cell_counts_on(kind: type[LeafSystem]) -> None:
+    system = MAKERS[kind]()
+    carried: dict[str, int | type] = {}
+    for port in [*inputs(system), *outputs(system)]:
+        if port.get_data_type() == PortDataType.kVectorValued:
+            carried[port.get_name()] = port.size()
+        else:
+            value = port.Allocate() if isinstance(port, OutputPort) else system.AllocateInputAbstract(port)
+            carried[port.get_name()] = type(value.get_value())
+    assert carried == KINDS[kind]
+
+
+@every_system
+def test_no_output_follows_an_input_at_once_but_those_that_must(kind: type[LeafSystem]) -> None:
+    system = MAKERS[kind]()
+    found = {
+        (i.get_name(), o.get_name())
+        for i in inputs(system)
+        for o in outputs(system)
+        if system.HasDirectFeedthrough(i.get_index(), o.get_index())
+    }
+    assert found == FEEDTHROUGH.get(kind, set())

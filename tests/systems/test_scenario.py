@@ -1,0 +1,235 @@
+"""A scenario says everything a cell can be told, and a mistake in it is answered with one sentence before any work."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydrake.common.yaml import yaml_dump_typed, yaml_load
+
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.scenario import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
+
+ONE_OF_EVERYTHING = """
+description: Every option, each with a value that is not its default.
+arm: ur10e
+kinematics: my_robot/kinematics.yaml
+flange: iso9409-1-80-6-m8
+tool: none
+robot: !SimulatedUr
+  control_period_s: 0.004
+  stiffness: [1.0e+5, 1.1e+5, 1.2e+5, 1.3e+4, 1.4e+4, 1.5e+4]
+  damping: [1.0e+3, 1.1e+3, 1.2e+3, 130.0, 140.0, 150.0]
+  following_error_rad: 0.1
+scanner: !RenderedScanner
+  preset: azure_kinect
+  width: 320
+  height: 288
+  xyz_m: [0.6, 0.1, 1.0]
+  rpy_deg: [175.0, 1.0, -80.0]
+  mounting_translation_mm: 5.0
+  mounting_rotation_deg: 0.5
+  exposure_s: 0.05
+finger_camera: !RenderedFingerCamera
+  width: 320
+  height: 240
+  focal_px: 225.0
+  rate_hz: 60.0
+  latency_s: 0.02
+  noise_grey: 1.0
+  hidden_from_s: 3.0
+home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
+calibration:
+  feature: flange
+  mounting_guess: {xyz_m: [0.6, 0.1, 1.0], rpy_deg: [170.0, 2.0, -85.0]}
+  guess_radius_mm: 40.0
+  theta_max_deg: 20.0
+  required_error_mm: 0.2
+  minimum_scans: 5
+  maximum_scans: 9
+  verification_scans: 2
+  verification_limit_mm: 0.4
+  cost: translation_and_rotation
+  table_z_m: -0.01
+  clearance_m: 0.04
+  work_point_m: [0.5, 0.1, 0.0]
+workpiece:
+  shape: l
+  length_mm: 250.0
+  pose_guess: {xyz_m: [0.6, 0.0, 0.03], rpy_deg: [0.0, 0.0, 80.0]}
+  placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
+  groove_error: {translation_mm: 1.5, rotation_deg: 0.3}
+  cut_at_mm: 200.0
+welding:
+  speed_mm_s: 6.0
+  deflection_mm: 1.5
+  axial_deflection_mm: 2.5
+  clearance_mm: 30.0
+  seam_length_mm: 100.0
+job:
+  calibrate: false
+  weld: false
+  X_BC: {xyz_m: [0.61, 0.11, 1.01], rpy_deg: [171.0, 3.0, -84.0]}
+  maximum_time_s: 100.0
+visualization:
+  recording_fps: 20.0
+  cloud_points: 5000
+"""
+ONLY_ONE_CHOICE = {"arm"}  # there is one arm so far: its default cannot be departed from
+
+
+@pytest.fixture
+def everything(tmp_path: Path) -> Scenario:
+    path = tmp_path / "everything.yaml"
+    path.write_text(ONE_OF_EVERYTHING, encoding="utf-8")
+    return load_scenario(str(path))
+
+
+def sections(schema: Any) -> list[type]:
+    """The dataclasses that a field of this type may hold."""
+    if dc.is_dataclass(schema):
+        return [typing.cast(type, schema)]
+    if isinstance(schema, types.UnionType) or typing.get_origin(schema) is typing.Union:
+        return [section for choice in typing.get_args(schema) for section in sections(choice)]
+    return []
+
+
+def compare(schema: type, text: dict[str, Any], value: Any, default: Any, where: str = "") -> list[str]:
+    """What of a dataclass tree the text leaves out, the loader lost, or the text sets to its default."""
+    hints = typing.get_type_hints(schema)
+    wrong = [f"{where}{key} is not in the text" for key in hints.keys() - text.keys()]
+    for key in hints.keys() & text.keys():
+        written, loaded = text[key], getattr(value, key)
+        if sections(hints[key]):
+            assert isinstance(loaded, tuple(sections(hints[key])))
+            below = {k: v for k, v in written.items() if k != "_tag"}
+            wrong += compare(type(loaded), below, loaded, type(loaded)(), f"{where}{key}.")
+            continue
+        if loaded != written:
+            wrong.append(f"{where}{key} was lost: {written} became {loaded}")
+        if loaded == getattr(default, key) and key not in ONLY_ONE_CHOICE:
+            wrong.append(f"{where}{key} is left at its default")
+    return wrong
+
+
+@pytest.mark.parametrize("name", scenario_names())
+def test_every_shipped_scenario_loads_and_says_what_it_shows(name: str) -> None:
+    assert load_scenario(name).description
+
+
+def test_the_demo_ships() -> None:
+    assert "s_groove" in scenario_names()
+
+
+def test_one_of_everything_sets_every_option_and_none_is_lost(everything: Scenario) -> None:
+    assert compare(Scenario, yaml_load(data=ONE_OF_EVERYTHING), everything, Scenario()) == []
+
+
+def test_one_of_everything_survives_being_written_and_read_again(everything: Scenario, tmp_path: Path) -> None:
+    again = tmp_path / "again.yaml"
+    again.write_text(yaml_dump_typed(everything, schema=Scenario), encoding="utf-8")
+    assert load_scenario(str(again)) == everything
+
+
+def test_overrides_change_what_they_name_and_nothing_else() -> None:
+    plain, changed = load_scenario("s_groove"), load_scenario("s_groove", "welding: {speed_mm_s: 5.0}")
+    assert changed.welding.speed_mm_s == 5.0
+    changed.welding.speed_mm_s = plain.welding.speed_mm_s
+    assert changed == plain
+
+
+def test_a_device_can_be_said_to_be_absent() -> None:
+    loaded = load_scenario("s_groove", "finger_camera: !NoDevice {}\njob: {weld: false}")
+    assert isinstance(loaded.finger_camera, NoDevice)
+
+
+def test_a_pose_is_written_in_metres_and_degrees() -> None:
+    X = PoseConfig([0.1, 0.2, 0.3], [180.0, 0.0, -90.0]).pose()
+    assert X.translation().tolist() == [0.1, 0.2, 0.3]
+    assert X.rotation().matrix()[:, 2] == pytest.approx([0.0, 0.0, -1.0], abs=1e-15)
+    assert X.rotation().matrix()[:, 0] == pytest.approx([0.0, -1.0, 0.0], abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    "pose", [PoseConfig([0.1, 0.2]), PoseConfig(rpy_deg=[0.0] * 4), PoseConfig([0.0, 0.0, float("nan")])]
+)
+def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
+    with pytest.raises(InputError, match="three finite numbers xyz_m and three finite numbers rpy_deg"):
+        pose.pose()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ("speeling: 1", "'speeling'"),
+        ("welding: {speed_mm_per_s: 3}", "'speed_mm_per_s'"),
+        ("robot: !SimulatedUr {stifness: []}", "'stifness'"),
+        ("robot: !RealUr {}", "'RealUr'.*'robot'"),
+        ("scanner: !RenderedFingerCamera {}", "'RenderedFingerCamera'.*'scanner'"),
+        ("job: {calibrate: maybe}", "'calibrate'.*maybe"),
+        ("calibration: {minimum_scans: 4.5}", "'minimum_scans'.*4.5"),
+        ("description: 3", "'description'"),
+        ("job: [", "line 1"),
+        ("- 1", "list"),
+        ("welding: {speed_mm_s: .nan}", "welding.speed_mm_s"),
+        ("welding: {speed_mm_s: -8.0}", "welding.speed_mm_s"),
+        ("calibration: {required_error_mm: 0.0}", "calibration.required_error_mm"),
+        ("calibration: {theta_max_deg: .inf}", "calibration.theta_max_deg"),
+        ("job: {maximum_time_s: 0}", "job.maximum_time_s"),
+        ("home_deg: [0.0, 1.0]", "home_deg"),
+        ("calibration: {feature: elbow}", "calibration.feature.*'elbow'"),
+        ("calibration: {cost: money}", "calibration.cost.*'money'"),
+        ("tool: gripper", "tool must be.*'gripper'"),
+        ("calibration: {minimum_scans: 3}", "calibration.minimum_scans must be at least 4"),
+    ],
+)
+def test_a_mistake_is_answered_with_one_sentence_that_names_it(overrides: str, named: str) -> None:
+    with pytest.raises(InputError, match=named) as answer:
+        load_scenario("s_groove", overrides)
+    assert "\n" not in str(answer.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ("tool: none", "feature tool_ring goes with tool: welding"),
+        ("calibration: {feature: flange}", "and flange with tool: none"),
+        ("calibration: {minimum_scans: 8, maximum_scans: 7}", "not above calibration.maximum_scans"),
+        ("workpiece: null", "A weld needs a workpiece"),
+        ("finger_camera: !NoDevice {}", "and a finger_camera"),
+        ("tool: none\ncalibration: {feature: flange}", "A weld needs .* tool: welding"),
+        ("job: {calibrate: false}", "without calibrating first needs job.X_BC"),
+        ("robot: !NoDevice {}", "A cell needs a robot"),
+        ("scanner: !NoDevice {}", "This job needs a scanner"),
+        (
+            "scanner: !NoDevice {}\njob: {calibrate: false, X_BC: {xyz_m: [0.0, 0.0, 1.0]}}",
+            "This job needs a scanner",
+        ),
+    ],
+)
+def test_two_settings_that_contradict_each_other_are_refused(overrides: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        load_scenario("s_groove", overrides)
+
+
+def test_the_first_of_two_faults_is_named_and_the_second_when_that_is_mended() -> None:
+    scenario = load_scenario("s_groove")
+    scenario.home_deg = scenario.home_deg[:5]
+    scenario.welding.speed_mm_s = -1.0
+    with pytest.raises(InputError, match="home_deg"):
+        check_scenario(scenario)
+    scenario.home_deg = [*scenario.home_deg, 0.0]
+    with pytest.raises(InputError, match=r"welding\.speed_mm_s"):
+        check_scenario(scenario)
+
+
+def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(InputError, match="There is no scenario 'moon': choose one of .*s_groove"):
+        load_scenario("moon")
+    with pytest.raises(InputError, match=r"There is no scenario 'moon\.yaml'"):
+        load_scenario("moon.yaml")

@@ -1,0 +1,116 @@
+"""The simulated soft tip seats itself in a groove, and sits there as deep and as far aside as the tool's numbers say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import kinematics_and_jacobian
+
+from .cells import Q_HOME, TOOL, Drive, plain_station
+
+START_S = 0.05  # where along the straight groove, m
+SPEED_M_S = 0.008
+AXIAL_M, LATERAL_M = 0.003, 0.002  # how hard the job presses
+
+
+class Groove:
+    """The straight groove of the plain station: where a hard ball of the tip's size would rest in it, and its own axes."""
+
+    def __init__(self) -> None:
+        truth = plain_station().truth
+        assert truth.workpiece is not None
+        assert truth.X_BP is not None
+        R = truth.X_BP.rotation().matrix()
+        k = int(np.searchsorted(truth.workpiece.arc_length_m, START_S))
+        self.p_BSeat = truth.X_BP @ truth.workpiece.tip_line_P(TOOL.tip_radius_m)[k]
+        self.tangent, self.up = R @ truth.workpiece.tangents_P[k], R[:, 2]
+        self.left = np.cross(self.up, self.tangent)
+        self.X_BT_axes = RotationMatrix(np.column_stack([self.tangent, self.left, self.up]))
+
+    def local(self, p_B: np.ndarray) -> np.ndarray:
+        """Along, to the left of and above the seat, (3,) m."""
+        gap = p_B - self.p_BSeat
+        return np.array([gap @ self.tangent, gap @ self.left, gap @ self.up])
+
+
+@pytest.fixture(scope="module")
+def groove() -> Groove:
+    return Groove()
+
+
+def pressed(groove: Groove, depth_m: float, left_m: float = 0.0) -> Drive:
+    """The tool's rest point `depth_m` below and `left_m` beside the seat, its tip let go just above the groove's walls."""
+    drive = Drive(plain_station())
+    p_BT = groove.p_BSeat - depth_m * groove.up + left_m * groove.left
+    X_BF = RigidTransform(groove.X_BT_axes, p_BT) @ TOOL.X_FT.inverse()
+    q = nearest_solution(drive.station.arm, X_BF, Q_HOME)
+    assert q is not None
+    drive.place_arm(q, np.array([0.0, 0.0, depth_m + 0.0008]))
+    return drive
+
+
+def tip(groove: Groove, drive: Drive) -> tuple[np.ndarray, np.ndarray]:
+    """The true tip in the groove's axes and its deflection in T, (3,) m each."""
+    contact = drive.get("cheat.contact")
+    return groove.local(contact[:3]), contact[3:]
+
+
+def slide(drive: Drive, groove: Groove, duration_s: float) -> None:
+    """Along the groove at the speed of a weld."""
+    p_FT = np.array(TOOL.X_FT.translation())
+    for _ in range(round(duration_s / 0.05)):
+        _, _, J = kinematics_and_jacobian(drive.station.arm, drive.get("ur10e.position_measured"), p_FT)
+        drive.set("ur10e.velocity_command", np.linalg.solve(J, [0.0, 0.0, 0.0, *(SPEED_M_S * groove.tangent)]))
+        drive.run(0.05)
+
+
+def test_pressed_straight_down_it_comes_to_rest_centred_and_a_little_below_a_hard_balls_seat(groove: Groove) -> None:
+    drive = pressed(groove, AXIAL_M + 0.0006)
+    drive.run(0.5)
+    world = drive.station.world
+    speed = np.abs(world.plant.GetVelocities(drive.plant, world.tool)).max()
+    place, deflection = tip(groove, drive)
+    assert speed < 1e-4  # what is left is the creep of the contact model's regularised friction
+    assert deflection[2] == pytest.approx(AXIAL_M, abs=0.3e-3)
+    assert abs(place[1]) < 0.1e-3
+    assert -1.5e-3 < place[2] < 0.0
+
+
+def test_it_rests_where_the_springs_balance_the_groove(groove: Groove) -> None:
+    shallow, deep = pressed(groove, 0.002), pressed(groove, 0.004)
+    for drive in (shallow, deep):
+        drive.run(0.4)
+    # Twice the load sinks it further, but by much less than the tool went down: the groove holds it.
+    sunk = tip(groove, shallow)[0][2] - tip(groove, deep)[0][2]
+    assert 0.0 < sunk < 0.4e-3
+
+
+@pytest.fixture(scope="module")
+def sliding(groove: Groove) -> tuple[np.ndarray, np.ndarray]:
+    """Place and deflection of a tip that slides as in a weld: pressed down, and leaning on the left wall."""
+    drive = pressed(groove, AXIAL_M + 0.0007, LATERAL_M + 0.00008)
+    slide(drive, groove, 1.0)
+    return tip(groove, drive)
+
+
+def test_friction_drags_it_behind_and_nothing_else_does(sliding: tuple[np.ndarray, np.ndarray]) -> None:
+    _, deflection = sliding
+    # Coulomb friction of 0.2 on two walls at 22.5 degrees: of the axial force of 1 N some 0.2 / sin(22.5 deg) comes back.
+    expected = 0.2 / np.sin(np.radians(22.5)) * TOOL.axial_stiffness_N_per_m * deflection[2]
+    assert -deflection[0] * TOOL.lateral_stiffness_N_per_m == pytest.approx(expected, rel=0.4)
+
+
+def test_under_the_load_of_the_weld_it_sinks_as_deep_as_the_tool_says(sliding: tuple[np.ndarray, np.ndarray]) -> None:
+    place, deflection = sliding
+    assert deflection[2] == pytest.approx(AXIAL_M, abs=0.1e-3)
+    assert deflection[1] == pytest.approx(-LATERAL_M, abs=0.1e-3)
+    # What the seam planner takes off the seat: an error here is an error of the torch's height, wanted to a tenth.
+    assert -place[2] == pytest.approx(TOOL.seat_sink_m, abs=0.1e-3)
+
+
+def test_it_leans_into_its_wall_as_far_as_the_tool_says(sliding: tuple[np.ndarray, np.ndarray]) -> None:
+    place, _ = sliding
+    assert place[1] == pytest.approx(TOOL.seat_side_m, abs=0.04e-3)

@@ -1,0 +1,1 @@
+"""Speed and accuracy tables that anyone can run again."""

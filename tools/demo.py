@@ -1,0 +1,184 @@
+"""The main job: build the cell of a scenario, run it, write what came of it; demo, live calibration and weld are cuts of it."""
+
+from __future__ import annotations
+
+import time
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.geometry import Meshcat, MeshcatParams
+
+from weldcal.models.errors import InputError
+from weldcal.systems.cell import make_cell, work_point
+from weldcal.systems.drivers.rendered_scanner import RenderedScanner
+from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.scenario import PoseConfig, Scenario, check_scenario, load_scenario
+from weldcal.tools.outcome import (
+    CalibrationError,
+    WeldOutcome,
+    calibration_error,
+    calibration_status,
+    weld_outcome,
+)
+from weldcal.tools.report.demo_report import demo_report
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.run_files import error_summary, write_calibration, write_scans, write_weld_csv
+from weldcal.tools.simulation import Progress, Run, no_progress, run_cell
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What a person may choose: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast as it goes."""
+
+    scenario: str
+    out: Path
+    seed: int = 0
+    browser: bool = False
+    realtime: bool = False
+    robot: str = "simulated"
+    recording: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """What a run came to; figures against the truth exist in simulation only."""
+
+    options: DemoOptions
+    run: Run
+    status: CalibrationStatus
+    calibration: CalibrationError | None
+    weld: WeldOutcome | None
+
+    @property
+    def folder(self) -> Path:
+        """Where everything was written."""
+        return self.options.out
+
+    @property
+    def state(self) -> str:
+        """`done`, or `held` with a reason."""
+        return "held" if self.run.job.command.held else "done"
+
+    @property
+    def n_scans(self) -> int:
+        """Scans of the feature that were taken, verification included."""
+        return self.status.sequence
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `demo` and `weld`."""
+        found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
+        if self.run.job.command.reason:
+            found["reason"] = self.run.job.command.reason
+        if self.calibration is not None:
+            found["X_BC_error_mm"] = 1e3 * self.calibration.translation_m
+            found["X_BC_error_deg"] = float(np.degrees(self.calibration.rotation_rad))
+            found["X_BC_error_at_work_mm"] = 1e3 * self.calibration.at_work_m
+        if self.status.estimate is not None:
+            found["X_BC"] = self.status.estimate.X_BC.GetAsMatrix4().tolist()
+            found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
+            found["held_out_mm"] = error_summary(1e3 * self.status.estimate.held_out.position_m)
+            found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
+        found["n_scans"] = self.n_scans
+        found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]
+        if self.weld is not None and self.weld.error is not None and self.weld.speed is not None:
+            distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
+            found["torch_mean_mm"], found["torch_max_mm"] = float(distance.mean()), float(distance.max())
+            found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
+            found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
+            found["torch_speed_cv"] = self.weld.speed.cv
+            found["welded_mm"] = 1e3 * self.weld.speed.welded_m
+        if self.weld is not None:
+            if self.weld.plan_error is not None:
+                found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
+                found["plan_max_mm"] = 1e3 * self.weld.plan_error.max_m
+            found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
+        found["simulated_seconds"] = float(self.run.root.get_time())
+        found["wall_seconds"] = self.run.wall_seconds
+        found["real_time_factor"] = self.run.real_time_factor()
+        return found
+
+
+def run_demo(options: DemoOptions, progress: Progress = no_progress) -> DemoResult:
+    """The whole story of a scenario.
+
+    Raises:
+        InputError, UnreachableScanner: the scenario or the options cannot be done; nothing has been written.
+    """
+    return run_scenario(load_scenario(options.scenario), options, progress)
+
+
+def run_calibration_live(options: DemoOptions, progress: Progress = no_progress) -> DemoResult:
+    """The calibration of a scenario alone: calibrate, verify, park."""
+    scenario = load_scenario(options.scenario)
+    scenario.job.calibrate, scenario.job.weld = True, False
+    return run_scenario(scenario, options, progress)
+
+
+def run_weld(options: DemoOptions, progress: Progress = no_progress) -> DemoResult:
+    """The weld of a scenario alone: the scanner stands exactly where its drawing says, and the cell is told so."""
+    scenario = load_scenario(options.scenario)
+    scenario.job.calibrate, scenario.job.weld = False, True
+    if isinstance(scenario.scanner, RenderedScanner):
+        scenario.scanner.mounting_translation_mm = scenario.scanner.mounting_rotation_deg = 0.0
+        scenario.job.X_BC = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
+    check_scenario(scenario)
+    return run_scenario(scenario, options, progress)
+
+
+def run_scenario(scenario: Scenario, options: DemoOptions, progress: Progress = no_progress) -> DemoResult:
+    """Build, run, measure, write.
+
+    Raises:
+        InputError, UnreachableScanner: see make_cell; nothing has been written.
+    """
+    if options.robot != "simulated":
+        raise InputError(f"There is no robot '{options.robot}' here: use --robot simulated.")
+    progress("build the cell", 0.0)
+    meshcat = None
+    if options.recording or options.browser:
+        meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
+    cell = make_cell(scenario, options.seed, meshcat)
+    if meshcat is not None:
+        _set_the_scene(meshcat)
+        if options.browser:
+            webbrowser.open(meshcat.web_url())
+            time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
+    run = run_cell(cell, progress, meshcat, options.realtime)
+    progress("measure and write", 0.985)
+    result = measure(run, options)
+    write_result(result, meshcat)
+    return result
+
+
+def measure(run: Run, options: DemoOptions) -> DemoResult:
+    """Hold the run against the truth of its simulation."""
+    cell, status = run.cell, calibration_status(run.cell, run.root)
+    error = None
+    truth = cell.station.truth.X_BC
+    if status.estimate is not None and truth is not None:
+        error = calibration_error(status.estimate.X_BC, truth, work_point(cell.scenario))
+    return DemoResult(options, run, status, error, weld_outcome(cell, run.root))
+
+
+def write_result(result: DemoResult, meshcat: Meshcat | None) -> None:
+    """Write calibration.yaml, scans/, weld.csv, recording.html and report.html; each file whole or not at all."""
+    folder, run = result.folder, result.run
+    folder.mkdir(parents=True, exist_ok=True)
+    write_calibration(run.cell, result.status, result.options.seed, folder)
+    write_scans(run, result.status, folder / "scans")
+    if result.weld is not None:
+        write_weld_csv(result.weld.log, folder)
+    if meshcat is not None:
+        write_atomic(folder / "recording.html", meshcat.StaticHtml())
+    write_atomic(folder / "report.html", demo_report(result, recording=meshcat is not None))
+
+
+def _set_the_scene(meshcat: Meshcat) -> None:
+    """A calm background and a viewer who stands in front of the cell."""
+    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
+    meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    meshcat.SetCameraPose(np.array([1.55, -0.75, 0.85]), np.array([0.50, 0.02, 0.38]))

@@ -1,0 +1,103 @@
+"""The report of a run, for someone who was not there: did it work, how well, what it looked like, where the numbers are from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
+from weldcal.tools.report import plots_demo
+from weldcal.tools.report.render import fixed, render
+
+if TYPE_CHECKING:
+    from weldcal.tools.demo import DemoResult
+
+STORY = {
+    "start": "get ready",
+    "move_to_verification_cloud": "move to the verification pose of Algorithm 1",
+    "scan_verification_cloud": "scan it",
+    "move_to_pose": "move to calibration poses",
+    "scan_pose": "scan the feature and solve",
+    "move_to_verify": "move to an unseen pose",
+    "scan_verify": "scan it and verify",
+    "park": "park",
+    "scan_workpiece": "scan the workpiece and plan the seam",
+    "approach_above": "move above the seam",
+    "approach": "approach",
+    "weld": "feel the seam and weld behind",
+    "retract": "retract",
+    "home": "go home",
+}
+
+
+def demo_report(result: DemoResult, *, recording: bool) -> str:
+    """The whole report as one self-contained HTML text."""
+    cell, status, weld = result.run.cell, result.status, result.weld
+    estimate = status.estimate
+    pictures = {}
+    if status.history:
+        required = cell.scenario.calibration.required_error_mm * 1e-3
+        pictures["convergence"] = plots_demo.convergence(status, required)
+    if weld is not None:
+        pictures["seam"] = plots_demo.seam_paths(weld)
+        pictures["errors"] = plots_demo.error_along_seam(weld)
+        pictures["along"] = plots_demo.along_the_weld(weld, cell.servo_config.weld_speed_m_s)
+    pose = []
+    if estimate is not None:
+        sigma = np.sqrt(np.diag(estimate.covariance))
+        pose = [
+            ("position in the base, mm", "  ".join(fixed(1e3 * float(v), 3) for v in estimate.X_BC.translation())),
+            ("one sigma, mm", "  ".join(fixed(1e3 * float(v), 3) for v in sigma[3:])),
+            ("one sigma of the rotation, deg", "  ".join(fixed(float(np.degrees(v)), 4) for v in sigma[:3])),
+            ("ROS 2", export_ros2(estimate.X_BC).strip()),
+            ("URScript", export_ur_pose(estimate.X_BC).strip()),
+        ]
+    return render(
+        "demo.html.j2",
+        result=result,
+        summary=result.summary(),
+        scenario=cell.scenario,
+        status=status,
+        weld=weld,
+        tip_error_mm=None if weld is None else 1e3 * plots_demo.tip_error(weld),
+        pictures=pictures,
+        pose=pose,
+        observations=_observations(result),
+        timing=_timing(result),
+        recording=recording,
+        software=software_version(),
+    )
+
+
+def _observations(result: DemoResult) -> list[tuple[str, ...]]:
+    status, estimate = result.status, result.status.estimate
+    rows = []
+    for k, observation in enumerate(status.observations):
+        if estimate is not None and k < len(estimate.inliers):
+            rows.append(
+                (
+                    observation.id,
+                    "used" if estimate.inliers[k] else "left out",
+                    fixed(1e3 * float(estimate.held_out.position_m[k]), 3),
+                    fixed(float(np.degrees(estimate.held_out.tilt_rad[k])), 4),
+                )
+            )
+    rows += [
+        (v.label, "verification, never used", fixed(1e3 * v.error_m, 3), fixed(float(np.degrees(v.tilt_rad)), 4))
+        for v in status.verifications
+    ]
+    return rows + [(label, f"refused: {reason}", "", "") for label, reason in status.refused]
+
+
+def _timing(result: DemoResult) -> list[tuple[str, ...]]:
+    """Simulated and wall seconds per phase, phases of one name added up."""
+    phases = result.run.phases
+    ends = [*phases[1:], ("", float(result.run.root.get_time()), result.run.wall_seconds)]
+    total: dict[str, list[float]] = {}
+    for (name, t0, w0), (_, t1, w1) in zip(phases, ends, strict=True):
+        spent = total.setdefault(STORY.get(name, name), [0.0, 0.0])
+        spent[0] += t1 - t0
+        spent[1] += w1 - w0
+    rows = [(name, fixed(s, 1), fixed(w, 1)) for name, (s, w) in total.items() if s > 0.0 or w > 0.05]
+    return [*rows, ("all", fixed(float(result.run.root.get_time()), 1), fixed(result.run.wall_seconds, 1))]

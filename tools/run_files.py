@@ -1,0 +1,134 @@
+"""What a run leaves on disk: calibration.yaml, weld.csv and the scans as a dataset that `weldcal calibrate` reads again."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.calibration.result import CalibrationResult, PoseRecord, save_result
+from weldcal.calibration.solve import CalibrationEstimate
+from weldcal.models.scanners import get_scanner
+from weldcal.systems.cell import Cell
+from weldcal.systems.drivers.rendered_scanner import RenderedScanner
+from weldcal.systems.messages import CalibrationStatus
+from weldcal.tools.outcome import WeldLog
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.simulation import Run
+from weldcal.welding.servo_state import Phase
+
+PHASE_NAMES = [str(phase) for phase in Phase]
+
+
+def error_summary(values: np.ndarray) -> dict[str, float]:
+    """Median, mean and 95th percentile of the finite values, in their own unit."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return {}
+    return {"median": float(np.median(finite)), "mean": float(finite.mean()), "p95": float(np.percentile(finite, 95))}
+
+
+def live_result(cell: Cell, status: CalibrationStatus, seed: int) -> CalibrationResult | None:
+    """The live calibration in the form that `weldcal calibrate` writes; None before there is an estimate."""
+    estimate = status.estimate
+    if estimate is None:
+        return None
+    scanner = cell.scenario.scanner
+    records = [_record(observation.id, estimate, k) for k, observation in enumerate(status.observations)]
+    records += [PoseRecord(id=label, used=False, reason=reason) for label, reason in status.refused]
+    return CalibrationResult(
+        X_BC=estimate.X_BC,
+        covariance=estimate.covariance,
+        held_out_mm=error_summary(1e3 * estimate.held_out.position_m),
+        tilt_deg={"median": error_summary(np.degrees(estimate.held_out.tilt_rad)).get("median")},
+        poses=tuple(records),
+        unobservable=estimate.unobservable,
+        warnings=estimate.warnings,
+        robot=cell.scenario.arm,
+        flange=cell.scenario.calibration.feature,
+        scanner=scanner.preset if isinstance(scanner, RenderedScanner) else "",
+        sigma_position_mm=1e3 * estimate.sigma_position_m,
+        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
+        seed=seed,
+    )
+
+
+def _record(id: str, estimate: CalibrationEstimate, k: int) -> PoseRecord:
+    used = bool(estimate.inliers[k])
+    return PoseRecord(
+        id=id,
+        used=used,
+        reason="" if used else "it disagrees with the other poses",
+        residual_mm=float(1e3 * estimate.position_residuals_m[k]),
+        held_out_mm=float(1e3 * estimate.held_out.position_m[k]),
+        tilt_deg=float(np.degrees(estimate.tilt_residuals_rad[k])),
+        held_out_tilt_deg=float(np.degrees(estimate.held_out.tilt_rad[k])),
+    )
+
+
+def write_calibration(cell: Cell, status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
+    """Write calibration.yaml, where there is a calibration."""
+    result = live_result(cell, status, seed)
+    return None if result is None else save_result(result, folder)
+
+
+def write_scans(run: Run, status: CalibrationStatus, folder: Path) -> Path | None:
+    """Write the calibration scans as a dataset folder, each as a depth map with its intrinsics."""
+    cell = run.cell
+    observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
+    if not observed:
+        return None
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    X_RF = cell.X_FR.inverse()
+    scanner = cell.scenario.scanner
+    assert isinstance(scanner, RenderedScanner)
+    preset = get_scanner(scanner.preset, width=scanner.width, height=scanner.height)
+    intrinsics = np.array([preset.fx, preset.fy, preset.cx, preset.cy])
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", "time"])
+    for id, X_BR in observed.items():
+        scan, _ = run.scans[id]
+        X_BF = X_BR @ X_RF
+        numbers = [*X_BF.translation(), *X_BF.rotation().ToQuaternion().wxyz(), scan.capture_time]
+        writer.writerow([id, *(f"{v:.12g}" for v in numbers)])
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, depth=scan.points_C[:, :, 2], intrinsics=intrinsics)
+        write_atomic(folder / "clouds" / f"{id}.npz", buffer.getvalue())
+    write_atomic(folder / "poses.csv", table.getvalue())
+    write_atomic(folder / "dataset.yaml", _header_text(cell))
+    return folder
+
+
+def _header_text(cell: Cell) -> str:
+    scanner = cell.scenario.scanner
+    q, p = cell.X_FR.rotation().ToQuaternion().wxyz(), cell.X_FR.translation()
+    flange = "tool-ring-63" if cell.scenario.calibration.feature == "tool_ring" else cell.scenario.flange
+    numbers = lambda values: "[" + ", ".join(f"{v:.12g}" for v in values) + "]"  # noqa: E731
+    return (
+        f"schema: 1\nrobot: {cell.scenario.arm}\nflange: {flange}\n"
+        f"scanner: {scanner.preset if isinstance(scanner, RenderedScanner) else 'unknown'}\n"
+        "configuration: eye_on_base\nunits: {clouds: m, poses: m}\n"
+        f"feature_in_flange: {{xyz: {numbers(p)}, wxyz: {numbers(q)}}}\nnote: scans of a simulated run\n"
+    )
+
+
+def write_weld_csv(log: WeldLog, folder: Path) -> Path:
+    """Write weld.csv: one row per log period; metres and seconds, positions in the base frame B."""
+    names = ["time_s", "phase", "torch_on"]
+    names += [f"{point}_{axis}_m" for point in ("tip", "torch", "robot") for axis in "xyz"]
+    names += [f"deflection_{axis}_m" for axis in ("tangential", "normal", "axial")]
+    extra = [name for name in log.telemetry if name not in ("phase", "torch_on")]
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow([*names, *extra, "sigma_min"])
+    for k, time in enumerate(log.time):
+        row: list[object] = [f"{time:.4f}", PHASE_NAMES[int(log.telemetry["phase"][k])], int(log.torch_on[k])]
+        numbers = [*log.p_BTip[k], *log.p_BTorch[k], *log.p_BRobot[k], *log.deflection_T[k]]
+        numbers += [log.telemetry[name][k] for name in extra] + [log.sigma_min[k]]
+        writer.writerow(row + [f"{v:.7g}" for v in numbers])
+    path = folder / "weld.csv"
+    write_atomic(path, table.getvalue())
+    return path

@@ -1,0 +1,126 @@
+"""Running a cell: advance the Diagram until its job ends, note the wall time of each phase, keep every scan that was taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+from pydrake.geometry import Meshcat
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context, EventStatus
+
+from weldcal.systems.cell import Cell
+from weldcal.systems.job_sequencer import JobState
+from weldcal.systems.messages import Scan
+
+Progress = Callable[[str, float], None]
+# How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
+SHARES = {
+    "start": 0.0,
+    "move_to_pose": 0.05,
+    "move_to_verify": 0.28,
+    "park": 0.31,
+    "scan_workpiece": 0.33,
+    "approach_above": 0.34,
+    "weld": 0.38,
+    "retract": 0.96,
+    "home": 0.97,
+    "done": 0.98,
+    "held": 0.98,
+}
+
+
+def no_progress(stage: str, fraction: float) -> None:
+    """For callers who do not watch."""
+
+
+@dataclass
+class Run:
+    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began."""
+
+    cell: Cell
+    simulator: Simulator
+    wall_seconds: float = 0.0
+    phases: list[tuple[str, float, float]] = field(default_factory=list)
+    scans: dict[str, tuple[Scan, str]] = field(default_factory=dict)
+
+    @property
+    def root(self) -> Context:
+        """The context of the whole Diagram."""
+        return self.simulator.get_context()
+
+    @property
+    def job(self) -> JobState:
+        """Where the job stands."""
+        return self.cell.sequencer.job_state(self.cell.sequencer.GetMyContextFromRoot(self.root))
+
+    def real_time_factor(self, phase: str | None = None) -> float:
+        """Simulated seconds per wall second of the whole run, or of one phase."""
+        if phase is None:
+            return float(self.root.get_time()) / max(self.wall_seconds, 1e-9)
+        spans = [
+            (b[1] - a[1], b[2] - a[2]) for a, b in pairwise(self.phases) if a[0] == phase
+        ]
+        return float(sum(s for s, _ in spans) / max(sum(w for _, w in spans), 1e-9))
+
+
+def run_cell(
+    cell: Cell, progress: Progress = no_progress, meshcat: Meshcat | None = None, realtime: bool = False
+) -> Run:
+    """Advance until the job is done or held (or its own time limit holds it). Records into `meshcat` where one is given."""
+    simulator = Simulator(cell.diagram)
+    if realtime:
+        simulator.set_target_realtime_rate(1.0)
+    run = Run(cell, simulator)
+    start = time.perf_counter()
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
+
+    def watch(root: Context) -> EventStatus:
+        command = cell.sequencer.job_state(cell.sequencer.GetMyContextFromRoot(root)).command
+        if not run.phases or command.phase != run.phases[-1][0]:
+            _keep_scan(run, root)
+            run.phases.append((command.phase, root.get_time(), time.perf_counter() - start))
+            progress(command.phase.replace("_", " "), _share(run, root, command.phase))
+        elif command.phase == "weld" and int(root.get_time() / 0.002) % 500 == 0:
+            progress("weld", _share(run, root, "weld"))
+        if command.finished:
+            return EventStatus.ReachedTermination(cell.sequencer, command.phase)
+        return EventStatus.DidNothing()
+
+    simulator.set_monitor(watch)
+    simulator.Initialize()
+    simulator.AdvanceTo(cell.scenario.job.maximum_time_s + 5.0)
+    run.wall_seconds = time.perf_counter() - start
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
+    return run
+
+
+def _share(run: Run, root: Context, phase: str) -> float:
+    share = SHARES.get(phase, 0.05)
+    if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
+        scans = sum(1 for name, _, _ in run.phases if name == "scan_pose")
+        return min(0.02 + 0.03 * scans, 0.27)
+    if phase == "weld":
+        begun = next((t for name, t, _ in run.phases if name == "weld"), root.get_time())
+        length = (
+            0.3 if run.cell.scenario.welding.seam_length_mm is None else run.cell.scenario.welding.seam_length_mm * 1e-3
+        )
+        expected = (length + 0.06) / run.cell.servo_config.weld_speed_m_s + 5.0
+        return share + 0.58 * min((root.get_time() - begun) / expected, 1.0)
+    return share
+
+
+def _keep_scan(run: Run, root: Context) -> None:
+    """A phase that follows a scan begins after the scan was digested: keep it, with its purpose."""
+    if not run.phases or not run.phases[-1][0].startswith("scan_"):
+        return
+    station = run.cell.station.diagram
+    scan: Scan = station.GetOutputPort("scanner.scan").Eval(station.GetMyContextFromRoot(root))
+    command = run.job.command
+    if scan.sequence:
+        run.scans[command.scan_label] = (scan, command.scan_purpose)
