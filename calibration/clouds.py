@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +49,7 @@ def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
         points, declared = _read_npz(path) if path.suffix.lower() == ".npz" else _read_open3d(path)
     except CloudError:
         raise
-    except (OSError, ValueError, RuntimeError, KeyError) as e:
+    except (OSError, ValueError, RuntimeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as e:
         raise CloudError(
             f"The file {path.name} cannot be read: {str(e).splitlines()[0] if str(e) else type(e).__name__}."
         ) from e

@@ -103,12 +103,13 @@ def _search(scene: Scene, standard: FlangeStandard, config: FlangeFitConfig, ref
 
 def _explain_unit(cloud: Array, standard: FlangeStandard, config: FlangeFitConfig) -> None:
     """Raise if the cloud would show a flange in another unit of length."""
-    for factor, size, unit in ((1e-3, "large", "millimetres"), (1e3, "small", "kilometres, or metres scaled twice")):
+    for factor, size, unit in (
+        (1e-3, "large", "millimetres, read as metres"),
+        (1e3, "small", "metres, read as millimetres"),
+    ):
         if _find(crop(cloud * factor), standard, None, config, Refusal()) is not None:
             raise FlangeNotFound(
-                f"The flange in the cloud is 1000 times too {size}: the coordinates are {unit} where metres are "
-                "declared;"
-                " correct the unit."
+                f"The flange in the cloud is 1000 times too {size}: the coordinates are {unit}; correct the unit."
             )
 
 

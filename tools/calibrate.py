@@ -176,7 +176,7 @@ def calibrate_dataset(
     )
     tell("Algorithm 1 for comparison", 0.8)
     algorithm1, verifier, icp = _algorithm1(observations, inliers, clouds, fits, standard, seed)
-    curve = convergence(inliers, verifier, orders=5 if not clouds else 3, seed=seed)
+    curve = convergence(inliers, verifier, orders=8, seed=seed)
     warnings += list(estimate.warnings)
     if turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
@@ -300,7 +300,7 @@ def _algorithm1(
     shares: Sight | None = None
     verifier: Verifier
     if clouds:
-        as_published = make_verification(clouds[held.id], held.X_BR, standard, seed=seed)
+        as_published = make_verification(clouds[held.id], held.X_BR, standard, max_points=1500, seed=seed)
         verifier = as_published
         metric = "point-to-point ICP of the verification cloud against the flange's model"
         shares = sight(ours, as_published)

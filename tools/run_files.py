@@ -106,13 +106,16 @@ def _header_text(cell: Cell) -> str:
     scanner = cell.scenario.scanner
     q, p = cell.X_FR.rotation().ToQuaternion().wxyz(), cell.X_FR.translation()
     flange = "tool-ring-63" if cell.scenario.calibration.feature == "tool_ring" else cell.scenario.flange
-    numbers = lambda values: "[" + ", ".join(f"{v:.12g}" for v in values) + "]"  # noqa: E731
     return (
         f"schema: 1\nrobot: {cell.scenario.arm}\nflange: {flange}\n"
         f"scanner: {scanner.preset if isinstance(scanner, RenderedScanner) else 'unknown'}\n"
         "configuration: eye_on_base\nunits: {clouds: m, poses: m}\n"
-        f"feature_in_flange: {{xyz: {numbers(p)}, wxyz: {numbers(q)}}}\nnote: scans of a simulated run\n"
+        f"feature_in_flange: {{xyz: {_numbers(p)}, wxyz: {_numbers(q)}}}\nnote: scans of a simulated run\n"
     )
+
+
+def _numbers(values: np.ndarray) -> str:
+    return "[" + ", ".join(f"{v:.12g}" for v in values) + "]"
 
 
 def write_weld_csv(log: WeldLog, folder: Path) -> Path:

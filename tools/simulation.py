@@ -111,7 +111,7 @@ def _share(run: Run, root: Context, phase: str) -> float:
             0.3 if run.cell.scenario.welding.seam_length_mm is None else run.cell.scenario.welding.seam_length_mm * 1e-3
         )
         expected = (length + 0.06) / run.cell.servo_config.weld_speed_m_s + 5.0
-        return share + 0.58 * min((root.get_time() - begun) / expected, 1.0)
+        return share + 0.58 * min(float(root.get_time() - begun) / expected, 1.0)
     return share
 
 

@@ -92,7 +92,7 @@ class Drive:
 
     def ticks(self, duration_s: float, period_s: float = 0.002) -> Iterator[float]:
         """Let time pass tick by tick, and stop half way between every two."""
-        start = round(self.time / period_s)
+        start = int(np.ceil(self.time / period_s - 1e-6))
         for k in range(round(duration_s / period_s)):
             self.simulator.AdvanceTo((start + k + 0.5) * period_s)
             yield self.time

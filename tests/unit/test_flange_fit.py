@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange
@@ -183,7 +184,7 @@ def test_millimetres_for_metres_are_named() -> None:
 def test_half_hidden_edge_is_refused_with_its_share() -> None:
     rng = np.random.default_rng(6)
     X_CR = facing_pose((0.0, 0.0, 0.7), 5.0, 0.0)
-    with pytest.raises(FlangeNotFound, match="of the flange's edge was seen|has no circular edge"):
+    with pytest.raises(FlangeNotFound, match=r"of the flange's edge was seen|has no circular edge"):
         fit(X_CR, render(X_CR, rng, hidden_half=True), rng)
 
 

@@ -72,7 +72,7 @@ def demo_report(result: DemoResult, *, recording: bool) -> str:
 
 def _observations(result: DemoResult) -> list[tuple[str, ...]]:
     status, estimate = result.status, result.status.estimate
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for k, observation in enumerate(status.observations):
         if estimate is not None and k < len(estimate.inliers):
             rows.append(

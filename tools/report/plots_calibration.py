@@ -87,8 +87,8 @@ def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
     figure = Figure(figsize=(8.2, 3.9), layout="constrained")
     axes = figure.subplots()
-    _band(axes, c.counts, 1e3 * c.held_out, _OURS, "this calibration, on scans it never saw")
-    _band(axes, c.counts, 1e3 * c.figure_true, _TRUTH, "Algorithm 1, on scans outside its pool")
+    _band(axes, c.counts, 1e3 * c.held_out, _OURS, "this calibration, on scans not used yet")
+    _band(axes, c.counts, 1e3 * c.figure_true, _TRUTH, "Algorithm 1, on scans not used yet")
     _band(axes, c.counts, 1e3 * c.figure, _THEIRS, "Algorithm 1's own figure")
     axes.set_xlabel("number of scans")
     axes.set_ylabel("error at the flange, mm")
@@ -103,7 +103,7 @@ def _band(axes: Axes, x: Array, y: Array, color: str, label: str) -> None:
         return
     y = np.where(np.isfinite(y), y, np.nan)[:, good]
     axes.plot(x[good], np.nanmedian(y, axis=0), color=color, marker="o", markersize=3.5, linewidth=1.8, label=label)
-    axes.fill_between(x[good], np.nanmin(y, axis=0), np.nanmax(y, axis=0), color=color, alpha=0.13, linewidth=0)
+    axes.fill_between(x[good], *np.nanpercentile(y, (25, 75), axis=0), color=color, alpha=0.13, linewidth=0)
 
 
 def _residual_bars(report: CalibrationReport) -> bytes:

@@ -1,0 +1,298 @@
+"""The job goes through its phases in order, only when each is done; whatever goes wrong, it holds and says why, for good."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from weldcal.calibration.solve import CalibrationEstimate, HeldOut
+from weldcal.systems.calibration_pose_planner import NextPose
+from weldcal.systems.job_sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
+from weldcal.systems.welding_velocity_servo import ServoReport
+from weldcal.welding.seam import SeamCurve
+
+from .cells import Q_HOME
+
+PLAN = JobPlan(
+    calibrate=True,
+    weld=True,
+    q_home=Q_HOME,
+    maximum_scans=8,
+    verification_scans=2,
+    verification_limit_m=0.5e-3,
+    required_error_m=0.1e-3,
+)
+SEAM = SeamCurve.from_points(np.column_stack([np.linspace(0.0, 0.2, 20), np.zeros(20), np.zeros(20)]))
+PLANNED = PlannedSeam(
+    sequence=99, seam=SEAM, q_start=np.full(6, 0.1), q_above=np.full(6, 0.2), q_retract=np.full(6, 0.3)
+)
+ESTIMATE = CalibrationEstimate(
+    RigidTransform(),
+    np.eye(6) * 1e-10,
+    np.ones(4, bool),
+    np.zeros(4),
+    np.zeros(4),
+    HeldOut(np.zeros(4), np.zeros(4)),
+    1e-4,
+    1e-3,
+    (),
+    (),
+)
+
+
+class World:
+    """What the sequencer sees, changed by hand; time goes on by a tick at each look."""
+
+    def __init__(self, plan: JobPlan = PLAN, state: JobState | None = None) -> None:
+        self.plan, self.state, self.time = plan, state or JobState(), 0.0
+        self.seen = Seen(
+            0.0, UrStatus(), 0, Q_HOME, NextPose(0, 0, "pose01", Q_HOME), CalibrationStatus(), PlannedSeam(), ServoReport()
+        )
+
+    @property
+    def command(self) -> JobCommand:
+        return self.state.command
+
+    @property
+    def phase(self) -> str:
+        return self.state.command.phase
+
+    def look(self, duration: float = 0.02, **changes: Any) -> str:
+        """Let the time pass, with one look at its end."""
+        self.time += duration
+        self.seen = dc.replace(self.seen, time=self.time, **changes)
+        self.state = next_job_state(self.state, self.seen, self.plan)
+        return self.phase
+
+    def arrive(self) -> str:
+        """The arm settles at the goal that stands and stays there for the dwell time."""
+        self.look(1.0, settled_goal=self.command.goal_id)
+        return self.look(self.plan.dwell_s + 0.01)
+
+    def digest(self, **changes: Any) -> str:
+        """The calibrator takes in the newest scan, and the pose planner looks at what it says."""
+        n = self.command.scan_sequence
+        counts = self.seen.calibration.calibration_scans + int(self.command.scan_purpose == "calibrate")
+        status = dc.replace(self.seen.calibration, sequence=n, calibration_scans=counts, **changes)
+        return self.look(0.3, calibration=status, next_pose=NextPose(n, n, f"pose{n + 1:02d}", np.full(6, 0.01 * n)))
+
+
+def in_phase(phase: str, **command: Any) -> World:
+    """A job in the middle of a phase."""
+    return World(state=JobState(JobCommand(phase=phase, goal_id=5, scan_sequence=4, **command)))
+
+
+def test_a_whole_job_goes_through_its_phases_in_order() -> None:
+    world = World()
+    assert world.look() == "move_to_verification_cloud"
+    assert world.arrive() == "scan_verification_cloud"
+    assert (world.command.scan_sequence, world.command.scan_purpose) == (1, "verification_cloud")
+    assert world.digest() == "move_to_pose"
+    for k in range(6):
+        assert world.arrive() == "scan_pose"
+        assert (world.command.scan_sequence, world.command.scan_purpose) == (k + 2, "calibrate")
+        assert world.digest(done=k == 5) == ("move_to_verify" if k == 5 else "move_to_pose")
+    good = VerificationResult("pose08", 0.1e-3, 0.001)
+    assert world.arrive() == "scan_verify"
+    assert world.command.scan_purpose == "verify"
+    assert world.digest(verifications=(good,)) == "move_to_verify"  # two were asked for
+    assert world.arrive() == "scan_verify"
+    assert world.digest(verifications=(good, good)) == "park"
+    assert (world.command.q_goal == Q_HOME).all()
+    assert world.arrive() == "scan_workpiece"
+    assert world.command.scan_purpose == "workpiece"
+    assert world.look(0.3, seam=PLANNED) == "approach_above"
+    assert world.command.q_goal is PLANNED.q_above
+    assert world.arrive() == "approach"
+    assert world.command.q_goal is PLANNED.q_start
+    assert not world.command.process_on
+    assert world.arrive() == "weld"
+    assert (world.command.mode, world.command.process_on, world.command.streaming) == ("weld", True, True)
+    assert world.look(5.0, servo=ServoReport("TRACK", True)) == "weld"
+    assert world.look(20.0, servo=ServoReport("DONE")) == "retract"
+    assert (world.command.process_on, world.command.streaming) == (False, False)
+    assert world.arrive() == "home"
+    assert world.arrive() == "done"
+    assert (world.command.mode, world.command.finished, world.command.held) == ("hold", True, False)
+    passed = [phase for _, phase in world.state.log]
+    assert {*PHASES, "done"} == set(passed)
+    assert [t for t, _ in world.state.log] == sorted(t for t, _ in world.state.log)
+
+
+def test_a_job_that_only_calibrates_ends_at_home() -> None:
+    world = World(dc.replace(PLAN, weld=False, verification_scans=1), in_phase("scan_verify").state)
+    assert world.digest(verifications=(VerificationResult("pose08", 0.1e-3, 0.001),)) == "park"
+    assert world.arrive() == "done"
+    assert world.command.finished
+
+
+def test_a_job_that_only_welds_goes_home_first() -> None:
+    world = World(dc.replace(PLAN, calibrate=False))
+    assert world.look() == "park"
+    assert world.arrive() == "scan_workpiece"
+
+
+def test_each_move_has_a_new_number_and_the_old_ones_arrival_does_not_count() -> None:
+    world = World()
+    world.look()
+    world.arrive()
+    before = world.command.goal_id
+    world.digest()
+    assert world.command.goal_id == before + 1
+    assert world.look(1.0, settled_goal=before) == "move_to_pose"
+    assert world.look(1.0, settled_goal=before) == "move_to_pose"
+
+
+def test_it_waits_for_the_arm_to_have_been_still_for_its_dwell_time() -> None:
+    world = in_phase("move_to_pose")
+    assert world.look(1.0, settled_goal=5) == "move_to_pose"
+    assert world.look(0.2, settled_goal=5) == "move_to_pose"
+    assert world.look(0.02, settled_goal=4) == "move_to_pose"  # it moved again: the wait starts anew
+    assert world.look(0.2, settled_goal=5) == "move_to_pose"
+    assert world.look(0.2, settled_goal=5) == "move_to_pose"
+    assert world.look(0.2, settled_goal=5) == "scan_pose"
+
+
+def test_it_does_not_go_to_a_pose_that_was_chosen_before_the_newest_scan() -> None:
+    world = in_phase("scan_pose", scan_purpose="calibrate")
+    old = NextPose(3, 3, "pose04", Q_HOME)
+    assert world.look(0.1, calibration=CalibrationStatus(sequence=4), next_pose=old) == "scan_pose"
+    assert world.look(0.1, next_pose=NextPose(4, 4, "pose05", Q_HOME)) == "move_to_pose"
+
+
+def test_the_camera_streams_before_the_tip_touches() -> None:
+    world = in_phase("approach")
+    world.look()
+    assert world.command.streaming
+    assert world.phase == "approach"
+
+
+def status(**changes: Any) -> CalibrationStatus:
+    return CalibrationStatus(sequence=4, **changes)
+
+
+NO_POSE = NextPose(4, 14, "pose15", None)
+HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
+    "protective stop": ("weld", 0.1, {"robot": UrStatus(safety_mode="PROTECTIVE_STOP")}, "The robot stopped: PROTECTIVE"),
+    "robot fault": ("park", 0.1, {"robot": UrStatus(fault="it hit a wall")}, "The robot stopped: it hit a wall"),
+    "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
+    "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),
+    "cloud pose not reached": ("move_to_verification_cloud", 21.0, {}, "did not come to rest at its goal within 20 s"),
+    "unseen pose not reached": ("move_to_verify", 21.0, {}, "did not come to rest at its goal within 20 s"),
+    "no cloud": ("scan_verification_cloud", 9.0, {}, "No scan arrived within 8 s"),
+    "no scan": ("scan_pose", 9.0, {}, "No scan arrived within 8 s"),
+    "no verification scan": ("scan_verify", 9.0, {}, "No scan arrived within 8 s"),
+    "no workpiece scan": ("scan_workpiece", 9.0, {}, "No workpiece scan arrived within 8 s"),
+    "no more poses": ("scan_pose", 0.1, {"calibration": status(), "next_pose": NO_POSE}, "poses are used up"),
+    "required error not reached": (
+        "scan_pose",
+        0.1,
+        {"calibration": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.234e-3)},
+        r"did not reach the required 0\.100 mm: after 8 scans it expects 0\.234 mm",
+    ),
+    "no calibration at all": (
+        "scan_pose",
+        0.1,
+        {"calibration": status(calibration_scans=8, refused=(("pose01", "it is too dark"),))},
+        "No calibration after 8 scans: it is too dark",
+    ),
+    "no calibration from good scans": (
+        "scan_pose",
+        0.1,
+        {"calibration": status(calibration_scans=8, message="they lie in one plane")},
+        "No calibration after 8 scans: they lie in one plane",
+    ),
+    "off at the unseen pose": (
+        "scan_verify",
+        0.1,
+        {
+            "calibration": status(
+                verifications=(VerificationResult("pose08", 0.9e-3, 0.0), VerificationResult("pose09", 0.1e-3, 0.0))
+            )
+        },
+        r"0\.90 mm off at the unseen pose 'pose08' \(limit 0\.50 mm\)",
+    ),
+    "no calibration to verify": (
+        "scan_verify",
+        0.1,
+        {"calibration": status(verifications=(VerificationResult("pose08", np.inf, np.inf),) * 2)},
+        "inf mm off at the unseen pose",
+    ),
+    "workpiece not found": (
+        "scan_workpiece",
+        0.1,
+        {"seam": PlannedSeam(sequence=4, reason="The plate is not there.")},
+        "The plate is not there",
+    ),
+    "no seam and no reason": ("scan_workpiece", 0.1, {"seam": PlannedSeam(sequence=4)}, "No seam could be planned"),
+    "weld fault": ("weld", 0.1, {"servo": ServoReport("FAULT", reason="Tag hidden: clean it.")}, "Tag hidden"),
+    "weld fault without a reason": ("weld", 0.1, {"servo": ServoReport("FAULT")}, "The welding servo stopped"),
+}
+
+
+@pytest.mark.parametrize("name", list(HOLDS))
+def test_it_holds_and_says_why(name: str) -> None:
+    phase, duration, changes, said = HOLDS[name]
+    world = in_phase(phase, mode="weld" if phase == "weld" else "move", process_on=phase == "weld")
+    assert world.look(duration, **changes) == "held"
+    command = world.command
+    assert (command.mode, command.process_on, command.held, command.finished) == ("hold", False, True, True)
+    assert re.search(said, command.reason or ""), command.reason
+
+
+def test_every_phase_that_waits_for_something_can_end_in_a_hold() -> None:
+    for phase in PHASES:
+        world = in_phase(phase)
+        assert world.look(PLAN.maximum_time_s + 1.0) == "held", phase
+        assert phase in (world.command.reason or "")
+
+
+def test_a_held_job_stays_held_when_the_cause_is_gone() -> None:
+    world = in_phase("weld", mode="weld", process_on=True)
+    world.look(0.1, robot=UrStatus(fault="stopped"))
+    held = world.state
+    world.look(5.0, robot=UrStatus(), settled_goal=5, servo=ServoReport("DONE"))
+    assert world.state is held
+
+
+def test_a_finished_job_stays_finished() -> None:
+    world = World(state=JobState(JobCommand(phase="done", finished=True)))
+    done = world.state
+    world.look(500.0, robot=UrStatus(fault="stopped"))
+    assert world.state is done
+
+
+def test_the_system_passes_its_command_on_to_everyone() -> None:
+    system = JobSequencer(dc.replace(PLAN, calibrate=False))
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in {
+        "robot_status": UrStatus(),
+        "next_pose": NextPose(),
+        "calibration_status": CalibrationStatus(),
+        "planned_seam": PlannedSeam(),
+        "servo_report": ServoReport(),
+    }.items():
+        system.GetInputPort(name).FixValue(context, AbstractValue.Make(value))
+    system.GetInputPort("position_measured").FixValue(context, Q_HOME)
+    system.GetInputPort("settled_goal").FixValue(context, [0.0])
+    simulator.AdvanceTo(0.05)
+    job: JobCommand = system.GetOutputPort("job").Eval(context)
+    assert (job.phase, job.goal_id) == ("park", 1)
+    assert system.GetOutputPort("scan_trigger").Eval(context)[0] == 0.0
+    system.GetInputPort("settled_goal").FixValue(context, [1.0])
+    simulator.AdvanceTo(0.5)
+    assert system.GetOutputPort("job").Eval(context).phase == "scan_workpiece"
+    assert system.GetOutputPort("scan_trigger").Eval(context)[0] == 1.0
+    assert system.GetOutputPort("streaming").Eval(context)[0] == 0.0
+    state: JobState = system.GetOutputPort("job_state").Eval(context)
+    assert state is system.job_state(context)
+    assert [phase for _, phase in state.log] == ["start", "park", "scan_workpiece"]

@@ -1,0 +1,195 @@
+"""Reading dataset folders: what is right is read, what is wrong is named in one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from weldcal.calibration.clouds import CloudError, read_cloud, save_cloud
+from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.errors import DatasetError
+
+HEADER = """\
+schema: 1
+robot: ur10e
+flange: iso9409-1-50-4-m6
+scanner: phoxi_m
+configuration: eye_on_base
+units: {clouds: m, poses: m}
+note: test
+"""
+POSES = """\
+id,x,y,z,qw,qx,qy,qz
+a,0.5,0.1,0.4,1,0,0,0
+b,0.5,0.2,0.4,0,1,0,0
+"""
+PLY = """\
+ply
+format ascii 1.0
+element vertex 40
+property float x
+property float y
+property float z
+element camera 1
+property float view_px
+property int viewportx
+end_header
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "dataset.yaml").write_text(HEADER)
+    (tmp_path / "poses.csv").write_text(POSES)
+    (tmp_path / "clouds").mkdir()
+    points = np.random.default_rng(0).uniform(0.1, 0.5, (200, 3))
+    save_cloud(tmp_path / "clouds" / "a.npz", points)
+    o3d.io.write_point_cloud(tmp_path / "clouds" / "b.pcd", o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+    return tmp_path
+
+
+def change(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def test_a_good_folder_is_read_with_its_hashes(folder: Path) -> None:
+    data = load_dataset(folder)
+    assert list(data.poses) == ["a", "b"]
+    assert np.allclose(data.poses["b"].translation(), [0.5, 0.2, 0.4])
+    assert data.poses["b"].rotation().matrix()[1, 1] == pytest.approx(-1.0)
+    assert data.refused == ()
+    assert set(data.hashes) == {"dataset.yaml", "poses.csv", "clouds/a.npz", "clouds/b.pcd"}
+    assert all(len(h) == 64 for h in data.hashes.values())
+    a, b = data.cloud("a")[0], data.cloud("b")[0]
+    # single precision of half a metre
+    assert np.allclose(a, b, atol=1e-7)
+    assert data.X_FR.IsExactlyIdentity()
+
+
+def test_units_are_converted(folder: Path) -> None:
+    change(folder / "dataset.yaml", "clouds: m,", "clouds: mm,")
+    assert load_dataset(folder).cloud("a")[0].max() < 1e-3
+
+
+def test_feature_in_the_flange_frame_is_read(folder: Path) -> None:
+    with (folder / "dataset.yaml").open("a") as stream:
+        stream.write("feature_in_flange: {xyz: [0.14, 0.0, -0.012], wxyz: [0.0, 1.0, 0.0, 0.0]}\n")
+    assert np.allclose(load_dataset(folder).X_FR.translation(), [0.14, 0.0, -0.012])
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "sentence"),
+    [
+        ("dataset.yaml", "schema: 1", "schema: 2", "schema 2"),
+        ("dataset.yaml", "clouds: m,", "clouds: inch,", "unit 'inch' for clouds; write m or mm"),
+        ("dataset.yaml", "eye_on_base", "eye_in_hand", "configuration 'eye_in_hand'"),
+        ("dataset.yaml", "robot: ur10e", "robots: ur10e", "cannot be read as a dataset description"),
+        ("poses.csv", "0.5,0.2,0.4", "0.5,,0.4", "'' in column y of 'b'; a number is needed"),
+        ("poses.csv", "0.5,0.2,0.4", "0.5,nan,0.4", "nan in column y of 'b'"),
+        ("poses.csv", "0,1,0,0", "0,0.5,0,0", "quaternion of 'b' has the length 0.5000"),
+        ("poses.csv", "b,0.5", "a,0.5", "id 'a' twice"),
+        ("poses.csv", "id,x,y,z,qw", "id,x,y,z,w", "lacks the column qw"),
+        ("poses.csv", "b,0.5,0.2,0.4,0,1,0,0\n", "", "no pose for b.pcd; add the missing row"),
+        ("poses.csv", "a,0.5,0.1,0.4,1,0,0,0\nb,0.5,0.2,0.4", "a,500,100,400,1,0,0,0\nb,500,200,400", "look like mm"),
+    ],
+)
+def test_what_is_wrong_is_named(folder: Path, file: str, old: str, new: str, sentence: str) -> None:
+    change(folder / file, old, new)
+    with pytest.raises(DatasetError, match=sentence) as caught:
+        load_dataset(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_folder_and_files_are_named(tmp_path: Path, folder: Path) -> None:
+    with pytest.raises(DatasetError, match="does not exist"):
+        load_dataset(tmp_path / "nowhere")
+    (folder / "poses.csv").unlink()
+    with pytest.raises(DatasetError, match=r"neither poses\.csv nor pairs\.csv"):
+        load_dataset(folder)
+
+
+def test_a_pose_without_a_cloud_is_refused_by_name(folder: Path) -> None:
+    (folder / "clouds" / "b.pcd").unlink()
+    data = load_dataset(folder)
+    assert data.refused[0][0] == "b"
+    assert "no cloud for this pose" in data.refused[0][1]
+
+
+def test_two_clouds_for_one_pose_are_not_guessed_at(folder: Path) -> None:
+    save_cloud(folder / "clouds" / "b.npz", np.ones((50, 3)))
+    assert "more than one cloud" in load_dataset(folder).refused[0][1]
+
+
+def test_pairs_are_read_and_mixed_units_are_noticed(tmp_path: Path) -> None:
+    (tmp_path / "dataset.yaml").write_text(HEADER)
+    rows = [f"{k},{0.1 * k},{0.2 + 0.05 * k},0.3,{0.1 * k},0.1,{0.5 + 0.05 * k}" for k in range(5)]
+    path = tmp_path / "pairs.csv"
+    path.write_text("id,base_x,base_y,base_z,camera_x,camera_y,camera_z\n" + "\n".join(rows) + "\n")
+    data = load_dataset(tmp_path)
+    assert len(data.pairs) == 5
+    assert not data.pairs[0].has_orientation
+    change(tmp_path / "dataset.yaml", "clouds: m,", "clouds: mm,")
+    with pytest.raises(DatasetError, match="one of them is in millimetres"):
+        load_dataset(tmp_path)
+
+
+def test_text_ply_with_a_camera_element_is_read(tmp_path: Path) -> None:
+    rows = "\n".join(f"{k} {2 * k} 700.5" for k in range(40))
+    (tmp_path / "c.ply").write_text(PLY + rows + "\n0 640\n")
+    points, remarks = read_cloud(tmp_path / "c.ply")
+    assert points.shape == (40, 3)
+    assert np.allclose(points[7], [7, 14, 700.5])
+    assert remarks == ()
+
+
+def test_depth_map_uses_pixel_centres_at_whole_numbers(tmp_path: Path) -> None:
+    depth = np.zeros((40, 60))
+    depth[10:, 20:] = 0.5
+    np.savez(tmp_path / "d.npz", depth=depth, intrinsics=[100.0, 110.0, 30.0, 20.0])
+    points, _ = read_cloud(tmp_path / "d.npz")
+    assert points.shape == (40, 60, 3)
+    assert np.isnan(points[0, 0]).all()
+    assert np.allclose(points[20, 40], [0.05, 0.0, 0.5])
+
+
+def test_a_few_nan_rows_are_dropped_with_their_number(tmp_path: Path) -> None:
+    points = np.ones((100, 3))
+    points[:7] = np.nan
+    save_cloud(tmp_path / "n.npz", points)
+    got, remarks = read_cloud(tmp_path / "n.npz")
+    assert got.shape == (93, 3)
+    assert remarks == ("7 of 100 points are NaN and were dropped",)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (np.full((100, 3), np.nan), "is NaN"),
+        (np.zeros((0, 3)), "is empty"),
+        (np.vstack([np.ones((40, 3)), [[np.inf, 0, 0]]]), "infinite"),
+        (np.vstack([np.ones((40, 3)), np.full((900, 3), np.nan)]), "900 of the 940 points"),
+        (np.ones((5, 3)), "only 5 valid points"),
+        (np.ones((50, 4)), "shape"),
+    ],
+)
+def test_clouds_of_no_use_are_refused(tmp_path: Path, content: np.ndarray, reason: str) -> None:
+    np.savez(tmp_path / "x.npz", points=content)
+    with pytest.raises(CloudError, match=reason):
+        read_cloud(tmp_path / "x.npz")
+
+
+def test_truncated_and_damaged_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "t.ply").write_text(PLY + "\n".join("1 2 3" for _ in range(25)))
+    with pytest.raises(CloudError, match="promises 40 points and 25 are there"):
+        read_cloud(tmp_path / "t.ply")
+    (tmp_path / "e.pcd").write_text("")
+    with pytest.raises(CloudError, match="is empty"):
+        read_cloud(tmp_path / "e.pcd")
+    (tmp_path / "g.npz").write_bytes(b"PK\x03\x04 nothing")
+    with pytest.raises(CloudError, match="cannot be read"):
+        read_cloud(tmp_path / "g.npz")

@@ -1,0 +1,114 @@
+"""A result survives the disk, is written whole or not at all, and says the same in every export."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.calibration.result import (
+    CalibrationResult,
+    IcpRecord,
+    PoseRecord,
+    export_all,
+    export_json,
+    export_ros2,
+    export_ur_pose,
+    export_urdf,
+    load_result,
+    save_result,
+    write_atomically,
+)
+from weldcal.calibration.rigid import exp_rotation
+from weldcal.models.errors import InputError
+
+X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
+
+
+@pytest.fixture
+def result() -> CalibrationResult:
+    return CalibrationResult(
+        X_BC=X_BC,
+        covariance=np.diag([1e-8, 2e-8, 3e-8, 4e-9, 5e-9, 6e-9]),
+        held_out_mm={"median": 0.2, "mean": 0.3, "p95": 0.5},
+        tilt_deg={"median": 0.08, "p95": None},
+        poses=(PoseRecord("a", True, "", 0.1, 0.2, 0.01, 0.02), PoseRecord("b", False, "no plane")),
+        icp=(IcpRecord("a", "point_to_point", (0.0, 0.1, 0.2), (0.1, 0.2, 0.3), 0.37, ("rotation",), 0.4),),
+        unobservable=("a bias",),
+        warnings=("one",),
+        robot="ur10e",
+        seed=7,
+        data_hashes={"poses.csv": "ab" * 32},
+    )
+
+
+def test_what_is_read_back_is_what_was_written(result: CalibrationResult, tmp_path: Path) -> None:
+    save_result(result, tmp_path / "new")
+    back = load_result(tmp_path / "new")
+    assert np.allclose(back.X_BC.GetAsMatrix34(), X_BC.GetAsMatrix34(), atol=1e-14)
+    assert np.array_equal(back.covariance, result.covariance)
+    assert back.poses == result.poses
+    assert back.icp == result.icp
+    assert back.held_out_mm == result.held_out_mm
+    assert back.tilt_deg == result.tilt_deg
+    assert (back.seed, back.robot, back.data_hashes) == (7, "ur10e", result.data_hashes)
+    assert back.software.startswith("weldcal")
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "f.txt"
+    write_atomically(path, "old")
+    with pytest.raises(UnicodeEncodeError):
+        write_atomically(path, "new \ud800")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["f.txt"]
+
+
+def test_every_export_says_the_same_pose(result: CalibrationResult, tmp_path: Path) -> None:
+    numbers = r"-?\d+\.\d+"
+    urdf = export_urdf(X_BC)
+    xyz, rpy = re.findall(rf'"({numbers} {numbers} {numbers})"', urdf)
+    from_urdf = RigidTransform(RollPitchYaw(*map(float, rpy.split())), list(map(float, xyz.split())))
+    ur = [float(v) for v in re.findall(numbers, export_ur_pose(X_BC))]
+    from_ur = RigidTransform(exp_rotation(np.array(ur[3:])), ur[:3])
+    ros = dict(re.findall(rf"--(\S+) ({numbers})", export_ros2(X_BC)))
+    # nine decimals
+    assert np.allclose(from_urdf.GetAsMatrix34(), X_BC.GetAsMatrix34(), atol=1e-8)
+    assert np.allclose(from_ur.GetAsMatrix34(), X_BC.GetAsMatrix34(), atol=1e-8)
+    assert np.allclose([float(ros[k]) for k in "xyz"], X_BC.translation(), atol=1e-8)
+    q = X_BC.rotation().ToQuaternion()
+    assert np.allclose([float(ros[k]) for k in ("qw", "qx", "qy", "qz")], q.wxyz(), atol=1e-8)
+    assert np.allclose(json.loads(export_json(result))["X_BC"], X_BC.GetAsMatrix4())
+    assert all(path.is_file() for path in export_all(result, tmp_path / "exports"))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [("schema: 1", "schema: 9", "schema 1"), ("X_BC:", "X_BD:", "not a calibration result")],
+)
+def test_a_file_that_is_no_calibration_is_named(
+    result: CalibrationResult, tmp_path: Path, old: str, new: str, sentence: str
+) -> None:
+    path = save_result(result, tmp_path)
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(InputError, match=sentence):
+        load_result(path)
+
+
+def test_a_rotation_changed_by_hand_is_noticed(result: CalibrationResult, tmp_path: Path) -> None:
+    path = save_result(result, tmp_path)
+    text = path.read_text()
+    first = f"{X_BC.rotation().matrix()[0, 0]}"
+    assert first in text
+    path.write_text(text.replace(first, "0.5"))
+    with pytest.raises(InputError, match="not orthonormal"):
+        load_result(path)
+
+
+def test_a_missing_result_says_what_to_give(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="folder written by 'weldcal calibrate'"):
+        load_result(tmp_path)
