@@ -61,10 +61,13 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
     return float(gap)
 
 
-def occludes(bodies: list[Body], frames: list[RigidTransform], eye: Array, targets: Array) -> tuple[bool, float]:
+def occludes(
+    bodies: list[Body], frames: list[RigidTransform], eye: Array, targets: Array, margin_m: float = 0.0
+) -> tuple[bool, float]:
     """Whether a body hides any of the targets (N, 3) from the eye (3,), and the smallest gap (m) from a body to the
     eye.
 
+    The place of the eye is known to `margin_m` only: no line of sight from anywhere so near may be blocked.
     A body that holds or touches a target carries it and does not hide it: the face looks away from its own body.
     """
     hidden, gap = False, np.inf
@@ -74,7 +77,9 @@ def occludes(bodies: list[Body], frames: list[RigidTransform], eye: Array, targe
         if bool((_point_segment(targets, start, end) < body.radius + 0.005).any()):
             continue
         if not hidden:
-            hidden = any(_segment_segment(eye, t, start, end) < body.radius for t in targets)
+            # an eye that stands elsewhere by the margin moves its line of sight by less and less towards the target
+            near = [_segment_segment(eye, t, start, end) for t in targets]
+            hidden = any(d < body.radius + margin_m * (1.0 - s) for d, s in near)
     return hidden, gap
 
 
@@ -85,12 +90,12 @@ def _point_segment(points: Array, start: Array, end: Array) -> Array:
     return np.asarray(np.linalg.norm(points - start - s[:, None] * d, axis=1))
 
 
-def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array) -> float:
-    """Smallest distance between two segments: closest points of the lines, clamped in turn."""
+def _segment_segment(a0: Array, a1: Array, b0: Array, b1: Array) -> tuple[float, float]:
+    """Smallest distance between two segments and where on the first (0..1): closest points of the lines, clamped in turn."""
     u, v, w = a1 - a0, b1 - b0, a0 - b0
     a, b, c, d, e = float(u @ u), float(u @ v), float(v @ v), float(u @ w), float(v @ w)
     det = a * c - b * b
     s = float(np.clip((b * e - c * d) / det, 0.0, 1.0)) if det > 1e-12 * max(a * c, 1e-30) else 0.0
     t = float(np.clip((b * s + e) / c, 0.0, 1.0)) if c > 0.0 else 0.0
     s = float(np.clip((b * t - d) / a, 0.0, 1.0)) if a > 0.0 else 0.0
-    return float(np.linalg.norm(w + s * u - t * v))
+    return float(np.linalg.norm(w + s * u - t * v)), s

@@ -78,8 +78,16 @@ def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
     return flat[~bad], remarks
 
 
-def save_cloud(path: Path, points_C: Array) -> None:
-    """Write an (N, 3) or (H, W, 3) cloud as NPZ, single precision, metres: what read_cloud reads back."""
+def save_cloud(path: Path, points_C: Array, intrinsics: tuple[float, float, float, float] | None = None) -> None:
+    """Write an (N, 3) or (H, W, 3) cloud as NPZ, single precision, metres: what read_cloud reads back.
+
+    With ``intrinsics`` (fx, fy, cx, cy) an organised cloud is written as its depth map, a third of the size.
+    """
+    if intrinsics is not None and np.ndim(points_C) == 3:
+        np.savez_compressed(
+            path, depth=np.asarray(points_C[:, :, 2], dtype=np.float32), intrinsics=np.array(intrinsics)
+        )
+        return
     np.savez_compressed(path, points=np.asarray(points_C, dtype=np.float32))
 
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import csv
 import hashlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.common.yaml import yaml_load_typed
+from pydrake.common.yaml import yaml_dump, yaml_load_typed
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.clouds import SUFFIXES, CloudError, find_cloud, read_cloud
+from weldcal.calibration.clouds import SUFFIXES, CloudError, find_cloud, read_cloud, save_cloud
 from weldcal.calibration.dataset_header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
 
@@ -52,6 +53,14 @@ class Dataset:
         """Pose of the calibration feature in the flange frame."""
         f = self.header.feature_in_flange
         return RigidTransform(_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
+
+    def guess(self, id: str) -> RigidTransform | None:
+        """Where the header's guess of the scanner's pose puts the feature in the camera frame, X_CR; None without a guess."""
+        g = self.header.scanner_guess
+        if g is None:
+            return None
+        X_BC = RigidTransform(_quaternion(g.wxyz, "scanner_guess"), g.xyz)
+        return X_BC.InvertAndCompose(self.poses[id] @ self.X_FR)
 
     def cloud(self, id: str) -> tuple[Array, tuple[str, ...]]:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3), with remarks. Raises CloudError with the
@@ -95,6 +104,40 @@ def load_dataset(folder: Path) -> Dataset:
     raise DatasetError(
         f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz."
     )
+
+
+def save_dataset(
+    folder: Path,
+    header: DatasetHeader,
+    poses: Mapping[str, RigidTransform],
+    clouds: Mapping[str, Array],
+    *,
+    times: Mapping[str, float] | None = None,
+    intrinsics: tuple[float, float, float, float] | None = None,
+) -> None:
+    """Record scans as a dataset folder that load_dataset reads back: X_BF and a cloud in metres ((N, 3) or (H, W, 3)) per id.
+
+    ``times`` (s) adds the column `time`; ``intrinsics`` writes organised clouds as depth maps.
+    ``header.units`` is written as metres. Raises DatasetError when the ids of poses and clouds differ.
+    """
+    if set(poses) != set(clouds):
+        raise DatasetError("A recording needs one cloud for each pose; the ids of poses and clouds differ.")
+    (folder / "clouds").mkdir(parents=True, exist_ok=True)
+    document = {**asdict(header), "schema": 1, "units": {"clouds": "m", "poses": "m"}}
+    (folder / "dataset.yaml").write_text(yaml_dump(document), encoding="utf-8")
+    for id, points in clouds.items():
+        save_cloud(folder / "clouds" / f"{id}.npz", points, intrinsics)
+    with (folder / "poses.csv").open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", *(["time"] if times else [])])
+        for id, X_BF in poses.items():
+            taken = [repr(float(times[id]))] if times else []
+            writer.writerow([id, *map(repr, X_BF.translation().tolist()), *map(repr, _wxyz(X_BF)), *taken])
+
+
+def _wxyz(X: RigidTransform) -> list[float]:
+    q = X.rotation().ToQuaternion()
+    return [float(v) for v in (q.w(), q.x(), q.y(), q.z())]
 
 
 def _header(path: Path) -> DatasetHeader:

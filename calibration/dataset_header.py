@@ -23,6 +23,15 @@ class Feature:
 
 
 @dataclass
+class ScannerGuess:
+    """Where the scanner roughly stands, X_BC: position m, quaternion wxyz, and how far off that may put the feature, m."""
+
+    xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
+    radius_m: float = 0.06
+
+
+@dataclass
 class DatasetHeader:
     """dataset.yaml, as written."""
 
@@ -34,3 +43,4 @@ class DatasetHeader:
     units: Units = field(default_factory=Units)
     note: str = ""
     feature_in_flange: Feature = field(default_factory=Feature)
+    scanner_guess: ScannerGuess | None = None

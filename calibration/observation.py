@@ -47,7 +47,8 @@ class Observation:
     @property
     def n_B(self) -> Array:
         """Outward normal of the feature in the base (3,)."""
-        return np.asarray(self.X_BR.rotation().col(2), dtype=float)
+        # matrix() copies; RotationMatrix.col() would hand out a view that dies with the pose
+        return np.asarray(self.X_BR.rotation().matrix()[:, 2], dtype=float)
 
 
 def observation_from_fit(

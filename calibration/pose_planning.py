@@ -28,7 +28,8 @@ class PlannerConfig:
 
     ``theta_max_rad``: largest angle between face normal and line of sight (paper, section 2.1.4). ``table_z_m``: height
     of the table in B; ``margin_m`` above it. ``image_margin``: share of the image kept free at each side, and of the
-    working range at each end, for an uncertain X_BC. ``feature_radius_m``: outer radius of the flange or ring.
+    working range at each end, for an uncertain X_BC. ``sight_margin_m``: how far the scanner may stand from its guess
+    without the arm coming into its sight. ``feature_radius_m``: outer radius of the flange or ring.
     ``max_travel_rad``: farthest any joint may go from the start. The sigmas weigh positions and normals in the
     information.
     """
@@ -41,6 +42,7 @@ class PlannerConfig:
     feature_radius_m: float = 0.0315
     scanner_clearance_m: float = 0.12
     self_clearance_m: float = 0.01
+    sight_margin_m: float = 0.03
     max_travel_rad: float = 2.2
     min_sigma: float = 0.05
     min_spacing_m: float = 0.03
@@ -227,7 +229,7 @@ def _refuse(
         return "the arm would touch itself"
     eye = np.asarray(X_BC.translation())
     ring_B = (X_BR @ ring_R.T).T
-    hidden, near_eye = occludes(bodies, frames, eye, ring_B)
+    hidden, near_eye = occludes(bodies, frames, eye, ring_B, config.sight_margin_m)
     if near_eye < config.scanner_clearance_m:
         return "the arm would come too close to the scanner"
     return "the arm hides the flange from the scanner" if hidden else None

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.rigid import rotation_vector
@@ -135,9 +135,7 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         "data_sha256": dict(result.data_hashes),
     }
     path = folder / RESULT_FILE
-    write_atomically(
-        path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=160, allow_unicode=True)
-    )
+    write_atomically(path, yaml_dump(document))
     return path
 
 
@@ -151,11 +149,11 @@ def load_result(path: Path) -> CalibrationResult:
     if not path.is_file():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
     try:
-        d = yaml.safe_load(path.read_text(encoding="utf-8"))
+        d = yaml_load(filename=str(path))  # what its YAML reader raises is no ValueError
         M = np.array(d["X_BC"]["matrix"], dtype=float)
         covariance = np.array(d["covariance"]["matrix"], dtype=float)
         schema = d["schema"]
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, UnicodeDecodeError) as e:
+    except Exception as e:  # unreadable in any way: the same sentence
         raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.") from e
     if schema != 1 or M.shape != (4, 4) or covariance.shape != (6, 6) or not np.isfinite(M).all():
         raise InputError(f"'{path.name}' is not a calibration result of schema 1; run 'weldcal calibrate' again.")

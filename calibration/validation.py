@@ -145,8 +145,8 @@ def convergence(
                 held_out[rows, k] = position_errors(X, shuffled[m:])
             except InputError:
                 pass  # the first m scans of this order lie in one plane
-            at = np.nonzero(run.counts <= m)[0] if run is not None else ()
-            if run is not None and len(at):
-                figure[r, k] = run.figures[at[-1]]
-                figure_true[rows, k] = position_errors(run.path[at[-1]], shuffled[m:])
+            seen = 0 if run is None else int((run.counts <= m).sum())
+            if run is not None and seen:
+                figure[r, k] = run.figures[seen - 1]
+                figure_true[rows, k] = position_errors(run.path[seen - 1], shuffled[m:])
     return Convergence(counts.astype(float), held_out, figure, figure_true)

@@ -10,6 +10,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.flange_fit import FlangeFit
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.rigid import exp_rotation, rotation_vector
 from weldcal.models.errors import InputError
@@ -116,6 +117,17 @@ def make_verification(
     model, normals = flange_mesh(standard).sample(12 * max_points, rng)
     up = (normals[:, 2] > 0.2) & (model[:, 2] > -1.5 * standard.chamfer_m - 1e-6)
     return Verification(points, X_BR, model[up][: 4 * max_points], normals[up][: 4 * max_points], method)
+
+
+def face_cloud(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
+    """The points (N, 3) m of the fitted face and its chamfers, without what lies in front, behind or around."""
+    flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
+    flat = flat[np.isfinite(flat).all(axis=1)]
+    d = flat - fit.center_C
+    height = d @ fit.normal_C
+    reach = np.linalg.norm(d - height[:, None] * fit.normal_C, axis=1)
+    keep = (reach < 0.5 * standard.outer_m + 0.001) & (height < 0.001) & (height > -2.0 * standard.chamfer_m)
+    return np.asarray(flat[keep])
 
 
 def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationError:

@@ -32,8 +32,8 @@ class WeldingTool:
     tip_reach_m: float = 0.170  # p_FT along +z_F, tip at rest
     tip_radius_m: float = 0.0025
     tip_modulus_Pa: float = 1e7  # hydroelastic modulus of the soft tip
-    # How the loaded tip sits in the groove: below where a hard ball would, and towards the wall it leans on. The tag cannot
-    # see either, so both are calibrated once, on a straight groove whose place is known (test_soft_tip.py measures them).
+    # Where the loaded tip is felt, by its tag, in the groove: below a hard ball's seat and towards the wall it leans on. Indentation
+    # and the tag's own bias are in it, so it is calibrated once, on a straight groove in a known place (test_soft_tip.py).
     seat_sink_m: float = 0.00099
     seat_side_m: float = 0.00004
     tip_mass_kg: float = 0.005

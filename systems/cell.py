@@ -26,6 +26,7 @@ from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
 from weldcal.systems.job_sequencer import JobPlan, JobSequencer
 from weldcal.systems.messages import PlannedSeam
+from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.scenario import Scenario
 from weldcal.systems.seam_planner import SeamPlanner
@@ -235,6 +236,7 @@ def make_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None)
         calibration_status=status,
         planned_seam=welding.seam,
         servo_report=welding.report,
+        hold=wiring.zeros("nobody_holds", 1) if meshcat is None else panel(wiring, meshcat),
     )
     if meshcat is not None:
         ports = {
@@ -251,6 +253,11 @@ def make_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None)
     diagram = builder.Build()
     diagram.set_name("cell")
     return Cell(diagram, station, scenario, poses, X_FR, config, sequencer, calibrator, logs)
+
+
+def panel(wiring: Wiring, meshcat: Meshcat) -> OutputPort:
+    """The operator's controls in the viewer."""
+    return wiring.add("operator_panel", OperatorPanel(meshcat)).GetOutputPort("hold")
 
 
 def job_plan(scenario: Scenario) -> JobPlan:

@@ -24,6 +24,7 @@ from weldcal.systems.welding_velocity_servo import ServoReport
 ROOT = "/weldcal"
 PLANNED, REFINED, TORCH = Rgba(0.55, 0.55, 0.60, 1.0), Rgba(0.15, 0.45, 0.90, 1.0), Rgba(0.95, 0.45, 0.10, 1.0)
 CLOUD, CIRCLE, BELIEF = Rgba(0.95, 0.80, 0.25, 0.9), Rgba(0.90, 0.15, 0.35, 1.0), Rgba(0.10, 0.70, 0.55, 0.35)
+SHOWN_ABOVE_M = 0.008
 ALL_PHASES = (*PHASES, "done", "held")
 
 
@@ -182,27 +183,32 @@ class CellVisualizer(LeafSystem):
         self, drawn: _Drawn, planned: PlannedSeam, servo: ServoReport, q: NDArray[np.float64], time: float
     ) -> _Drawn:
         if planned.sequence > drawn.seam and planned.seam is not None:
-            line = planned.seam.position(np.linspace(0.0, planned.seam.length, 200))
-            self._meshcat.SetLine(f"{ROOT}/seam/planned", np.asarray(line).T, 3.0, PLANNED)
-            self._show(f"{ROOT}/seam/planned", time)
+            line = np.asarray(planned.seam.position(np.linspace(0.0, planned.seam.length, 300)))
+            self._draw_path("planned", line, SHOWN_ABOVE_M, PLANNED, time)
             drawn = drawn.but(seam=planned.sequence)
         if servo.command is None or self._tool is None:
             return drawn
         if servo.torch_on:
+            if not drawn.torch:
+                self._meshcat.SetProperty(f"{ROOT}/scan/{drawn.scan:02d}", "visible", False, time)
             p_BW = forward_kinematics(self._arm, q) @ self._tool.X_FT @ self._tool.p_TW
             drawn = drawn.but(torch=(*drawn.torch, tuple(p_BW)))
         refined = servo.state.refined.points if servo.state is not None else np.empty((0, 3))
-        if len(drawn.torch) >= 11 or len(refined) - drawn.points >= 30:  # about a second: one piece of each line
-            k = drawn.pieces
-            if len(drawn.torch) > 1:
-                self._meshcat.SetLine(f"{ROOT}/seam/torch/{k:03d}", np.array(drawn.torch).T, 8.0, TORCH)
-                self._show(f"{ROOT}/seam/torch/{k:03d}", time)
-            start = max(drawn.points - 1, 0)
-            if len(refined) - start > 1:
-                self._meshcat.SetLine(f"{ROOT}/seam/refined/{k:03d}", np.asarray(refined[start:]).T, 4.0, REFINED)
-                self._show(f"{ROOT}/seam/refined/{k:03d}", time)
-            drawn = drawn.but(torch=drawn.torch[-1:], points=len(refined), pieces=k + 1)
+        if len(drawn.torch) >= 11 or len(refined) - drawn.points >= 30:  # about a second: one piece of each path
+            piece = drawn.pieces
+            if drawn.torch:
+                self._draw_path(f"torch/{piece:03d}", np.array(drawn.torch), SHOWN_ABOVE_M + 0.004, TORCH, time)
+            if len(refined) > drawn.points:
+                self._draw_path(f"refined/{piece:03d}", refined[drawn.points :], SHOWN_ABOVE_M, REFINED, time)
+            drawn = drawn.but(torch=drawn.torch[-1:], points=len(refined), pieces=piece + 1)
         return drawn
+
+    def _draw_path(self, name: str, points_B: NDArray[np.float64], raise_m: float, rgba: Rgba, time: float) -> None:
+        """A path as a row of dots (a browser draws lines one pixel thin), raised out of the groove so that it can be seen."""
+        dots = PointCloud(len(points_B), Fields(BaseField.kXYZs))
+        dots.mutable_xyzs()[:] = (np.asarray(points_B) + np.array([0.0, 0.0, raise_m])).T
+        self._meshcat.SetObject(f"{ROOT}/seam/{name}", dots, 0.004, rgba)
+        self._show(f"{ROOT}/seam/{name}", time)
 
 
 def add_visualizer(

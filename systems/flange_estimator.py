@@ -5,18 +5,20 @@ from __future__ import annotations
 import dataclasses as dc
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.flange_fit import FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.verification import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
 from weldcal.systems.pose_recorder import PoseHistory
+
+# The poses are planned so that the whole feature is in sight; where it is not, something stands in between and the rim ends wrongly.
+LIVE_FIT = FlangeFitConfig(min_coverage=0.85)
 
 
 class FlangeEstimator(LeafSystem):
@@ -97,16 +99,7 @@ def estimate_flange(
     guess = FlangeGuess(center_C=X_CR.translation(), radius_m=radius, normal_C=X_CR.rotation().matrix()[:, 2])
     points = scan.points_C.astype(float)
     try:
-        fit = fit_flange(points, standard, guess=guess)
+        fit = fit_flange(points, standard, guess=guess, config=LIVE_FIT)
     except FlangeNotFound as error:
         return dc.replace(base, reason=str(error))
-    return dc.replace(base, fit=fit, points_C=face_of(points.reshape(-1, 3), fit, standard))
-
-
-def face_of(points_C: NDArray[np.float64], fit: FlangeFit, standard: FlangeStandard) -> NDArray[np.float64]:
-    """The points (N, 3) m of the fitted face and its edges, without what lies in front of or behind it."""
-    p = points_C[np.isfinite(points_C).all(axis=1)] - fit.center_C
-    height = p @ fit.normal_C
-    reach = np.linalg.norm(p - height[:, None] * fit.normal_C, axis=1)
-    keep = (np.abs(height) < 1.5 * standard.chamfer_m + 0.001) & (reach < 0.5 * standard.outer_m + 0.001)
-    return np.asarray(p[keep] + fit.center_C)
+    return dc.replace(base, fit=fit, points_C=face_cloud(points, fit, standard))

@@ -45,6 +45,7 @@ class Seen(Message):
     calibration: CalibrationStatus
     seam: PlannedSeam
     servo: ServoReport
+    hold_requested: bool = False
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -80,11 +81,15 @@ def _scan(state: JobState, seen: Seen, phase: str, purpose: str, label: str) -> 
 
 def hold(state: JobState, seen: Seen, reason: str) -> JobState:
     """Process off and arm at rest, latched; nothing leaves this state but a person's reset."""
-    return _enter(state, seen, "held", mode="hold", process_on=False, held=True, finished=True, reason=reason)
+    return _enter(
+        state, seen, "held", mode="hold", process_on=False, streaming=False, held=True, finished=True, reason=reason
+    )
 
 
 def _arrived(state: JobState, seen: Seen, plan: JobPlan) -> tuple[JobState, bool]:
     """Settled at the goal for the dwell time."""
+    if seen.time - state.since > plan.move_timeout_s:
+        return hold(state, seen, f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s."), False
     if seen.settled_goal != state.command.goal_id:
         return dc.replace(state, settled_since=None), False
     since = seen.time if state.settled_since is None else state.settled_since
@@ -112,8 +117,6 @@ def _arrive_and_scan(purpose: str, phase: str) -> Callable[[JobState, Seen, JobP
         state, there = _arrived(state, seen, plan)
         if there:
             return _scan(state, seen, phase, purpose, seen.next_pose.label)
-        if seen.time - state.since > plan.move_timeout_s:
-            return hold(state, seen, f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s.")
         return state
 
     return step
@@ -178,7 +181,7 @@ def _planned(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
         if seen.time - state.since > plan.scan_timeout_s:
             return hold(state, seen, f"No workpiece scan arrived within {plan.scan_timeout_s:.0f} s of its trigger.")
         return state
-    if seen.seam.seam is None or seen.seam.q_above is None:
+    if seen.seam.seam is None or seen.seam.q_above is None or seen.seam.q_start is None:
         return hold(state, seen, seen.seam.reason or "No seam could be planned.")
     return _move(state, seen, "approach_above", seen.seam.q_above)
 
@@ -244,6 +247,8 @@ def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
         return state
     if not seen.robot.ready:
         return hold(state, seen, f"The robot stopped: {seen.robot.fault or seen.robot.safety_mode}.")
+    if seen.hold_requested:
+        return hold(state, seen, f"A person held the job, in the phase '{state.command.phase}'.")
     if seen.time > plan.maximum_time_s:
         return hold(
             state,
@@ -267,14 +272,15 @@ class JobSequencer(LeafSystem):
         - calibration_status
         - planned_seam
         - servo_report
+        - hold
         output_ports:
         - job
         - job_state
         - scan_trigger
         - streaming
 
-    `job` carries the `JobCommand`, `job_state` the whole `JobState` with its log; `scan_trigger` and `streaming` (1) go to the
-    station.
+    `hold` (1) is a person's wish to stop. `job` carries the `JobCommand`, `job_state` the whole
+    `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station.
     """
 
     def __init__(self, plan: JobPlan, period_s: float = 0.02) -> None:
@@ -287,6 +293,7 @@ class JobSequencer(LeafSystem):
         self._calibration = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
         self._servo = self.DeclareAbstractInputPort("servo_report", AbstractValue.Make(ServoReport()))
+        self._hold = self.DeclareVectorInputPort("hold", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(JobState()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job_out, ticket)
@@ -310,6 +317,7 @@ class JobSequencer(LeafSystem):
             calibration=self._calibration.Eval(context),
             seam=self._seam.Eval(context),
             servo=self._servo.Eval(context),
+            hold_requested=bool(self._hold.Eval(context)[0] > 0.5),
         )
         old = self.job_state(context)
         new = next_job_state(old, seen, self._plan)

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 WIDTH_M, HEIGHT_M = 0.72, 0.09
 # Above and behind the cell, facing a viewer who stands in front of the robot (+x) and looks back at it.
-X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.pi / 2), [-0.25, 0.0, 1.18])
+X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.deg2rad(65.0)), [-0.25, -0.38, 1.0])
 TEXT = {
     "start": "ready",
     "move_to_verification_cloud": "calibrate: to the verification pose",

@@ -1,9 +1,10 @@
 """What a scenario YAML may say: typed configuration of one cell, unknown keys are errors."""
 
 import dataclasses as dc
-import math
+import re
 from pathlib import Path
 
+import numpy as np
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
 
@@ -12,6 +13,7 @@ from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.scenario_numbers import check_numbers
 
 SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
 
@@ -24,16 +26,8 @@ class PoseConfig:
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
 
     def pose(self) -> RigidTransform:
-        """The pose as a RigidTransform.
-
-        Raises:
-            InputError: if it is not three finite metres and three finite degrees.
-        """
-        if len(self.xyz_m) != 3 or len(self.rpy_deg) != 3 or not all(map(math.isfinite, self.xyz_m + self.rpy_deg)):
-            raise InputError(
-                "Write every pose of the scenario as three finite numbers xyz_m and three finite numbers rpy_deg."
-            )
-        return RigidTransform(RollPitchYaw([math.radians(a) for a in self.rpy_deg]), self.xyz_m)
+        """The pose as a RigidTransform."""
+        return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
 
 @dc.dataclass
@@ -148,10 +142,22 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
             continue
         try:
             scenario = yaml_load_typed(schema=Scenario, data=text, defaults=scenario)
-        except Exception as error:  # Drake's loader raises several kinds; each text names the key
-            raise InputError(f"Scenario {label} cannot be read: {' '.join(str(error).split())}") from error
+        except Exception as error:  # Drake's loader raises several kinds, and not every text names the key
+            what = " ".join(str(error).split())
+            raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
     check_scenario(scenario)
     return scenario
+
+
+def _part_at_fault(text: str) -> str:
+    """Which top-level part of a YAML text does not load by itself, as words for a sentence; empty where that is not clear."""
+    parts = re.split(r"^(?=\w+ *:)", text, flags=re.MULTILINE)
+    for part in filter(str.strip, parts):
+        try:
+            yaml_load_typed(schema=Scenario, data=part, defaults=Scenario())
+        except Exception:  # the same loader as above: any failure names this part
+            return f" at '{part.split(':')[0].strip()}'"
+    return ""
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -166,8 +172,7 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError(
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
-    if len(scenario.home_deg) != 6:
-        raise InputError("home_deg must hold six joint angles in degrees.")
+    check_numbers(scenario)
     calibration = scenario.calibration
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
@@ -179,15 +184,6 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
     if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:
         raise InputError("calibration.minimum_scans must be at least 4 and not above calibration.maximum_scans.")
-    positive = {
-        "calibration.required_error_mm": calibration.required_error_mm,
-        "calibration.theta_max_deg": calibration.theta_max_deg,
-        "welding.speed_mm_s": scenario.welding.speed_mm_s,
-        "job.maximum_time_s": scenario.job.maximum_time_s,
-    }
-    for key, value in positive.items():
-        if not (math.isfinite(value) and value > 0.0):
-            raise InputError(f"{key} must be a positive number, not {value}.")
     if scenario.job.weld and (
         scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
     ):

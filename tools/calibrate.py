@@ -18,7 +18,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.clouds import CloudError
 from weldcal.calibration.dataset import Dataset, load_dataset
 from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
-from weldcal.calibration.flange_fit import FlangeFit, fit_flange
+from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.observability import turn_deg
 from weldcal.calibration.observation import Observation, observation_from_fit
 from weldcal.calibration.result import (
@@ -44,6 +44,7 @@ from weldcal.calibration.verification import (
     Sight,
     Verification,
     Verifier,
+    face_cloud,
     icp_error,
     make_verification,
     sight,
@@ -239,26 +240,24 @@ def _sightings(
         tell("fitting flanges", 0.7 * k / len(data.clouds))
         try:
             points, remarks = data.cloud(id)
-            fit = fit_flange(points, standard)
+            fit = fit_flange(points, standard, guess=_guess(data, id, standard))
         except (CloudError, FlangeNotFound) as e:
             refused.append((id, e.reason))
             continue
         warnings += [f"{id}: {r}." for r in remarks]
         fits[id] = fit
-        clouds[id] = _near(points, fit, standard)
+        clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
     return observations, fits, clouds, refused, warnings
 
 
-def _near(points: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
-    """Points (N, 3) of the flange itself, for verification."""
-    flat = points.reshape(-1, 3)
-    flat = flat[np.isfinite(flat).all(axis=1)]
-    d = flat - fit.center_C
-    height = d @ fit.normal_C
-    rho2 = (d**2).sum(axis=1) - height**2
-    keep = (rho2 < (0.5 * standard.outer_m + 0.001) ** 2) & (height < 0.001) & (height > -2.0 * standard.chamfer_m)
-    return np.asarray(flat[keep])
+def _guess(data: Dataset, id: str, standard: FlangeStandard) -> FlangeGuess | None:
+    """Where to look in this cloud, where the dataset says roughly where the scanner stands."""
+    X_CR = data.guess(id)
+    if X_CR is None or data.header.scanner_guess is None:
+        return None
+    radius = data.header.scanner_guess.radius_m + 0.5 * standard.outer_m
+    return FlangeGuess(center_C=X_CR.translation(), radius_m=radius, normal_C=X_CR.rotation().matrix()[:, 2])
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]], data: Dataset) -> None:

@@ -179,17 +179,18 @@ def benchmark_cell(
 @benchmarks.command("seeds")
 def benchmark_seeds(
     scenario: ScenarioOption = "s_groove",
-    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="How many seeds, from 0 on.")] = 11,
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="How many seeds.")] = 11,
     out: OutOption = None,
+    seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
     """The demo over many seeds: does every run end done, and how far off are calibration and torch at worst."""
-    folder = out or fresh_folder("benchmark", f"seeds-{scenario}", 0)
+    folder = out or fresh_folder("benchmark", f"seeds-{scenario}", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark seeds") as progress:
         from weldcal.tools.benchmarks.seeds import run_seeds
 
-        summary = run_seeds(scenario, folder, range(runs), progress)
+        summary = run_seeds(scenario, folder, range(seed, seed + runs), progress)
     finish("benchmark seeds", summary, folder, json_wanted=json)
 
 

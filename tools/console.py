@@ -77,7 +77,9 @@ def rows(result: Mapping[str, object]) -> dict[str, str]:
     found: dict[str, str] = {}
     for key, value in result.items():
         unit = next((unit for unit in ("mm", "deg") if key.endswith(f"_{unit}")), "")
-        name = NAMES.get(key) or key.removesuffix(f"_{unit}").replace("_error", " error").replace("torch_", "torch ").replace("_at_", " at ")
+        name = NAMES.get(key) or key.removesuffix(f"_{unit}").replace("_error", " error").replace(
+            "torch_", "torch "
+        ).replace("_at_", " at ")
         if isinstance(value, list) and all(
             isinstance(item, Mapping) and {"id", "reason"} <= set(item) for item in value
         ):

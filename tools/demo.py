@@ -181,4 +181,4 @@ def _set_the_scene(meshcat: Meshcat) -> None:
     meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
     meshcat.SetProperty("/Grid", "visible", False)
     meshcat.SetProperty("/Axes", "visible", False)
-    meshcat.SetCameraPose(np.array([1.55, -0.75, 0.85]), np.array([0.50, 0.02, 0.38]))
+    meshcat.SetCameraPose(np.array([1.30, -0.68, 0.78]), np.array([0.42, 0.0, 0.42]))

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.calibration.dataset import save_dataset
+from weldcal.calibration.dataset_header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.result import CalibrationResult, PoseRecord, save_result
 from weldcal.calibration.solve import CalibrationEstimate
 from weldcal.models.scanners import get_scanner
-from weldcal.systems.cell import Cell
+from weldcal.systems.cell import Cell, feature_standard
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.tools.outcome import WeldLog
@@ -75,47 +77,40 @@ def write_calibration(cell: Cell, status: CalibrationStatus, seed: int, folder: 
 
 
 def write_scans(run: Run, status: CalibrationStatus, folder: Path) -> Path | None:
-    """Write the calibration scans as a dataset folder, each as a depth map with its intrinsics."""
-    cell = run.cell
+    """Write the calibration scans as a dataset folder that `weldcal calibrate` reads again; None where there are none."""
+    cell, scanner = run.cell, run.cell.scenario.scanner
     observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
-    if not observed:
+    if not observed or not isinstance(scanner, RenderedScanner):
         return None
-    (folder / "clouds").mkdir(parents=True, exist_ok=True)
-    X_RF = cell.X_FR.inverse()
-    scanner = cell.scenario.scanner
-    assert isinstance(scanner, RenderedScanner)
     preset = get_scanner(scanner.preset, width=scanner.width, height=scanner.height)
-    intrinsics = np.array([preset.fx, preset.fy, preset.cx, preset.cy])
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["id", "x", "y", "z", "qw", "qx", "qy", "qz", "time"])
-    for id, X_BR in observed.items():
-        scan, _ = run.scans[id]
-        X_BF = X_BR @ X_RF
-        numbers = [*X_BF.translation(), *X_BF.rotation().ToQuaternion().wxyz(), scan.capture_time]
-        writer.writerow([id, *(f"{v:.12g}" for v in numbers)])
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, depth=scan.points_C[:, :, 2], intrinsics=intrinsics)
-        write_atomic(folder / "clouds" / f"{id}.npz", buffer.getvalue())
-    write_atomic(folder / "poses.csv", table.getvalue())
-    write_atomic(folder / "dataset.yaml", _header_text(cell))
+    c, X_RF = cell.scenario.calibration, cell.X_FR.inverse()
+    guess = c.mounting_guess.pose()
+    header = DatasetHeader(
+        robot=cell.scenario.arm,
+        flange=feature_standard(cell.scenario).designation,
+        scanner=scanner.preset,
+        configuration="eye_on_base",
+        note="scans of a simulated run",
+        feature_in_flange=Feature(
+            _numbers(cell.X_FR.translation()), _numbers(cell.X_FR.rotation().ToQuaternion().wxyz())
+        ),
+        scanner_guess=ScannerGuess(
+            _numbers(guess.translation()), _numbers(guess.rotation().ToQuaternion().wxyz()), 1e-3 * c.guess_radius_mm
+        ),
+    )
+    save_dataset(
+        folder,
+        header,
+        {id: X_BR @ X_RF for id, X_BR in observed.items()},
+        {id: run.scans[id][0].points_C.astype(float) for id in observed},
+        times={id: run.scans[id][0].capture_time for id in observed},
+        intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
+    )
     return folder
 
 
-def _header_text(cell: Cell) -> str:
-    scanner = cell.scenario.scanner
-    q, p = cell.X_FR.rotation().ToQuaternion().wxyz(), cell.X_FR.translation()
-    flange = "tool-ring-63" if cell.scenario.calibration.feature == "tool_ring" else cell.scenario.flange
-    return (
-        f"schema: 1\nrobot: {cell.scenario.arm}\nflange: {flange}\n"
-        f"scanner: {scanner.preset if isinstance(scanner, RenderedScanner) else 'unknown'}\n"
-        "configuration: eye_on_base\nunits: {clouds: m, poses: m}\n"
-        f"feature_in_flange: {{xyz: {_numbers(p)}, wxyz: {_numbers(q)}}}\nnote: scans of a simulated run\n"
-    )
-
-
-def _numbers(values: np.ndarray) -> str:
-    return "[" + ", ".join(f"{v:.12g}" for v in values) + "]"
+def _numbers(values: np.ndarray) -> list[float]:
+    return [float(v) for v in values]
 
 
 def write_weld_csv(log: WeldLog, folder: Path) -> Path:

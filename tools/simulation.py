@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, EventStatus
 from weldcal.systems.cell import Cell
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import Scan
+from weldcal.systems.operator_panel import PACE_SLIDER
 
 Progress = Callable[[str, float], None]
 # How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
@@ -60,9 +61,7 @@ class Run:
         """Simulated seconds per wall second of the whole run, or of one phase."""
         if phase is None:
             return float(self.root.get_time()) / max(self.wall_seconds, 1e-9)
-        spans = [
-            (b[1] - a[1], b[2] - a[2]) for a, b in pairwise(self.phases) if a[0] == phase
-        ]
+        spans = [(b[1] - a[1], b[2] - a[2]) for a, b in pairwise(self.phases) if a[0] == phase]
         return float(sum(s for s, _ in spans) / max(sum(w for _, w in spans), 1e-9))
 
 
@@ -73,6 +72,8 @@ def run_cell(
     simulator = Simulator(cell.diagram)
     if realtime:
         simulator.set_target_realtime_rate(1.0)
+        if meshcat is not None:
+            meshcat.SetSliderValue(PACE_SLIDER, 1.0)
     run = Run(cell, simulator)
     start = time.perf_counter()
     if meshcat is not None:
@@ -86,6 +87,8 @@ def run_cell(
             progress(command.phase.replace("_", " "), _share(run, root, command.phase))
         elif command.phase == "weld" and int(root.get_time() / 0.002) % 500 == 0:
             progress("weld", _share(run, root, "weld"))
+        if cell.diagram.HasSubsystemNamed("operator_panel") and int(root.get_time() / 0.002) % 50 == 0:
+            _keep_pace(run, root)
         if command.finished:
             return EventStatus.ReachedTermination(cell.sequencer, command.phase)
         return EventStatus.DidNothing()
@@ -98,6 +101,14 @@ def run_cell(
         meshcat.StopRecording()
         meshcat.PublishRecording()
     return run
+
+
+def _keep_pace(run: Run, root: Context) -> None:
+    """The viewer's slider sets how fast the simulation may go."""
+    panel = run.cell.diagram.GetSubsystemByName("operator_panel")
+    pace = float(panel.GetOutputPort("pace").Eval(panel.GetMyContextFromRoot(root))[0])
+    if pace != run.simulator.get_target_realtime_rate():
+        run.simulator.set_target_realtime_rate(pace)
 
 
 def _share(run: Run, root: Context, phase: str) -> float:

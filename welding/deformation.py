@@ -158,8 +158,14 @@ def detect_tag(
     )
     if not rotations:
         return TagObservation(False, f"No pose explains the corners of tag {tag.id}.", None, corners)
-    best = int(np.argmin(np.asarray(errors).ravel()))
-    r, p = cv2.solvePnPRefineLM(tag.corners_M, corners, K, lens, rotations[best].copy(), translations[best].copy())
+    spread = np.nan_to_num(np.asarray(errors, dtype=float).ravel(), nan=np.inf)
+    best = int(np.argmin(spread))
+    if spread[best] > bounds.max_reprojection_px:
+        # Square to the camera to the last pixel, the closed form divides by zero; the iterative one does not.
+        _, start_r, start_p = cv2.solvePnP(tag.corners_M, corners, K, lens, flags=cv2.SOLVEPNP_ITERATIVE)
+    else:
+        start_r, start_p = rotations[best], translations[best]
+    r, p = cv2.solvePnPRefineLM(tag.corners_M, corners, K, lens, start_r.copy(), start_p.copy())
     predicted, _ = cv2.projectPoints(tag.corners_M, r, p, K, lens)
     gaps = np.linalg.norm(predicted.reshape(4, 2) - corners, axis=1)
     error = float(np.sqrt(np.mean(gaps**2)))

@@ -228,10 +228,9 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
         fresh = clip(2.0 - (sample.time - state.frame_time) / 0.1, 0.0, 1.0)
         lateral = config.k_p * (config.delta_d_m - state.delta_n)
         return fresh * lateral, fresh * config.k_z * (state.delta_axial - config.axial_d_m)
-    if state.phase == Phase.COAST:
-        wanted = state.residual_at_loss + np.array((0.0, -config.contact.hover_m))
-    else:
-        wanted = state.hold
+    wanted = (
+        state.residual_at_loss + np.array((0.0, -config.contact.hover_m)) if state.phase == Phase.COAST else state.hold
+    )
     gap = wanted - off
     return config.k_follow * float(gap[0]), config.k_follow * float(gap[1])
 

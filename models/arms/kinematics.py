@@ -258,7 +258,7 @@ def _read_kinematics(path: Path) -> tuple[Array, str]:
 def _read(path: Path, section: str) -> Mapping[str, Any]:
     """The mapping under the top-level key `section` of a YAML file."""
     try:
-        data = yaml_load_file(str(path))  # type: ignore[no-untyped-call]
+        data = yaml_load_file(str(path))
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); name an existing YAML file.") from error
     except Exception as error:  # the YAML reader has no common base of its own that pydrake exports

@@ -17,7 +17,13 @@ from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.flanges import get_flange
 from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.flange_estimator import FlangeEstimator, estimate_flange
-from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator, digest, expected_error, verify_at
+from weldcal.systems.iterative_calibrator import (
+    CalibratorConfig,
+    IterativeCalibrator,
+    digest,
+    expected_error,
+    verify_at,
+)
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
 from weldcal.systems.pose_recorder import PoseHistory
 
@@ -68,7 +74,9 @@ def look() -> tuple[Scan, RigidTransform]:
 
 def test_the_ring_is_found_where_the_arm_holds_it(look: tuple[Scan, RigidTransform]) -> None:
     scan, X_BF = look
-    guess = RigidTransform(X_BC.rotation(), X_BC.translation() + [0.02, -0.01, 0.01])  # a tape measure's worth
+    guess = RigidTransform(
+        X_BC.rotation(), X_BC.translation() + np.array([0.02, -0.01, 0.01])
+    )  # a tape measure's worth
     found = estimate_flange(scan, JOB, X_BF, TOOL.X_FR, RING, guess, 0.06)
     assert found.reason is None
     assert found.fit is not None
@@ -91,7 +99,7 @@ def test_the_points_kept_are_the_rings_own(look: tuple[Scan, RigidTransform]) ->
 
 def test_a_scan_without_the_ring_comes_back_with_its_reason(look: tuple[Scan, RigidTransform]) -> None:
     scan, X_BF = look
-    elsewhere = RigidTransform(X_BF.rotation(), X_BF.translation() + [0.0, 0.3, 0.0])
+    elsewhere = RigidTransform(X_BF.rotation(), X_BF.translation() + np.array([0.0, 0.3, 0.0]))
     answer = estimate_flange(scan, JOB, elsewhere, TOOL.X_FR, RING, X_BC, 0.02)
     assert answer.fit is None
     assert answer.reason
@@ -149,12 +157,8 @@ def test_it_is_not_done_before_its_own_expected_error_is_small_enough() -> None:
     assert rough.estimate is not None
     assert rough.predicted_error_m > CONFIG.required_error_m
     assert not rough.done
-    easy = dataclass_with(CONFIG, required_error_m=2.0 * rough.predicted_error_m)
+    easy = dc.replace(CONFIG, required_error_m=2.0 * rough.predicted_error_m)
     assert digested(6, error_m=1e-3, config=easy).done
-
-
-def dataclass_with(config: CalibratorConfig, **changes: float) -> CalibratorConfig:
-    return dc.replace(config, **changes)  # type: ignore[arg-type]
 
 
 def test_the_expected_error_falls_with_more_scans_and_counts_at_the_work_point() -> None:
@@ -208,14 +212,15 @@ def test_a_verification_scan_is_never_calibrated_with() -> None:
     assert after.calibration_scans == 6
     assert after.sequence == 7
     (result,) = after.verifications
-    assert (result.label, result.error_m) == ("pose07", pytest.approx(0.0, abs=1e-7))
+    assert result.label == "pose07"
+    assert result.error_m == pytest.approx(0.0, abs=1e-7)
 
 
 def test_a_verification_measures_the_position_and_the_tilt_of_the_ring() -> None:
     status = digested(6)
     moved = RigidTransform(
         ring_pose(7).rotation() @ RollPitchYaw(0.02, 0.0, 0.5).ToRotationMatrix(),
-        ring_pose(7).translation() + [0.0, 3e-4, 4e-4],
+        ring_pose(7).translation() + np.array([0.0, 3e-4, 4e-4]),
     )
     result = verify_at(status, seen(7, purpose="verify"), moved)
     assert result.error_m == pytest.approx(5e-4, abs=1e-7)
@@ -257,7 +262,9 @@ def test_the_calibrator_takes_each_estimate_once() -> None:
     assert (status.sequence, len(status.observations)) == (1, 1)
     (observation,) = status.observations
     assert observation.X_BR.IsNearlyEqualTo(forward_kinematics(the_arm(), Q_HOME), 1e-12)
-    system.GetInputPort("flange_estimate").FixValue(context, AbstractValue.Make(FlangeEstimate(2, 0.2, "calibrate", "b")))
+    system.GetInputPort("flange_estimate").FixValue(
+        context, AbstractValue.Make(FlangeEstimate(2, 0.2, "calibrate", "b"))
+    )
     simulator.AdvanceTo(0.2)
     assert system.status(context).refused[0][0] == "b"
 

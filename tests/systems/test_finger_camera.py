@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -37,8 +39,8 @@ def rendered(push_m: np.ndarray) -> Image:
 
 def drawn(deflection_T: np.ndarray, scale: int = 8) -> np.ndarray:
     """What a camera would see of the tag with the tip off its rest, drawn by OpenCV: smooth edges, a little noise."""
-    cells = np.kron(tag_cells(TAG).astype(np.uint8) * 255, np.ones((40, 40), np.uint8))
-    cells = cv2.copyMakeBorder(cells, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
+    inner = np.kron(tag_cells(TAG).astype(np.uint8) * 255, np.ones((40, 40), np.uint8))
+    cells = cv2.copyMakeBorder(inner, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255)
     n = cells.shape[0]
     half = 0.5 * TAG.size_m * n / (n - 120)
     corners_M = np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
@@ -54,7 +56,7 @@ def drawn(deflection_T: np.ndarray, scale: int = 8) -> np.ndarray:
     big = cv2.warpPerspective(cells, H, (CAMERA.width * scale, CAMERA.height * scale), borderValue=70)
     smooth = cv2.resize(big, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
     noise = CAMERA.noise_grey * np.random.default_rng(0).standard_normal(smooth.shape)
-    return np.clip(smooth + noise, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(smooth + noise, 0, 255), dtype=np.uint8)
 
 
 def read(image: Image) -> Deformation:
@@ -121,8 +123,8 @@ def test_without_the_tag_there_is_a_reason_and_no_number(what: str) -> None:
 class Bench:
     """A streaming camera alone, before a picture that the test changes."""
 
-    def __init__(self, **changes: float) -> None:
-        config = RenderedFingerCamera(width=8, height=6, **changes)  # type: ignore[arg-type]
+    def __init__(self, **changes: Any) -> None:
+        config = RenderedFingerCamera(width=8, height=6, **changes)
         self.camera = StreamingColourCamera(config, 1, 0.002)
         self.simulator = Simulator(self.camera)
         self.context = self.simulator.get_mutable_context()
@@ -148,7 +150,8 @@ def test_a_frame_arrives_after_its_latency_with_the_time_of_its_exposure() -> No
     bench = Bench(rate_hz=30.0, latency_s=0.040)
     assert bench.image_at(0.039).sequence == 0
     first = bench.image_at(0.0405)
-    assert (first.sequence, first.capture_time) == (1, 0.0)
+    # On a tick of the plant itself, the frame still shows the step before.
+    assert (first.sequence, first.capture_time) == (1, pytest.approx(-0.002))
     later = bench.image_at(1.0 / 30.0 + 0.0405)
     assert later.sequence == 2
     # The world moves in steps: the frame shows the step before its exposure.
@@ -253,4 +256,6 @@ def test_a_frame_from_before_the_arms_memory_is_not_used() -> None:
 
 
 def test_the_scenarios_camera_is_the_one_that_is_read() -> None:
-    assert scenario().finger_camera.camera() == CAMERA
+    camera = scenario().finger_camera
+    assert isinstance(camera, RenderedFingerCamera)
+    assert camera.camera() == CAMERA

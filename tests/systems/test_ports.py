@@ -40,6 +40,7 @@ from weldcal.systems.messages import (
     Scan,
     UrStatus,
 )
+from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.scenario import VisualizationConfig
 from weldcal.systems.seam_planner import SeamPlanner
@@ -78,6 +79,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     CellVisualizer: lambda: CellVisualizer(
         Meshcat(MeshcatParams(host="localhost", port=0)), the_arm(), TOOL, X, 0.03, VisualizationConfig()
     ),
+    OperatorPanel: lambda: OperatorPanel(Meshcat(MeshcatParams(host="localhost", port=0))),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
 }
 
@@ -151,6 +153,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "calibration_status": CalibrationStatus,
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,
+        "hold": 1,
         "job": JobCommand,
         "job_state": JobState,
         "scan_trigger": 1,
@@ -165,6 +168,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "servo_report": ServoReport,
         "position_measured": 6,
     },
+    OperatorPanel: {"hold": 1, "pace": 1},
     CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},
 }
 
@@ -215,7 +219,7 @@ def test_the_docstring_shows_the_ports_in_their_order(kind: type[LeafSystem]) ->
     block, system = documented(kind), MAKERS[kind]()
     private = SHARED_CALCULATIONS.get(kind, set())
     assert block["name"] == kind.__name__
-    assert block["input_ports"] == [port.get_name() for port in inputs(system)]
+    assert block.get("input_ports", []) == [port.get_name() for port in inputs(system)]
     shown = [name for name in block.get("output_ports", []) if name not in private]
     assert shown == [port.get_name() for port in outputs(system) if port.get_name() not in private]
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydrake.symbolic import Variable
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import SymbolicVectorSystem
-from pydrake.symbolic import Variable
 
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -68,9 +69,8 @@ def scan_of_the_plate(width: int = 824, height: int = 616) -> Scan:
     """What the driver's own chain of camera and scanner returns."""
     builder = DiagramBuilder()
     config = RenderedScanner("ideal", width, height, [0.0, 0.0, DISTANCE_M], [180.0, 0.0, 0.0], 0.0, 0.0, 0.0)
-    build = StationBuild(
-        builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), _OnlyAScene(a_scene(builder))
-    )  # type: ignore[arg-type]
+    world: Any = _OnlyAScene(a_scene(builder))
+    build = StationBuild(builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), world)
     assert ApplyDriverConfig(config, build).IsNearlyEqualTo(X_BC, 1e-12)
     builder.ExportInput(build.inputs["scanner.trigger"], "trigger")
     builder.ExportOutput(build.outputs["scanner.scan"], "scan")

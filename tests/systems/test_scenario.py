@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses as dc
+import re
 import types
 import typing
 from pathlib import Path
@@ -14,6 +15,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.scenario import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
+from weldcal.systems.scenario_numbers import check_numbers
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.
@@ -64,7 +66,7 @@ workpiece:
   pose_guess: {xyz_m: [0.6, 0.0, 0.03], rpy_deg: [0.0, 0.0, 80.0]}
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
   groove_error: {translation_mm: 1.5, rotation_deg: 0.3}
-  cut_at_mm: 200.0
+  hole_from_mm: 200.0
 welding:
   speed_mm_s: 6.0
   deflection_mm: 1.5
@@ -159,8 +161,26 @@ def test_a_pose_is_written_in_metres_and_degrees() -> None:
     "pose", [PoseConfig([0.1, 0.2]), PoseConfig(rpy_deg=[0.0] * 4), PoseConfig([0.0, 0.0, float("nan")])]
 )
 def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
-    with pytest.raises(InputError, match="three finite numbers xyz_m and three finite numbers rpy_deg"):
-        pose.pose()
+    with pytest.raises(InputError, match=r"(xyz_m|rpy_deg) must (hold 3 numbers|be finite)"):
+        check_numbers(pose)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
+        ("robot: !SimulatedUr {stiffness: [1, 2]}", "robot.stiffness must hold 6 numbers, not 2"),
+        ("finger_camera: !RenderedFingerCamera {rate_hz: 0}", "finger_camera.rate_hz must be a positive number"),
+        ("calibration: {verification_limit_mm: .nan}", "calibration.verification_limit_mm must be finite"),
+        ("calibration: {verification_scans: -1}", "calibration.verification_scans must not be negative"),
+        ("welding: {seam_length_mm: -5}", "welding.seam_length_mm must be a positive number"),
+        ("welding: {speed_mm_s: fast}", "at 'welding'"),
+        ("home_deg: 5", "at 'home_deg'"),
+    ],
+)
+def test_a_number_that_no_cell_can_work_with_is_named(overrides: str, named: str) -> None:
+    with pytest.raises(InputError, match=re.escape(named)):
+        load_scenario("s_groove", overrides)
 
 
 @pytest.mark.parametrize(
@@ -229,7 +249,7 @@ def test_the_first_of_two_faults_is_named_and_the_second_when_that_is_mended() -
 
 
 def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(InputError, match="There is no scenario 'moon': choose one of .*s_groove"):
+    with pytest.raises(InputError, match=r"There is no scenario 'moon': choose one of .*s_groove"):
         load_scenario("moon")
     with pytest.raises(InputError, match=r"There is no scenario 'moon\.yaml'"):
         load_scenario("moon.yaml")

@@ -9,9 +9,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import kinematics_and_jacobian
 from weldcal.systems.aruco_deformation_estimator import measure_deformation
+from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
 from weldcal.welding.deformation import TagModel
 
-from .cells import Q_HOME, TOOL, Drive, plain_station, scenario
+from .cells import Q_HOME, TOOL, Drive, plain_station
 
 START_S = 0.05  # where along the straight groove, m
 SPEED_M_S = 0.008
@@ -113,7 +114,7 @@ def test_it_leans_into_its_wall_by_less_than_a_tenth(sliding: tuple[np.ndarray, 
 
 def test_as_the_finger_camera_feels_it_the_tip_sits_where_the_tools_numbers_say(groove: Groove) -> None:
     tag = TagModel(dictionary=TOOL.tag_dictionary, id=TOOL.tag_id, size_m=TOOL.tag_size_m)
-    K = scenario().finger_camera.camera().camera_matrix
+    K = RenderedFingerCamera().camera().camera_matrix
     felt = []
     for left_m in (0.0018, 0.0020, 0.0022, 0.0024):  # the tag's edges meet the pixels differently in each
         drive = pressed(groove, AXIAL_M + 0.0007, left_m)

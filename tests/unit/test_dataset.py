@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import open3d as o3d
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.clouds import CloudError, read_cloud, save_cloud
-from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.dataset import load_dataset, save_dataset
+from weldcal.calibration.dataset_header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
 
 HEADER = """\
@@ -123,6 +125,24 @@ def test_a_pose_without_a_cloud_is_refused_by_name(folder: Path) -> None:
 def test_two_clouds_for_one_pose_are_not_guessed_at(folder: Path) -> None:
     save_cloud(folder / "clouds" / "b.npz", np.ones((50, 3)))
     assert "more than one cloud" in load_dataset(folder).refused[0][1]
+
+
+def test_a_recording_reads_back_as_it_was(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    poses = {f"s{k}": RigidTransform(RollPitchYaw(*rng.uniform(-1, 1, 3)), rng.uniform(0.1, 1, 3)) for k in range(4)}
+    clouds = {k: rng.uniform(0.3, 0.6, (20, 30, 3)).astype(np.float32) for k in poses}
+    clouds["s1"][3, 4] = np.nan
+    header = DatasetHeader(robot="ur10e", flange="iso9409-1-50-4-m6", scanner="phoxi_m", configuration="eye_on_base")
+    header.feature_in_flange.xyz = [0.14, 0.0, -0.012]
+    save_dataset(tmp_path / "r", header, poses, clouds)
+    data = load_dataset(tmp_path / "r")
+    for k, X_BF in poses.items():
+        # a quaternion and back: rounding
+        assert np.allclose(data.poses[k].GetAsMatrix34(), X_BF.GetAsMatrix34(), atol=1e-14)
+        assert np.array_equal(data.cloud(k)[0], clouds[k], equal_nan=True)
+    assert data.X_FR.translation()[0] == 0.14
+    with pytest.raises(DatasetError, match="ids of poses and clouds differ"):
+        save_dataset(tmp_path / "s", header, poses, {})
 
 
 def test_pairs_are_read_and_mixed_units_are_noticed(tmp_path: Path) -> None:

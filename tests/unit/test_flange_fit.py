@@ -10,6 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.observation import observation_from_fit
+from weldcal.calibration.rigid import rotation_vector
+from weldcal.calibration.solve import estimate_eye_on_base
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner
@@ -89,7 +92,9 @@ def render(
 
 def fit(X_CR: RigidTransform, cloud: Array, rng: np.random.Generator) -> FlangeFit:
     offset = rng.uniform(-0.012, 0.012, 3)
-    return fit_flange(cloud, STANDARD, guess=FlangeGuess(X_CR.translation() + offset, 0.085, X_CR.rotation().col(2)))
+    return fit_flange(
+        cloud, STANDARD, guess=FlangeGuess(X_CR.translation() + offset, 0.085, X_CR.rotation().matrix()[:, 2])
+    )
 
 
 def poses(n: int, seed: int) -> list[RigidTransform]:
@@ -108,7 +113,7 @@ def errors(n: int, seed: int, **scene: object) -> tuple[Array, Array, Array, Arr
     for X_CR in poses(n, seed):
         found = fit(X_CR, render(X_CR, rng, **scene), rng)  # type: ignore[arg-type]
         e = found.center_C - X_CR.translation()
-        lean = np.cross(found.normal_C, X_CR.rotation().col(2))
+        lean = np.cross(found.normal_C, X_CR.rotation().matrix()[:, 2])
         normalised = float(e @ np.linalg.solve(found.center_covariance, e)) / 3.0
         tilt = float(np.linalg.norm(lean))
         rows.append((X_CR.rotation().matrix().T @ e, normalised, tilt, tilt**2 / 2.0 / found.normal_sigma**2))
@@ -200,3 +205,17 @@ def test_nothing_near_the_guess_is_said_so() -> None:
     cloud = render(facing_pose((0.0, 0.0, 0.7), 5.0, 0.0), np.random.default_rng(8))
     with pytest.raises(FlangeNotFound, match="valid points lie within 60 mm of the expected flange"):
         fit_flange(cloud, STANDARD, guess=FlangeGuess(np.array([0.0, 0.0, 0.3]), 0.06))
+
+
+def test_a_dozen_scans_place_the_scanner_within_a_sixth_of_a_millimetre() -> None:
+    rng = np.random.default_rng(9)
+    X_BC = RigidTransform(RollPitchYaw(3.0, 0.1, 0.5), [-0.6, -0.2, 1.3])
+    observations = []
+    for k, X_CR in enumerate(poses(12, 9)):
+        found = fit(X_CR, render(X_CR, rng), rng)
+        observations.append(observation_from_fit(f"p{k}", X_BC @ X_CR, found))
+    X = estimate_eye_on_base(observations).X_BC
+    turn = rotation_vector(X.rotation() @ X_BC.rotation().inverse())
+    # at the camera's own origin, 0.75 m from the flange, where a rotation counts most
+    assert np.linalg.norm(X.translation() - X_BC.translation()) < 1.5e-4
+    assert np.degrees(np.linalg.norm(turn)) < 0.03

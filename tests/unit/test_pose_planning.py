@@ -61,7 +61,7 @@ def test_the_feature_is_in_view_faces_the_scanner_and_is_not_hidden(planned: lis
         assert (p[:, 2] > SCANNER.near_m).all()
         assert (p[:, 2] < SCANNER.far_m).all()
         sight = -X_CR.translation() / np.linalg.norm(X_CR.translation())
-        assert np.arccos(sight @ X_CR.rotation().col(2)) <= CONFIG.theta_max_rad + 1e-9
+        assert np.arccos(sight @ X_CR.rotation().matrix()[:, 2]) <= CONFIG.theta_max_rad + 1e-9
         frames = link_frames(ARM, pose.q)
         assert not occludes(bodies, frames, X_BC.translation(), (pose.X_BR @ ring.T).T)[0]
         assert lowest_point(bodies, frames) >= CONFIG.table_z_m + CONFIG.margin_m
@@ -70,7 +70,7 @@ def test_the_feature_is_in_view_faces_the_scanner_and_is_not_hidden(planned: lis
 def test_poses_span_space_and_tilt(planned: list[PlannedPose]) -> None:
     p = np.array([pose.X_BR.translation() for pose in planned])
     assert np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[2] / np.sqrt(len(p)) > 0.02
-    normals = np.array([pose.X_BR.rotation().col(2) for pose in planned])
+    normals = np.array([pose.X_BR.rotation().matrix()[:, 2] for pose in planned])
     assert np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min())) > 20.0
     first = np.array([pose.X_BR.translation() for pose in planned[:4]])
     assert np.linalg.svd(first - first.mean(axis=0), compute_uv=False)[2] > 0.01

@@ -25,7 +25,7 @@ def sightings(
         p_C = np.array([rng.uniform(-0.15, 0.15), rng.uniform(-0.12, 0.12), rng.uniform(0.55, 0.85)])
         R_CR = RollPitchYaw(np.pi + rng.uniform(-turn, turn), rng.uniform(-turn, turn), rng.uniform(-turn, turn))
         X_BR = X_BC @ RigidTransform(R_CR, p_C)
-        n_C = exp_rotation(sigma_n * rng.standard_normal(3)) @ R_CR.ToRotationMatrix().col(2)
+        n_C = exp_rotation(sigma_n * rng.standard_normal(3)) @ R_CR.ToRotationMatrix().matrix()[:, 2]
         out.append(Observation(f"p{k}", X_BR, p_C + sigma * rng.standard_normal(3), n_C if normals else None))
     return out
 

@@ -78,7 +78,7 @@ def test_point_to_plane_sees_the_normal_too(verification: Verification) -> None:
 
 
 def test_a_pair_without_a_cloud_gives_its_centre_error_only() -> None:
-    o = Observation("v", X_BR, X_CR.translation() + X_CR.rotation().col(2) * 2e-4)
+    o = Observation("v", X_BR, X_CR.translation() + X_CR.rotation().matrix()[:, 2] * 2e-4)
     error = CentreVerification(o)(X_BC)
     assert np.allclose(error.value, [0, 0, 0, 0, 0, 2e-4], atol=1e-12)
 

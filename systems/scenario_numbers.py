@@ -1,0 +1,48 @@
+"""The numbers of a scenario: finite, in number and in sign what the cell can work with."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+import math
+from typing import Any
+
+from weldcal.models.errors import InputError
+
+POSITIVE = {
+    *("required_error_mm", "theta_max_deg", "guess_radius_mm", "verification_limit_mm", "clearance_m", "clearance_mm"),
+    *("speed_mm_s", "deflection_mm", "axial_deflection_mm", "seam_length_mm", "length_mm", "hole_from_mm"),
+    *("maximum_time_s", "control_period_s", "following_error_rad", "stiffness", "damping"),
+    *("rate_hz", "focal_px", "width", "height", "recording_fps", "cloud_points"),
+}
+NOT_NEGATIVE = {
+    *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "verification_scans"),
+    *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
+}
+LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "home_deg": 6, "stiffness": 6, "damping": 6}
+
+
+def check_numbers(config: Any, place: str = "") -> None:
+    """Walk a tree of configuration dataclasses.
+
+    Raises:
+        InputError: naming the first key whose number (or list of numbers) cannot be used.
+    """
+    for field in dc.fields(config):
+        value, key = getattr(config, field.name), f"{place}{field.name}"
+        if dc.is_dataclass(value):
+            check_numbers(value, f"{key}.")
+            continue
+        if isinstance(value, list) and len(value) != LENGTHS.get(field.name, len(value)):
+            raise InputError(f"{key} must hold {LENGTHS[field.name]} numbers, not {len(value)}.")
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, int | float) and not isinstance(number, bool):
+                _check(key, field.name, float(number))
+
+
+def _check(key: str, name: str, number: float) -> None:
+    if not math.isfinite(number):
+        raise InputError(f"{key} must be finite, not {number}.")
+    if name in POSITIVE and number <= 0.0:
+        raise InputError(f"{key} must be a positive number, not {number:g}.")
+    if name in NOT_NEGATIVE and number < 0.0:
+        raise InputError(f"{key} must not be negative, and it is {number:g}.")

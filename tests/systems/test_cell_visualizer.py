@@ -1,0 +1,165 @@
+"""What a person sees: Meshcat gets a board for every phase, each belief as it comes, and a recording that opens by itself."""
+
+from __future__ import annotations
+
+import base64
+import re
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.systems.cell import Cell, make_cell
+from weldcal.systems.cell_visualizer import ALL_PHASES, ROOT, CellVisualizer
+from weldcal.systems.job_sequencer import PHASES, JobState
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
+from weldcal.systems.phase_labels import TEXT, label_image
+from weldcal.systems.scenario import VisualizationConfig
+from weldcal.systems.welding_velocity_servo import ServoReport
+from weldcal.welding.seam import SeamCurve
+
+from .cells import Q_HOME, TOOL, scenario, the_arm
+
+
+@pytest.fixture(scope="module")
+def meshcat() -> Meshcat:
+    """One Meshcat for this machine alone, at whatever port is free."""
+    return Meshcat(MeshcatParams(host="localhost", port=0))
+
+
+@pytest.fixture(scope="module")
+def recorded(meshcat: Meshcat) -> Cell:
+    """The S groove's cell after its first 0.3 s, recorded."""
+    cell = make_cell(scenario(), 0, meshcat)
+    meshcat.StartRecording(frames_per_second=10.0, set_visualizations_while_recording=False)
+    simulator = Simulator(cell.diagram)
+    simulator.AdvanceTo(0.3)
+    meshcat.StopRecording()
+    meshcat.PublishRecording()
+    return cell
+
+
+@pytest.mark.usefixtures("recorded")
+def test_every_phase_has_its_board_in_the_scene(meshcat: Meshcat) -> None:
+    for phase in ALL_PHASES:
+        assert meshcat.HasPath(f"{ROOT}/phase/{phase}")
+
+
+@pytest.mark.usefixtures("recorded")
+def test_the_arm_and_the_scanners_guess_are_in_the_scene(meshcat: Meshcat) -> None:
+    assert meshcat.HasPath("/drake/cell")
+    assert meshcat.HasPath(f"{ROOT}/camera/guess")
+
+
+@pytest.mark.usefixtures("recorded")
+def test_the_recording_is_one_page_with_the_boards_in_it(meshcat: Meshcat) -> None:
+    page = meshcat.StaticHtml()
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert not re.search(r"<(script|link)[^>]*(src|href)=.https?:", page)  # it opens with no network
+    # The page carries what was sent to the browser as base64 of binary messages.
+    pieces = re.findall(r"[A-Za-z0-9+/]{200,}={0,2}", page)
+    sent = b"".join(base64.b64decode(piece) for piece in pieces if len(piece) % 4 == 0)
+    for phase in ALL_PHASES:
+        assert f"{ROOT}/phase/{phase}".encode() in sent
+        assert f"map_Kd phase_{phase}.png".encode() in sent
+    assert sent.count(b"data:image/png;base64,iVBORw0K") >= len(ALL_PHASES)  # their pictures, and not their names alone
+    assert b"set_animation" in sent
+
+
+def test_the_viewer_listens_on_this_machine_only(meshcat: Meshcat) -> None:
+    assert meshcat.web_url().startswith("http://localhost:")
+
+
+def test_every_phase_has_words_and_a_board_that_shows_them() -> None:
+    assert set(ALL_PHASES) == {*PHASES, "done", "held"} == set(TEXT)
+    for phase, text in TEXT.items():
+        board = label_image(text)
+        assert board.shape == (128, 1024, 3), phase
+        bright = np.argwhere(board.max(axis=2) > 200)
+        assert len(bright) > 300
+        # The whole line fits: nothing touches the board's ends.
+        assert bright[:, 1].min() > 8
+        assert bright[:, 1].max() < 1015
+
+
+class Viewer:
+    """The visualizer alone, shown messages by hand."""
+
+    def __init__(self, meshcat: Meshcat) -> None:
+        meshcat.Delete(ROOT)
+        self.meshcat = meshcat
+        guess = RigidTransform([0.65, 0.0, 0.95])
+        self.system = CellVisualizer(meshcat, the_arm(), TOOL, guess, 0.0315, VisualizationConfig(cloud_points=50))
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.show(
+            job_state=JobState(),
+            calibration_status=CalibrationStatus(),
+            flange_estimate=FlangeEstimate(),
+            scan=Scan(),
+            planned_seam=PlannedSeam(),
+            servo_report=ServoReport(),
+        )
+        self.system.GetInputPort("position_measured").FixValue(self.context, Q_HOME)
+        self.simulator.Initialize()
+
+    def show(self, **messages: object) -> None:
+        for name, message in messages.items():
+            self.system.GetInputPort(name).FixValue(self.context, AbstractValue.Make(message))
+
+    def run(self, duration: float) -> None:
+        self.simulator.AdvanceTo(self.context.get_time() + duration)
+
+    def has(self, path: str) -> bool:
+        return bool(self.meshcat.HasPath(f"{ROOT}/{path}"))
+
+
+@pytest.fixture
+def viewer(meshcat: Meshcat, recorded: Cell) -> Viewer:
+    assert recorded.diagram.HasSubsystemNamed("cell_visualizer")
+    return Viewer(meshcat)
+
+
+def test_a_scan_appears_when_it_comes(viewer: Viewer) -> None:
+    viewer.run(0.15)
+    assert not viewer.has("scan/01")
+    points = np.random.default_rng(0).uniform(0.1, 0.2, (20, 30, 3)).astype(np.float32)
+    points[0] = np.nan
+    viewer.show(scan=Scan(1, 0.1, points))
+    viewer.run(0.15)
+    assert viewer.has("scan/01")
+    assert not viewer.has("scan/02")
+
+
+def test_a_fitted_circle_appears_and_a_refused_one_does_not(viewer: Viewer) -> None:
+    viewer.show(flange_estimate=FlangeEstimate(1, 0.0, "calibrate", "pose01", reason="no rim was seen"))
+    viewer.run(0.15)
+    assert not viewer.has("circle/01")
+    fit = FlangeFit(
+        np.array([0.0, 0.0, 0.6]),
+        np.array([0.0, 0.0, -1.0]),
+        np.eye(3) * 1e-10,
+        1e-4,
+        1e-5,
+        1e-5,
+        0.0315,
+        None,
+        900,
+        90,
+        0.9,
+    )
+    viewer.show(flange_estimate=FlangeEstimate(2, 0.0, "calibrate", "pose02", fit))
+    viewer.run(0.15)
+    assert viewer.has("circle/02")
+
+
+def test_the_planned_seam_appears(viewer: Viewer) -> None:
+    seam = SeamCurve.from_points(np.column_stack([np.full(30, 0.65), np.linspace(-0.1, 0.1, 30), np.zeros(30)]))
+    viewer.show(planned_seam=PlannedSeam(1, seam), job_state=JobState(JobCommand(phase="approach_above")))
+    viewer.run(0.15)
+    assert viewer.has("seam/planned")
+    assert not viewer.has("seam/torch/000")

@@ -1,0 +1,52 @@
+"""A person's click holds the job for good, and a person's slider sets the pace."""
+
+from __future__ import annotations
+
+import pytest
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.analysis import Simulator
+
+from weldcal.systems.operator_panel import HOLD_BUTTON, PACE_SLIDER, OperatorPanel
+
+
+class Panel:
+    """The panel alone, with what it says at any time."""
+
+    def __init__(self, pace: float = 0.0) -> None:
+        self.meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
+        self.system = OperatorPanel(self.meshcat, pace)
+        self.simulator = Simulator(self.system)
+
+    def after(self, duration: float) -> tuple[float, float]:
+        """Hold and pace after some more time."""
+        context = self.simulator.get_context()
+        self.simulator.AdvanceTo(context.get_time() + duration)
+        return tuple(float(self.system.GetOutputPort(name).Eval(context)[0]) for name in ("hold", "pace"))  # type: ignore[return-value]
+
+    def click(self) -> None:
+        """What the browser sends when the button is clicked (msgpack: a map of two strings)."""
+        pairs = {"type": "button", "name": HOLD_BUTTON}
+        words = [word.encode() for pair in pairs.items() for word in pair]
+        self.meshcat._InjectWebsocketMessage(b"\x82" + b"".join(bytes([0xA0 + len(word)]) + word for word in words))
+
+
+def test_nobody_holds_by_default() -> None:
+    assert Panel().after(0.2) == (0.0, 0.0)
+
+
+def test_a_click_holds_and_stays() -> None:
+    panel = Panel()
+    panel.after(0.1)
+    panel.click()
+    assert panel.after(0.1)[0] == 1.0
+    panel.meshcat.DeleteButton(HOLD_BUTTON)  # even the count of clicks may go
+    panel.meshcat.AddButton(HOLD_BUTTON)
+    assert panel.after(0.2)[0] == 1.0
+
+
+@pytest.mark.parametrize("pace", [0.0, 1.0])
+def test_the_slider_begins_at_the_pace_that_was_asked_for_and_can_be_moved(pace: float) -> None:
+    panel = Panel(pace)
+    assert panel.after(0.1)[1] == pace
+    panel.meshcat.SetSliderValue(PACE_SLIDER, 2.0)
+    assert panel.after(0.1)[1] == 2.0

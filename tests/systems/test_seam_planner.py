@@ -1,0 +1,165 @@
+"""A scan of the workpiece becomes the line on which the tip will run, with an arm's way to it; or a reason why not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.analysis import Simulator
+
+from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.workpieces import make_workpiece
+from weldcal.systems.cell import servo_config
+from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
+from weldcal.systems.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
+from weldcal.welding.seam import SeamCurve
+from weldcal.welding.servo_state import ServoConfig
+from weldcal.welding.touch import touch_start_pose
+
+from .cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
+
+STRAIGHT = make_workpiece("straight", length_m=0.200)
+X_BP = RigidTransform(RollPitchYaw(0.0, 0.0, np.pi / 2), [0.65, 0.0, 0.02])
+JOB = JobCommand(scan_sequence=1, scan_purpose="workpiece", scan_label="workpiece")
+CLEARANCE_M = 0.025
+
+
+@pytest.fixture(scope="module")
+def config() -> ServoConfig:
+    return servo_config(scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE), plain_station())
+
+
+@pytest.fixture(scope="module")
+def workpiece_scan() -> Scan:
+    """What the ideal scanner sees of the straight plate from its place above, the arm parked out of its sight."""
+    drive = Drive(plain_station())
+    drive.place_arm(Q_HOME)
+    drive.set("scanner.trigger", [1.0])
+    drive.run(0.15)
+    scan: Scan = drive.get("scanner.scan")
+    return scan
+
+
+def planned(
+    scan: Scan, config: ServoConfig, job: JobCommand = JOB, X_BC: RigidTransform | None = None, offset_m: float = 0.0
+) -> PlannedSeam:
+    """What the system makes of one scan; the guess of the plate's place is off by some millimetres and a degree."""
+    error = RigidTransform(RollPitchYaw(0.0, 0.0, np.radians(1.0)), [0.004 + offset_m, -0.003, 0.0])
+    system = SeamPlanner(the_arm(), TOOL, STRAIGHT, X_BP @ error, config, Q_HOME, CLEARANCE_M, 0.1, X_BC)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for name, value in {"scan": scan, "job": job, "calibration_status": CalibrationStatus()}.items():
+        system.GetInputPort(name).FixValue(context, AbstractValue.Make(value))
+    simulator.AdvanceTo(0.01)
+    answer: PlannedSeam = system.GetOutputPort("planned_seam").Eval(context)
+    return answer
+
+
+@pytest.fixture(scope="module")
+def plan(workpiece_scan: Scan, config: ServoConfig) -> PlannedSeam:
+    return planned(workpiece_scan, config, X_BC=plain_station().truth.X_BC)
+
+
+def test_the_tips_line_runs_above_the_root_as_high_as_the_tip_sits() -> None:
+    seam = tip_seam(STRAIGHT, X_BP, TOOL, None)
+    height = STRAIGHT.tip_height(TOOL.tip_radius_m) - TOOL.seat_sink_m
+    root = (X_BP @ STRAIGHT.seam_P.T).T
+    gap = np.asarray(seam.position(np.array([0.0, 0.5 * seam.length, seam.length]))) - root[[0, len(root) // 2, -1]]
+    assert gap == pytest.approx(np.tile([0.0, 0.0, height], (3, 1)), abs=3e-4)  # the curve is sampled anew
+    assert gap[:, 2] == pytest.approx(height, abs=1e-9)
+    assert seam.length == pytest.approx(STRAIGHT.length_m, abs=1e-6)
+    assert seam.frame(0.05).tangent == pytest.approx([0.0, 1.0, 0.0], abs=1e-9)
+
+
+def test_a_weld_may_take_only_a_part_of_the_seam() -> None:
+    assert tip_seam(STRAIGHT, X_BP, TOOL, 0.060).length == pytest.approx(0.060, abs=1e-3)
+
+
+def test_the_line_lies_on_the_side_of_the_plate_that_is_up() -> None:
+    tilted = X_BP @ RigidTransform(RollPitchYaw(0.1, 0.0, 0.0), np.zeros(3))
+    assert tip_seam(STRAIGHT, tilted, TOOL, None).frame(0.1).up == pytest.approx(
+        tilted.rotation().matrix()[:, 2], abs=1e-6
+    )
+
+
+def test_the_waypoints_put_the_tool_where_the_touch_begins_above_it_and_above_the_end(config: ServoConfig) -> None:
+    seam = tip_seam(STRAIGHT, X_BP, TOOL, None)
+    q_start, q_above, q_retract = arm_waypoints(the_arm(), TOOL, seam, config, Q_HOME, CLEARANCE_M)
+    start, above, end = (forward_kinematics(the_arm(), q) @ TOOL.X_FT for q in (q_start, q_above, q_retract))
+    assert start.IsNearlyEqualTo(touch_start_pose(seam, config), 1e-6)
+    assert above.translation() - start.translation() == pytest.approx([0.0, 0.0, CLEARANCE_M], abs=1e-6)
+    assert above.rotation().matrix() == pytest.approx(start.rotation().matrix(), abs=1e-6)
+    lifted = end.translation() - seam.frame(seam.length).position
+    assert lifted == pytest.approx([0.0, 0.0, CLEARANCE_M + 0.05], abs=1e-6)
+
+
+def test_the_way_down_is_one_short_motion_of_the_same_arm_configuration(config: ServoConfig) -> None:
+    q_start, q_above, _ = arm_waypoints(the_arm(), TOOL, tip_seam(STRAIGHT, X_BP, TOOL, None), config, Q_HOME, 0.025)
+    assert np.abs(q_start - q_above).max() < 0.1
+
+
+def test_a_seam_out_of_reach_is_refused_in_one_sentence(config: ServoConfig) -> None:
+    far = RigidTransform(X_BP.rotation(), [1.6, 0.0, 0.02])
+    seam: SeamCurve = tip_seam(STRAIGHT, far, TOOL, None)
+    with pytest.raises(SeamOutOfReach, match="move the workpiece towards the robot"):
+        arm_waypoints(the_arm(), TOOL, seam, config, Q_HOME, CLEARANCE_M)
+
+
+def test_the_plate_is_found_where_it_lies_and_the_seam_with_it(plan: PlannedSeam) -> None:
+    assert plan.reason is None
+    assert plan.X_BP is not None
+    # An ideal scanner with pixels of 2 mm on a flat plate: in its plane the edges fix it to a quarter of a pixel.
+    assert plan.X_BP.translation() == pytest.approx(X_BP.translation(), abs=0.5e-3)
+    assert plan.X_BP.translation()[2] == pytest.approx(0.02, abs=0.1e-3)
+    assert np.degrees((plan.X_BP.rotation().inverse() @ X_BP.rotation()).ToAngleAxis().angle()) < 0.3
+    assert plan.seam is not None
+    expected = tip_seam(STRAIGHT, plan.X_BP, TOOL, 0.1)
+    assert plan.seam.length == pytest.approx(expected.length)
+    assert plan.seam.frame(0.05).position == pytest.approx(expected.frame(0.05).position)
+    assert plan.sequence == 1
+    assert plan.rms_m < 0.5e-3
+
+
+def test_the_plan_holds_the_arms_way_to_it(plan: PlannedSeam, config: ServoConfig) -> None:
+    assert plan.seam is not None
+    expected = arm_waypoints(the_arm(), TOOL, plan.seam, config, Q_HOME, CLEARANCE_M)
+    assert plan.q_start == pytest.approx(expected[0])
+    assert plan.q_above == pytest.approx(expected[1])
+    assert plan.q_retract == pytest.approx(expected[2])
+
+
+def test_the_cloud_is_shown_in_the_base(plan: PlannedSeam) -> None:
+    assert plan.points_B is not None
+    on_top = np.abs(plan.points_B[:, 2] - 0.02) < 0.5e-3
+    assert on_top.sum() > 1000
+
+
+def test_without_a_calibration_there_is_no_plan_but_a_reason(workpiece_scan: Scan, config: ServoConfig) -> None:
+    answer = planned(workpiece_scan, config)
+    assert answer.seam is None
+    assert answer.sequence == 1
+    assert "not calibrated" in (answer.reason or "")
+
+
+def test_a_plate_that_is_not_there_is_a_reason(workpiece_scan: Scan, config: ServoConfig) -> None:
+    above_the_plate = workpiece_scan.points_C.copy()
+    above_the_plate[workpiece_scan.points_C[..., 2] < 0.945] = np.nan  # all but the table is gone
+    answer = planned(Scan(1, 0.0, above_the_plate), config, X_BC=plain_station().truth.X_BC)
+    assert answer.seam is None
+    assert answer.reason
+    assert "\n" not in answer.reason
+
+
+def test_an_empty_scan_is_a_reason(config: ServoConfig) -> None:
+    nothing = Scan(1, 0.0, np.full((10, 10, 3), np.nan, np.float32))
+    answer = planned(nothing, config, X_BC=plain_station().truth.X_BC)
+    assert answer.seam is None
+    assert answer.reason
+
+
+def test_scans_of_anything_else_are_left_alone(config: ServoConfig) -> None:
+    nothing = Scan(1, 0.0, np.full((10, 10, 3), np.nan, np.float32))
+    calibrating = JobCommand(scan_sequence=1, scan_purpose="calibrate")
+    assert planned(nothing, config, job=calibrating).sequence == 0
+    assert planned(nothing, config, job=JobCommand(scan_sequence=2, scan_purpose="workpiece")).sequence == 0
