@@ -35,11 +35,15 @@ class Scan(Message):
 
 @dataclass(frozen=True, eq=False)
 class Image(Message):
-    """One frame of the finger camera: grey (H, W) uint8, with the time of its exposure."""
+    """One frame of the finger camera: grey (H, W) uint8.
+
+    `capture_time` is the time on the arm's clock whose pose the frame shows; `exposed_at` when the shutter opened.
+    """
 
     sequence: int = 0
     capture_time: float = -np.inf
     pixels: NDArray[np.uint8] = field(default_factory=lambda: np.empty((0, 0), dtype=np.uint8))
+    exposed_at: float = -np.inf
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ class StreamingColourCamera(LeafSystem):
         )
         step = self._plant_period_s
         taken = (np.ceil(now / step - 1e-6) - 1.0) * step  # on a tick itself the plant still shows the step before
-        frame = Image(sequence=stream.count + 1, capture_time=taken, pixels=noisy)
+        frame = Image(stream.count + 1, taken, noisy, now)
         kept = 2 + int(self._config.latency_s * self._config.rate_hz)  # enough to look back through the latency
         new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
         state.get_mutable_abstract_state(self._state).set_value(new)
@@ -102,8 +102,7 @@ class StreamingColourCamera(LeafSystem):
     def _arrived(self, context: Context) -> Image:
         stream: _Stream = context.get_abstract_state(self._state).get_value()
         now = context.get_time()
-        delay = self._plant_period_s + self._config.latency_s  # the exposure ends within a step of the time it carries
-        ripe = [f for f in stream.frames if now >= f.capture_time + delay - 1e-9]
+        ripe = [f for f in stream.frames if now >= f.exposed_at + self._config.latency_s - 1e-9]
         return ripe[-1] if ripe else Image()
 
     def _image(self, context: Context, output: Any) -> None:
