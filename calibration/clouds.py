@@ -42,8 +42,8 @@ def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
     dropped.
 
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
-    centres at whole numbers; zero or NaN depth is invalid. NaN rows are usual in organised files and are dropped with a
-    remark. Raises CloudError: unreadable, truncated, empty, mostly NaN in a list of points, infinite coordinates.
+    centres at whole numbers; zero or NaN depth is invalid. NaN stands for a missing pixel in organised files.
+    Raises CloudError: unreadable, truncated, empty, NaN in a list of points, infinite coordinates.
     """
     try:
         points, declared = _read_npz(path) if path.suffix.lower() == ".npz" else _read_open3d(path)
@@ -72,10 +72,11 @@ def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
         out = points.copy()
         out[bad.reshape(points.shape[:2])] = np.nan
         return out, ()
-    if n_bad > 0.9 * len(flat) and path.suffix.lower() != ".pcd":
-        raise CloudError(f"{n_bad} of the {len(flat)} points of {path.name} are NaN; export the cloud again.")
-    remarks = (f"{n_bad} of {len(flat)} points are NaN and were dropped",) if n_bad else ()
-    return flat[~bad], remarks
+    if n_bad:
+        raise CloudError(
+            f"{n_bad} of the {len(flat)} points of {path.name} are NaN; export the cloud without invalid points, or organised."
+        )
+    return flat, ()
 
 
 def save_cloud(path: Path, points_C: Array, intrinsics: tuple[float, float, float, float] | None = None) -> None:

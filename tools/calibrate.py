@@ -234,6 +234,7 @@ def _sightings(
     """Fit every cloud, or take the pairs as they are."""
     if data.pairs:
         return [Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs], {}, {}, [], []
+    _check_clouds(data)
     observations, fits, clouds = [], {}, {}
     refused, warnings = list(data.refused), []
     for k, id in enumerate(data.clouds):
@@ -241,7 +242,7 @@ def _sightings(
         try:
             points, remarks = data.cloud(id)
             fit = fit_flange(points, standard, guess=_guess(data, id, standard))
-        except (CloudError, FlangeNotFound) as e:
+        except FlangeNotFound as e:
             refused.append((id, e.reason))
             continue
         warnings += [f"{id}: {r}." for r in remarks]
@@ -249,6 +250,23 @@ def _sightings(
         clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
     return observations, fits, clouds, refused, warnings
+
+
+def _check_clouds(data: Dataset) -> None:
+    """Read every file before any work: a damaged one is the user's to mend, unlike a scan in which no flange is found.
+
+    Raises:
+        InputError: naming the first such file, what is wrong with it and how many there are.
+    """
+    bad: list[str] = []
+    for id in data.clouds:
+        try:
+            data.cloud(id)
+        except CloudError as e:
+            bad.append(f"{id}: {e.reason}")
+    if bad:
+        more = f" ({len(bad) - 1} more clouds are damaged too)" if len(bad) > 1 else ""
+        raise InputError(f"A cloud cannot be used{more}; mend it, or take it away together with its pose: {bad[0]}")
 
 
 def _guess(data: Dataset, id: str, standard: FlangeStandard) -> FlangeGuess | None:

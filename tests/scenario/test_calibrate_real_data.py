@@ -112,6 +112,13 @@ def _nan(folder: Path) -> None:
         o3d.io.write_point_cloud(path, cloud)
 
 
+def _some_nan(folder: Path) -> None:
+    path = folder / "clouds" / "pose04.pcd"
+    points = np.array(o3d.io.read_point_cloud(path).points)
+    points[:5] = np.nan
+    o3d.io.write_point_cloud(path, o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
+
+
 def _millimetres(folder: Path) -> None:
     for path in sorted((folder / "clouds").iterdir()):
         points = 1e3 * np.asarray(o3d.io.read_point_cloud(path).points)
@@ -147,15 +154,25 @@ def _coplanar(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "spoil", "sentence"),
     [
-        (AUBO, _nan, "None of the 6 clouds can be used; .* NaN"),
+        (AUBO, _nan, r"pose02: Every point of pose02\.pcd is NaN"),
         (AUBO, _millimetres, "1000 times too large"),
         (AUBO, _missing_pose, r"no pose for pose06\.pcd"),
         (AUBO, _nan_pose, "nan in column x of 'pose04'"),
-        (AUBO, _empty_of_four, r"Only 3 usable poses remain of 4.*pose02.*is empty"),
+        (AUBO, _empty_of_four, r"pose02: The cloud pose02\.pcd is empty"),
+        (AUBO, _some_nan, r"pose04: 5 of the \d+ points of pose04\.pcd are NaN"),
         (AUBO, lambda f: _keep(f, 3), "3 poses; a calibration needs at least 4"),
         (UR10E, _coplanar, "lie in one plane"),
     ],
-    ids=["NaN points", "millimetres", "missing pose", "NaN in a pose", "empty cloud", "three poses", "four coplanar"],
+    ids=[
+        "NaN points",
+        "millimetres",
+        "missing pose",
+        "NaN in a pose",
+        "empty cloud",
+        "some NaN points",
+        "three poses",
+        "four coplanar",
+    ],
 )
 def test_bad_data_get_one_sentence_and_leave_nothing(
     tmp_path: Path, source: Path, spoil: Callable[[Path], None], sentence: str

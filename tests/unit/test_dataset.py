@@ -177,13 +177,17 @@ def test_depth_map_uses_pixel_centres_at_whole_numbers(tmp_path: Path) -> None:
     assert np.allclose(points[20, 40], [0.05, 0.0, 0.5])
 
 
-def test_a_few_nan_rows_are_dropped_with_their_number(tmp_path: Path) -> None:
-    points = np.ones((100, 3))
-    points[:7] = np.nan
-    save_cloud(tmp_path / "n.npz", points)
-    got, remarks = read_cloud(tmp_path / "n.npz")
-    assert got.shape == (93, 3)
-    assert remarks == ("7 of 100 points are NaN and were dropped",)
+def test_nan_is_a_missing_pixel_in_an_image_and_an_error_in_a_list(tmp_path: Path) -> None:
+    rows = ["nan nan nan"] * 7 + ["1 1 1"] * 93
+    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {}\nHEIGHT {}\nPOINTS 100\nDATA ascii\n"
+    (tmp_path / "image.pcd").write_text("VERSION 0.7\n" + header.format(20, 5) + "\n".join(rows) + "\n")
+    got, remarks = read_cloud(tmp_path / "image.pcd")
+    assert got.shape == (5, 20, 3)
+    assert np.isnan(got).all(axis=2).sum() == 7
+    assert remarks == ()
+    (tmp_path / "list.pcd").write_text("VERSION 0.7\n" + header.format(100, 1) + "\n".join(rows) + "\n")
+    with pytest.raises(CloudError, match=r"7 of the 100 points of list\.pcd are NaN"):
+        read_cloud(tmp_path / "list.pcd")
 
 
 @pytest.mark.parametrize(
