@@ -37,9 +37,8 @@ def find_cloud(folder: Path, id: str) -> Path:
     return found[0]
 
 
-def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
-    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit, and remarks on what was
-    dropped.
+def read_cloud(path: Path) -> Array:
+    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
 
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
     centres at whole numbers; zero or NaN depth is invalid. NaN stands for a missing pixel in organised files.
@@ -71,12 +70,12 @@ def read_cloud(path: Path) -> tuple[Array, tuple[str, ...]]:
     if points.ndim == 3:
         out = points.copy()
         out[bad.reshape(points.shape[:2])] = np.nan
-        return out, ()
+        return out
     if n_bad:
         raise CloudError(
             f"{n_bad} of the {len(flat)} points of {path.name} are NaN; export the cloud without invalid points, or organised."
         )
-    return flat, ()
+    return flat
 
 
 def save_cloud(path: Path, points_C: Array, intrinsics: tuple[float, float, float, float] | None = None) -> None:

@@ -62,11 +62,9 @@ class Dataset:
         X_BC = RigidTransform(_quaternion(g.wxyz, "scanner_guess"), g.xyz)
         return X_BC.InvertAndCompose(self.poses[id] @ self.X_FR)
 
-    def cloud(self, id: str) -> tuple[Array, tuple[str, ...]]:
-        """Points of one cloud in metres, (N, 3) or organised (H, W, 3), with remarks. Raises CloudError with the
-        reason."""
-        points, remarks = read_cloud(self.clouds[id])
-        return points * UNITS[self.header.units.clouds], remarks
+    def cloud(self, id: str) -> Array:
+        """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
+        return read_cloud(self.clouds[id]) * UNITS[self.header.units.clouds]
 
 
 def load_dataset(folder: Path) -> Dataset:

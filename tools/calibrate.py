@@ -158,7 +158,7 @@ def calibrate_dataset(
         raise InputError(f"'{out}' is a file; give a folder for the result.")
     data = load_dataset(Path(folder))
     standard = get_flange(flange or data.header.flange)
-    observations, fits, clouds, refused, warnings = _sightings(data, standard, seed, tell)
+    observations, fits, clouds, refused = _sightings(data, standard, seed, tell)
     _enough(observations, refused, data)
     tell("solving", 0.7)
     estimate = estimate_eye_on_base(observations, SolveConfig(seed=seed))
@@ -178,7 +178,7 @@ def calibrate_dataset(
     tell("Algorithm 1 for comparison", 0.8)
     algorithm1, verifier, icp = _algorithm1(observations, inliers, clouds, fits, standard, seed)
     curve = convergence(inliers, verifier, orders=8, seed=seed)
-    warnings += list(estimate.warnings)
+    warnings = list(estimate.warnings)
     if turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
             "The poses hardly differ in orientation: a constant error of the flange centre would not show in these "
@@ -230,26 +230,25 @@ def calibrate_dataset(
 
 def _sightings(
     data: Dataset, standard: FlangeStandard, seed: int, tell: Progress
-) -> tuple[list[Observation], dict[str, FlangeFit], dict[str, Array], list[tuple[str, str]], list[str]]:
+) -> tuple[list[Observation], dict[str, FlangeFit], dict[str, Array], list[tuple[str, str]]]:
     """Fit every cloud, or take the pairs as they are."""
     if data.pairs:
-        return [Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs], {}, {}, [], []
+        return [Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs], {}, {}, []
     _check_clouds(data)
     observations, fits, clouds = [], {}, {}
-    refused, warnings = list(data.refused), []
+    refused = list(data.refused)
     for k, id in enumerate(data.clouds):
         tell("fitting flanges", 0.7 * k / len(data.clouds))
         try:
-            points, remarks = data.cloud(id)
+            points = data.cloud(id)
             fit = fit_flange(points, standard, guess=_guess(data, id, standard))
         except FlangeNotFound as e:
             refused.append((id, e.reason))
             continue
-        warnings += [f"{id}: {r}." for r in remarks]
         fits[id] = fit
         clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
-    return observations, fits, clouds, refused, warnings
+    return observations, fits, clouds, refused
 
 
 def _check_clouds(data: Dataset) -> None:

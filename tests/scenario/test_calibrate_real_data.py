@@ -90,7 +90,7 @@ def test_the_same_data_give_the_same_answer(aubo: CalibrationReport, tmp_path: P
 def test_franka_ply_in_millimetres_is_read_and_fitted() -> None:
     from weldcal.calibration.dataset import load_dataset
 
-    points, _ = load_dataset(DATA / "franka_phoxi_m").cloud("pose04")
+    points = load_dataset(DATA / "franka_phoxi_m").cloud("pose04")
     fit = fit_flange(points, get_flange("iso9409-1-50-4-m6"))
     assert fit.coverage > 0.9
     # chamfered edge of a 63 mm flange

@@ -67,7 +67,7 @@ def test_a_good_folder_is_read_with_its_hashes(folder: Path) -> None:
     assert data.refused == ()
     assert set(data.hashes) == {"dataset.yaml", "poses.csv", "clouds/a.npz", "clouds/b.pcd"}
     assert all(len(h) == 64 for h in data.hashes.values())
-    a, b = data.cloud("a")[0], data.cloud("b")[0]
+    a, b = data.cloud("a"), data.cloud("b")
     # single precision of half a metre
     assert np.allclose(a, b, atol=1e-7)
     assert data.X_FR.IsExactlyIdentity()
@@ -75,7 +75,7 @@ def test_a_good_folder_is_read_with_its_hashes(folder: Path) -> None:
 
 def test_units_are_converted(folder: Path) -> None:
     change(folder / "dataset.yaml", "clouds: m,", "clouds: mm,")
-    assert load_dataset(folder).cloud("a")[0].max() < 1e-3
+    assert load_dataset(folder).cloud("a").max() < 1e-3
 
 
 def test_feature_in_the_flange_frame_is_read(folder: Path) -> None:
@@ -139,7 +139,7 @@ def test_a_recording_reads_back_as_it_was(tmp_path: Path) -> None:
     for k, X_BF in poses.items():
         # a quaternion and back: rounding
         assert np.allclose(data.poses[k].GetAsMatrix34(), X_BF.GetAsMatrix34(), atol=1e-14)
-        assert np.array_equal(data.cloud(k)[0], clouds[k], equal_nan=True)
+        assert np.array_equal(data.cloud(k), clouds[k], equal_nan=True)
     assert data.X_FR.translation()[0] == 0.14
     with pytest.raises(DatasetError, match="ids of poses and clouds differ"):
         save_dataset(tmp_path / "s", header, poses, {})
@@ -161,17 +161,16 @@ def test_pairs_are_read_and_mixed_units_are_noticed(tmp_path: Path) -> None:
 def test_text_ply_with_a_camera_element_is_read(tmp_path: Path) -> None:
     rows = "\n".join(f"{k} {2 * k} 700.5" for k in range(40))
     (tmp_path / "c.ply").write_text(PLY + rows + "\n0 640\n")
-    points, remarks = read_cloud(tmp_path / "c.ply")
+    points = read_cloud(tmp_path / "c.ply")
     assert points.shape == (40, 3)
     assert np.allclose(points[7], [7, 14, 700.5])
-    assert remarks == ()
 
 
 def test_depth_map_uses_pixel_centres_at_whole_numbers(tmp_path: Path) -> None:
     depth = np.zeros((40, 60))
     depth[10:, 20:] = 0.5
     np.savez(tmp_path / "d.npz", depth=depth, intrinsics=[100.0, 110.0, 30.0, 20.0])
-    points, _ = read_cloud(tmp_path / "d.npz")
+    points = read_cloud(tmp_path / "d.npz")
     assert points.shape == (40, 60, 3)
     assert np.isnan(points[0, 0]).all()
     assert np.allclose(points[20, 40], [0.05, 0.0, 0.5])
@@ -181,10 +180,9 @@ def test_nan_is_a_missing_pixel_in_an_image_and_an_error_in_a_list(tmp_path: Pat
     rows = ["nan nan nan"] * 7 + ["1 1 1"] * 93
     header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {}\nHEIGHT {}\nPOINTS 100\nDATA ascii\n"
     (tmp_path / "image.pcd").write_text("VERSION 0.7\n" + header.format(20, 5) + "\n".join(rows) + "\n")
-    got, remarks = read_cloud(tmp_path / "image.pcd")
+    got = read_cloud(tmp_path / "image.pcd")
     assert got.shape == (5, 20, 3)
     assert np.isnan(got).all(axis=2).sum() == 7
-    assert remarks == ()
     (tmp_path / "list.pcd").write_text("VERSION 0.7\n" + header.format(100, 1) + "\n".join(rows) + "\n")
     with pytest.raises(CloudError, match=r"7 of the 100 points of list\.pcd are NaN"):
         read_cloud(tmp_path / "list.pcd")
