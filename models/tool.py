@@ -34,8 +34,8 @@ class WeldingTool:
     tip_modulus_Pa: float = 1e7  # hydroelastic modulus of the soft tip
     # Where the loaded tip is felt, by its tag, in the groove: below a hard ball's seat and towards the wall it leans on. Indentation
     # and the tag's own bias are in it, so it is calibrated once, on a straight groove in a known place (test_soft_tip.py).
-    seat_sink_m: float = 0.00099
-    seat_side_m: float = 0.00004
+    seat_sink_m: float = 0.00092
+    seat_side_m: float = 0.00005
     tip_mass_kg: float = 0.005
     lateral_stiffness_N_per_m: float = 600.0
     axial_stiffness_N_per_m: float = 300.0

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from pydrake.common import MemoryFile
-from pydrake.geometry import InMemoryMesh, Mesh, Meshcat
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.systems.textured_board import textured_board
 
 WIDTH_M, HEIGHT_M = 0.72, 0.09
 # Above and behind the cell, facing a viewer who stands in front of the robot (+x) and looks back at it.
@@ -31,7 +33,7 @@ TEXT = {
 }
 
 
-def label_image(text: str) -> np.ndarray:
+def label_image(text: str) -> NDArray[np.uint8]:
     """A (128, 1024, 3) uint8 BGR board with the text."""
     board = np.full((128, 1024, 3), (46, 38, 33), dtype=np.uint8)
     (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.6, 2)
@@ -41,20 +43,6 @@ def label_image(text: str) -> np.ndarray:
 
 def add_phase_label(meshcat: Meshcat, path: str, phase: str) -> None:
     """Put the board for a phase at `path`."""
-    w, h = WIDTH_M / 2, HEIGHT_M / 2
-    name = f"phase_{phase}"
-    obj = (
-        f"mtllib {name}.mtl\nusemtl board\nv {-w} {-h} 0\nv {w} {-h} 0\nv {w} {h} 0\nv {-w} {h} 0\n"
-        "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n"
-    )
-    mtl = f"newmtl board\nKa 1 1 1\nKd 1 1 1\nmap_Kd {name}.png\n"
-    png = cv2.imencode(".png", label_image(TEXT.get(phase, phase)))[1].tobytes()
-    mesh = InMemoryMesh(
-        mesh_file=MemoryFile(obj, ".obj", f"{name}.obj"),
-        supporting_files={
-            f"{name}.mtl": MemoryFile(mtl, ".mtl", f"{name}.mtl"),
-            f"{name}.png": MemoryFile(png, ".png", f"{name}.png"),
-        },
-    )
-    meshcat.SetObject(path, Mesh(mesh))
+    board = textured_board(f"phase_{phase}", WIDTH_M, HEIGHT_M, label_image(TEXT.get(phase, phase)))
+    meshcat.SetObject(path, board)
     meshcat.SetTransform(path, X_WS)

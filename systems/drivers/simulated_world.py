@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
@@ -12,9 +13,12 @@ from pydrake.geometry import (
     AddRigidHydroelasticProperties,
     Box,
     Cylinder,
+    GeometryInstance,
+    IllustrationProperties,
     InMemoryMesh,
     MakeRenderEngineVtk,
     Mesh,
+    PerceptionProperties,
     ProximityProperties,
     RenderEngineVtkParams,
     SceneGraph,
@@ -46,6 +50,7 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.messages import Message
+from weldcal.systems.textured_board import textured_board
 from weldcal.welding.deformation import TagModel, tag_cells
 
 SCANNER_RENDERER = "scanner"
@@ -55,6 +60,7 @@ DARK = (0.16, 0.18, 0.21, 1.0)
 COPPER = (0.80, 0.45, 0.20, 1.0)
 SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
+CELL_PX = 16  # texels of a tag cell: about those of the camera's picture of it, so that interpolation smooths the edges
 TIP_FRICTION = 0.2  # soft tip on steel
 
 
@@ -88,19 +94,15 @@ def _add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> 
     _show(plant, body, RigidTransform(), shape, "iso_flange", STEEL)
 
 
-def _tag_mesh(tag: TagModel) -> TriMesh:
-    """The dark cells of the tag as one mesh of quads in the marker frame (x right, y up, z out of the print)."""
-    dark = ~tag_cells(tag)
-    n = dark.shape[0]
-    cell = tag.size_m / n
-    vertices: list[tuple[float, float, float]] = []
-    triangles: list[tuple[int, int, int]] = []
-    for row, column in np.argwhere(dark):
-        x0, y0 = -tag.size_m / 2 + column * cell, tag.size_m / 2 - row * cell
-        k = len(vertices)
-        vertices += [(x0, y0, 0.0), (x0 + cell, y0, 0.0), (x0 + cell, y0 - cell, 0.0), (x0, y0 - cell, 0.0)]
-        triangles += [(k, k + 2, k + 1), (k, k + 3, k + 2)]
-    return TriMesh(np.array(vertices), np.array(triangles))
+def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: TagModel) -> None:
+    """The tag with a white margin of one cell, in the marker frame (x right, y up, z out of the print)."""
+    cells = cv2.copyMakeBorder(255 * tag_cells(tag).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=255)
+    print_ = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
+    size = tag.size_m * cells.shape[0] / (cells.shape[0] - 2)
+    geometry = GeometryInstance(X, textured_board("tag", size, size, print_), "tag_print")
+    geometry.set_perception_properties(PerceptionProperties())
+    geometry.set_illustration_properties(IllustrationProperties())
+    plant.RegisterVisualGeometry(body, geometry)
 
 
 def _add_tool(
@@ -182,7 +184,7 @@ def _add_tool(
         "tag_white",
         (1.0, 1.0, 1.0, 1.0),
     )
-    _show(plant, body, X_TM, mesh_shape(_tag_mesh(tag), "tag.obj"), "tag_dark", (0.02, 0.02, 0.02, 1.0))
+    _print_tag(plant, body, X_TM, tag)
     contact = ProximityProperties()
     AddContactMaterial(dissipation=1.0, friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=contact)
     AddCompliantHydroelasticProperties(

@@ -84,9 +84,8 @@ def test_a_push_of_the_rendered_tag_is_read_back(push_mm: tuple[float, float, fl
     assert answer.sample is not None
     assert answer.sample.valid, answer.reason
     assert answer.sample.deflection_T[:2] == pytest.approx(push[:2], abs=0.05 * MM)
-    # The renderer draws hard edges: each side of the tag is off by up to a pixel in 112, seen from 40 mm, and the corner
-    # refinement draws corners inwards by as much again.
-    assert answer.sample.deflection_T[2] == pytest.approx(push[2], abs=0.6 * MM)
+    # The corner refinement sees the tag of 112 px a constant 0.6 px too large: 0.23 mm of 40 mm, the same at every push.
+    assert answer.sample.deflection_T[2] == pytest.approx(push[2] - 0.23 * MM, abs=0.12 * MM)
 
 
 def test_the_rendered_tag_is_read_without_a_great_bias_on_average() -> None:
@@ -96,7 +95,8 @@ def test_the_rendered_tag_is_read_without_a_great_bias_on_average() -> None:
         assert sample is not None
         errors.append(sample.deflection_T - MM * np.array(push_mm))
     assert np.abs(np.mean(errors, axis=0)[:2]).max() < 0.03 * MM
-    assert abs(np.mean(errors, axis=0)[2]) < 0.4 * MM
+    assert abs(np.mean(errors, axis=0)[2]) < 0.3 * MM
+    assert np.std(errors, axis=0)[2] < 0.06 * MM, "what is left is a constant, which the seat's calibration absorbs"
 
 
 @pytest.mark.parametrize("what", ["dark", "half covered", "another tag"])
