@@ -138,7 +138,7 @@ def calibrate(
             assert scenario is not None
             folder = out or fresh_folder("calibrate", scenario, seed)
             options = DemoOptions(scenario=scenario, out=folder, seed=seed, browser=False)
-            summary = run_calibration_live(options, progress).summary()
+            summary = run_calibration_live(options, progress).calibration_summary()
     finish("calibrate", summary, folder, json_wanted=json, rows=rows)
 
 

@@ -99,6 +99,23 @@ class DemoResult:
         found["real_time_factor"] = self.run.real_time_factor()
         return found
 
+    def calibration_summary(self) -> dict[str, object]:
+        """The JSON object of a live `calibrate`: the keys of the offline one beside those of the run."""
+        found, estimate = self.summary(), self.status.estimate
+        found["seconds"] = self.run.wall_seconds
+        if estimate is not None:
+            ids = [o.id for o in self.status.observations]
+            found |= {
+                "n_used": int(estimate.inliers.sum()),
+                "covariance": estimate.covariance.tolist(),
+                "scanner_correction": None,
+                "tilt_deg": error_summary(np.degrees(estimate.held_out.tilt_rad)),
+                "outliers": [id for id, used in zip(ids, estimate.inliers, strict=True) if not used],
+                "warnings": list(estimate.warnings),
+                "unobservable": list(estimate.unobservable),
+            }
+        return found
+
 
 def run_demo(options: DemoOptions, progress: Progress = no_progress) -> DemoResult:
     """The whole story of a scenario.

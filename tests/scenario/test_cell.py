@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.conftest import run_weldcal
 from weldcal.calibration.pose_planning import PlannedPose
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.cell import make_cell
@@ -91,6 +92,15 @@ def test_the_same_seed_gives_the_same_run(tmp_path: Path) -> None:
     assert first.status.X_BC is not None
     assert second.status.X_BC is not None
     assert np.array_equal(first.status.X_BC.GetAsMatrix4(), second.status.X_BC.GetAsMatrix4())
+
+
+def test_a_live_calibration_reports_what_the_offline_one_does(tmp_path: Path) -> None:
+    finished = run_weldcal(
+        "calibrate", "--scenario", "calibrate_only", "--out", str(tmp_path / "live"), folder=tmp_path
+    )
+    assert finished.returncode == 0, finished.stderr
+    keys = "state n_used refused X_BC covariance scanner_correction held_out_mm tilt_deg outliers warnings unobservable seconds"
+    assert set(keys.split()) <= set(finished.summary)
 
 
 def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
