@@ -194,6 +194,35 @@ def benchmark_seeds(
     finish("benchmark seeds", summary, folder, json_wanted=json)
 
 
+@app.command("emulate-ur", short_help="A UR controller on loopback.")
+def emulate_ur(
+    polyscope: Annotated[
+        str, typer.Option("--polyscope", metavar="VERSION", help="Controller version: 5.12, 5.21, 10.7 ...")
+    ] = "5.21",
+    kinematics: Annotated[
+        Path | None, typer.Option("--kinematics", metavar="FILE", help="A robot's factory calibration.")
+    ] = None,
+    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="Loopback address 127.x.y.z.")] = "127.0.0.1",
+    control_port: Annotated[
+        int, typer.Option("--control-port", metavar="PORT", help="Where faults are injected, as JSON lines.")
+    ] = 30090,
+    seed: SeedOption = 0,
+    debug: DebugOption = False,
+) -> None:
+    """A UR controller on loopback that executes the URScript it is sent; runs until it is interrupted."""
+    with console.boundary(json_wanted=False, debug=debug):
+        from weldcal.tools.ur_emulator.main import run_emulator
+
+        run_emulator(
+            host=host,
+            control_port=control_port,
+            polyscope=polyscope,
+            kinematics=kinematics,
+            seed=seed,
+            ready=typer.echo,
+        )
+
+
 @app.command(short_help="Show a finished run again.")
 def view(
     result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],

@@ -1,0 +1,133 @@
+"""The arm of the emulated controller: the simulation's kinematic model, moved 2 ms at a time."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.tools.ur_emulator.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
+from weldcal.tools.ur_emulator.poses import inverse, matrix, pose_of
+
+Array = NDArray[np.float64]
+
+# [M] how the arm slows when its program stops, pauses, or a safety function acts
+STOP_RAD_S2 = 10.0
+# [M] how far inside a joint's limit the controller stops the arm
+LIMIT_MARGIN_RAD = 1e-6
+HISTORY = 2000
+
+
+class EmulatedArm:
+    """Targets and actual values of six joints (rad, rad/s, rad/s^2), the tool frame, and the motion under way."""
+
+    def __init__(self, model: ArmModel, q: Array) -> None:
+        self.model = model
+        self.q_target = np.array(q, dtype=np.float64)
+        self.q = self.q_target.copy()
+        self.qd_target, self.qdd_target, self.qd = np.zeros(6), np.zeros(6), np.zeros(6)
+        self.X_FT = np.eye(4)
+        self.p_FT = np.zeros(3)
+        self.motion: Motion | None = None
+        self.lag_s = 0.0
+        self.history: deque[Array] = deque(maxlen=HISTORY)
+        self._cache: dict[str, list[float]] = {}
+
+    def place(self, q: Array) -> None:
+        """Puts the arm somewhere at rest, as no robot can."""
+        self.q_target = np.array(q, dtype=np.float64)
+        self.q = self.q_target.copy()
+        self.qd_target, self.qdd_target, self.qd = np.zeros(6), np.zeros(6), np.zeros(6)
+        self.motion = None
+        self._cache.clear()
+
+    def set_tcp(self, pose: list[float]) -> None:
+        """The tool centre point in the flange frame."""
+        self.X_FT = matrix(pose)
+        self.p_FT = self.X_FT[:3, 3].copy()
+        self._cache.clear()
+
+    @property
+    def at_rest(self) -> bool:
+        """No joint has a target velocity."""
+        return bool(np.abs(self.qd_target).max() < REST_RAD_S)
+
+    def step(self, driven: bool, scaling: float) -> None:
+        """Moves by one step; where it is not driven it brakes.
+
+        Raises:
+            MotionRefused: the arm cannot follow; it has begun to brake.
+        """
+        refusal: MotionRefused | None = None
+        before = self.qd_target
+        qd = slowed(before, STOP_RAD_S2)
+        if driven and self.motion is not None:
+            try:
+                qd = self._checked(self.motion.velocity(self, scaling))
+            except MotionRefused as refused:
+                refusal = refused
+        elif self.motion is not None:
+            speed = float(np.abs(before).max())
+            self.motion.braked(float(np.abs(qd).max()) / speed if speed > 0.0 else 0.0)
+        self._integrate(qd)
+        if refusal is not None:
+            raise refusal
+
+    def _checked(self, qd: Array) -> Array:
+        if not np.isfinite(qd).all():
+            raise MotionRefused("the commanded velocity is not finite")
+        if (np.abs(qd) > self.model.velocity_limit * (1.0 + 1e-9) + 1e-9).any():
+            raise MotionRefused(f"joint {int(np.argmax(np.abs(qd) / self.model.velocity_limit))} is too fast")
+        # where the joint would come to rest if it braked from here
+        ahead = self.q_target + qd * STEP_S + qd * np.abs(qd) / (2.0 * STOP_RAD_S2)
+        outside = (ahead > self.model.position_upper - LIMIT_MARGIN_RAD) & (qd > 0.0)
+        outside |= (ahead < self.model.position_lower + LIMIT_MARGIN_RAD) & (qd < 0.0)
+        if outside.any():
+            raise MotionRefused(f"joint {int(np.argmax(outside))} is at its limit")
+        return qd
+
+    def _integrate(self, qd: Array) -> None:
+        self.qdd_target = (qd - self.qd_target) / STEP_S
+        self.qd_target = qd
+        self.q_target = self.q_target + qd * STEP_S
+        if self.lag_s > 0.0:
+            share = STEP_S / (STEP_S + self.lag_s)
+            q = self.q + share * (self.q_target - self.q)
+            self.qd, self.q = (q - self.q) / STEP_S, q
+        else:
+            self.qd, self.q = qd, self.q_target
+        self.history.append(self.q)
+        if qd.any() or self.lag_s > 0.0:
+            self._cache.clear()
+
+    def flange(self, q: Array) -> Array:
+        """X_BF (4, 4) at q."""
+        R, p, _ = kinematics_and_jacobian(self.model, q)
+        X = np.eye(4)
+        X[:3, :3], X[:3, 3] = R, p
+        return X
+
+    def flange_goal(self, pose: list[float]) -> Array:
+        """X_BF (4, 4) that puts the tool at `pose`."""
+        return matrix(pose) @ inverse(self.X_FT)
+
+    def tool_pose(self, target: bool = False) -> list[float]:
+        """The tool's pose in the base, from the actual or the target joints."""
+        key = "target" if target else "actual"
+        if key not in self._cache:
+            self._cache[key] = pose_of(self.flange(self.q_target if target else self.q) @ self.X_FT)
+        return self._cache[key]
+
+    def tool_speed(self, target: bool = False) -> list[float]:
+        """The tool's twist [v; w] in base axes (m/s, rad/s)."""
+        qd = self.qd_target if target else self.qd
+        if not qd.any():
+            return [0.0] * 6
+        key = "target speed" if target else "actual speed"
+        if key not in self._cache:
+            J = kinematics_and_jacobian(self.model, self.q_target if target else self.q, self.p_FT)[2]
+            V = (J @ qd).tolist()
+            self._cache[key] = [*V[3:], *V[:3]]
+        return self._cache[key]

@@ -1,0 +1,80 @@
+"""URScript's own functions, as far as the client's script and a guard script call them, bound to one program.
+
+Those of script_motions.py are generators that take frames; all other functions answer at once. What the emulator has no
+physics for (force mode, freedrive ...) is accepted and noted in the log.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from weldcal.tools.ur_emulator.script_answers import Answers
+from weldcal.tools.ur_emulator.script_motions import Motions
+
+if TYPE_CHECKING:
+    from weldcal.tools.ur_emulator.controller import Controller
+    from weldcal.tools.ur_emulator.program import Program
+
+BLOCKING = frozenset(
+    {
+        *("movej", "movel", "movep", "speedj", "speedl", "servoj", "servoc", "stopj", "stopl"),
+        *("sync", "sleep", "protective_stop"),
+    }
+)
+NO_EFFECT = {
+    "force_mode": None,
+    "end_force_mode": None,
+    "force_mode_set_damping": None,
+    "force_mode_set_gain_scaling": None,
+    "freedrive_mode": None,
+    "end_freedrive_mode": None,
+    "teach_mode": None,
+    "end_teach_mode": None,
+    "get_freedrive_status": 0,
+    "zero_ftsensor": None,
+    "set_gravity": None,
+    "enable_external_ft_sensor": None,
+    "ft_rtde_input_enable": None,
+    "direct_torque": None,
+    "set_friction_scales": None,
+    "set_safety_mode_transition_hardness": None,
+    "set_conveyor_tick_count": None,
+    "set_tool_voltage": None,
+    "popup": None,
+}
+
+
+def script_functions(
+    controller: Controller, program: Program
+) -> tuple[Mapping[str, Callable[..., Any]], Iterable[str]]:
+    """All functions by their URScript name, and the names of those that are generators."""
+    functions = Motions(controller, program)
+    named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name, v) for name, v in NO_EFFECT.items()}
+    named |= {
+        name: getattr(functions, name) for kind in (Motions, Answers) for name in vars(kind) if not name.startswith("_")
+    }
+    named |= {name: _real(getattr(math, name)) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")}
+    named |= {name: _real(getattr(math, name)) for name in ("sqrt", "floor", "ceil", "log")}
+    return named, BLOCKING
+
+
+def _no_effect(controller: Controller, name: str, value: Any) -> Callable[..., Any]:
+    noted = False
+
+    def function(*arguments: Any, **keywords: Any) -> Any:
+        nonlocal noted
+        if not noted:
+            noted = True
+            controller.note(f"no effect here: {name}")
+        return value
+
+    return function
+
+
+def _real(function: Callable[..., float]) -> Callable[..., float]:
+    def wrapped(*arguments: float) -> float:
+        return function(*arguments)
+
+    return wrapped

@@ -1,0 +1,115 @@
+"""The invariant checker: records every frame's motion and says whether the arm moved when nobody asked it to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from weldcal.tools.ur_emulator.controller import Controller
+
+RECORD_FRAMES = 300_000  # ten minutes
+REST_RAD_S = 1e-3
+# A streamed motion whose client has been silent for longer than this moves unattended.
+SILENT_S = 0.25
+TIME, SPEED, TOOL, SILENCE, STREAMED = range(5)
+
+
+class Checker:
+    """Times are the host's monotonic clock, which processes on one machine share."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._record = np.zeros((RECORD_FRAMES, 5))
+        self._count = 0
+        self._heard = float("-inf")
+        self._moving = False
+        self._latched_at: float | None = None
+        self._rested_since_fault = False
+        self.faults: list[tuple[float, str]] = []
+        self.moves_without_a_command = 0
+        self.moves_after_a_fault = 0
+        self.unattended_s = 0.0
+
+    def heard(self, now: float) -> None:
+        """A client has sent an input package or a script."""
+        self._heard = now
+
+    def fault(self, name: str, now: float) -> None:
+        """A fault was injected: from the first rest on, any motion before `reset` is a violation."""
+        self.faults.append((now, name))
+        if self._latched_at is None:
+            self._latched_at, self._rested_since_fault = now, not self._moving
+
+    def reset(self) -> None:
+        """A person has acknowledged: motion is allowed again."""
+        self._latched_at = None
+
+    def frame(self, now: float) -> None:
+        """Looks at one control frame."""
+        arm = self._controller.arm
+        qd = arm.qd
+        moving_any = qd.any()
+        speed = float(np.abs(qd).max()) if moving_any else 0.0
+        silence = now - self._heard
+        motion = arm.motion
+        streamed = motion is not None and motion.streamed
+        tool = float(np.linalg.norm(arm.tool_speed()[:3])) if moving_any else 0.0
+        self._record[self._count % RECORD_FRAMES] = (now, speed, tool, min(silence, 1e9), streamed)
+        self._count += 1
+        moving = speed > REST_RAD_S
+        if moving and not self._moving:
+            self.moves_without_a_command += silence > SILENT_S
+            self.moves_after_a_fault += self._latched_at is not None and self._rested_since_fault
+        if moving and streamed and silence > SILENT_S:
+            self.unattended_s += 0.002
+        self._moving = moving
+        if not moving:
+            self._rested_since_fault = True
+
+    def _rows(self) -> Any:
+        if self._count <= RECORD_FRAMES:
+            return self._record[: self._count]
+        return np.roll(self._record, -(self._count % RECORD_FRAMES), axis=0)
+
+    def at_rest_after(self, fault_time: float, within: float, speed: float = REST_RAD_S) -> dict[str, Any]:
+        """Whether the arm was at rest `within` seconds after the fault and has not moved since.
+
+        rest_after_s is None where it never came to rest, moved_again_s where it never moved again; travel_m is the
+        tool's path from the fault to the first rest.
+        """
+        rows = self._rows()
+        rows = rows[rows[:, TIME] >= fault_time]
+        if rows.shape[0] == 0:
+            return {"ok": False, "reason": "nothing was recorded after that time"}
+        still = rows[:, SPEED] < speed
+        if not still.any():
+            return {
+                "ok": False,
+                "rest_after_s": None,
+                "moved_again_s": None,
+                "travel_m": float(rows[:, TOOL].sum() * 0.002),
+            }
+        first = int(np.argmax(still))
+        again = ~still[first:]
+        moved = float(rows[first + int(np.argmax(again)), TIME] - fault_time) if again.any() else None
+        rest = float(rows[first, TIME] - fault_time)
+        return {
+            "ok": rest <= within and moved is None,
+            "rest_after_s": rest,
+            "moved_again_s": moved,
+            "travel_m": float(rows[:first, TOOL].sum() * 0.002),
+            "peak_tool_speed_after_m_s": float(rows[first:, TOOL].max()),
+            "recorded_s": float(rows[-1, TIME] - fault_time),
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """Counts since the start."""
+        return {
+            "ok": not (self.moves_without_a_command or self.moves_after_a_fault or self.unattended_s > 0.0),
+            "moves_without_a_command": int(self.moves_without_a_command),
+            "moves_after_a_fault": int(self.moves_after_a_fault),
+            "unattended_s": round(self.unattended_s, 3),
+            "faults": [{"time": time, "fault": name} for time, name in self.faults],
+            "latched": self._latched_at is not None,
+        }

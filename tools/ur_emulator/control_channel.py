@@ -1,0 +1,237 @@
+"""The control channel: one JSON object a line injects a fault or asks a question, one JSON object a line answers."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from weldcal.models.errors import InputError
+from weldcal.tools.ur_emulator.checker import Checker
+from weldcal.tools.ur_emulator.controller import Controller
+from weldcal.tools.ur_emulator.dashboard import IDLE_PROGRAM
+from weldcal.tools.ur_emulator.modes import RobotMode, SafetyMode
+from weldcal.tools.ur_emulator.motions import STEP_S
+from weldcal.tools.ur_emulator.net import Connection, Network, Server
+from weldcal.tools.ur_emulator.rtde_server import RtdeServer
+
+Request = Mapping[str, Any]
+
+
+class World:
+    """What the loop itself needs to know: how long it stands still, is unplugged, jitters, and when it ends."""
+
+    def __init__(self) -> None:
+        self.frozen_until = 0.0
+        self.unplugged_until: float | None = None
+        self.jitter_s = 0.0
+        self.quit = False
+        self.overruns = 0
+        self.frames_late_s = 0.0
+
+
+class ControlServer(Server):
+    """{"fault": name, ...}, {"check": ...}, {"ask": "state" | "log" | "program" | "connections"}, {"do": ...}."""
+
+    kind = "control"
+
+    def __init__(
+        self, controller: Controller, network: Network, rtde: RtdeServer, checker: Checker, world: World
+    ) -> None:
+        self._controller, self._network = controller, network
+        self._rtde, self._checker, self._world = rtde, checker, world
+        c = controller
+        self._faults: dict[str, Callable[[Request, float], None]] = {
+            "drop": lambda r, now: self._each(r, drop_until=now + _number(r, "seconds")),
+            "drop_p": lambda r, now: self._each(r, drop_share=_number(r, "p")),
+            "delay": self._delay,
+            "freeze": self._freeze,
+            "mute_input": lambda r, now: self._each(r, deaf_until=now + _number(r, "seconds", math.inf)),
+            "corrupt": lambda r, now: self._each(r, corrupt=int(_number(r, "n", 1))),
+            "wrong_size": lambda r, now: self._each(r, wrong_size=int(_number(r, "n", 1))),
+            "partial_writes": lambda r, now: self._each(r, piece=int(_number(r, "bytes", 7))),
+            "half_open": lambda r, now: self._each(r, half_open=True),
+            "reset_tcp": lambda r, now: self._close(r, reset=True),
+            "close_tcp": lambda r, now: self._close(r, reset=False),
+            "protective_stop": lambda r, now: c.protective_stop("injected"),
+            "estop": lambda r, now: c.set_safety_mode(
+                SafetyMode.SYSTEM_EMERGENCY_STOP if r.get("system") else SafetyMode.ROBOT_EMERGENCY_STOP
+            ),
+            "safeguard": lambda r, now: c.set_safety_mode(SafetyMode.SAFEGUARD_STOP),
+            "reduced": lambda r, now: c.set_safety_mode(SafetyMode.REDUCED),
+            "safety_mode": lambda r, now: c.set_safety_mode(SafetyMode(int(_number(r, "value")))),
+            "robot_mode": lambda r, now: self._robot_mode(RobotMode(int(_number(r, "value")))),
+            "stop_program": lambda r, now: c.stop_program(),
+            "pause_program": lambda r, now: c.pause_program(),
+            "replace_program": lambda r, now: self._start(str(r.get("script") or IDLE_PROGRAM.format(name="foreign"))),
+            "foreign_program": lambda r, now: self._start(str(r.get("script") or IDLE_PROGRAM.format(name="foreign"))),
+            "local_mode": lambda r, now: setattr(c, "remote", False),
+            "registers_in_use": lambda r, now: rtde.claim_elsewhere([str(n) for n in r.get("names", ())]),
+            "speed_scaling": self._slider,
+            "timestamp_jump": lambda r, now: setattr(c, "timestamp", c.timestamp + _number(r, "seconds")),
+            "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
+            "jitter": lambda r, now: setattr(self._world, "jitter_s", _number(r, "seconds")),
+            "reboot": self._reboot,
+            "refuse_upload": lambda r, now: setattr(c, "refuse_upload", bool(r.get("on", True))),
+            "slow_start": lambda r, now: setattr(c, "start_delay_s", _number(r, "seconds")),
+            "tracking_lag": lambda r, now: setattr(c.arm, "lag_s", _number(r, "seconds")),
+            "wrong_tcp": lambda r, now: c.set_tcp(_six(r, "pose", [0.0, 0.0, 0.1, 0.0, 0.0, 0.0])),
+            "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
+            "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
+        }
+        self._deeds: dict[str, Callable[[Request, float], None]] = {
+            "estop_release": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
+            "safeguard_release": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
+            "normal": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
+            "resume_program": lambda r, now: _required(c.resume_program(), "there is nothing that can be resumed"),
+            "remote": lambda r, now: setattr(c, "remote", bool(r.get("on", True))),
+            "registers_free": lambda r, now: rtde.release_elsewhere(),
+            "clear_pstop_timer": lambda r, now: setattr(c, "protective_since", -(10**9)),
+            "unlock": lambda r, now: _required(c.unlock_protective_stop(), "the protective stop is younger than 5 s"),
+            "power_on": lambda r, now: c.release_brakes(),
+            "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
+            "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
+            "clear_links": self._clear_links,
+            "reset_checker": lambda r, now: checker.reset(),
+            "quit": lambda r, now: setattr(self._world, "quit", True),
+        }
+
+    def arrived(self, connection: Connection, data: bytes, now: float) -> None:
+        connection.inbox += data
+        while b"\n" in connection.inbox:
+            line, _, rest = bytes(connection.inbox).partition(b"\n")
+            connection.inbox[:] = rest
+            if line.strip():
+                connection.send(json.dumps(self.answer(line, now)).encode() + b"\n", now)
+
+    def answer(self, line: bytes, now: float) -> dict[str, Any]:
+        """The reply to one line; `ok` is false and `error` says why where it cannot be done."""
+        try:
+            request = json.loads(line)
+            if not isinstance(request, dict):
+                raise InputError("Send one JSON object a line.")
+            return {"ok": True, "time": now, **self._act(request, now)}
+        except (InputError, ValueError, TypeError, KeyError) as error:
+            return {"ok": False, "time": now, "error": str(error)}
+
+    def _act(self, request: Request, now: float) -> dict[str, Any]:
+        if "fault" in request:
+            name = str(request["fault"])
+            if name not in self._faults:
+                raise InputError(f"There is no fault {name!r}; choose one of: {', '.join(sorted(self._faults))}.")
+            self._faults[name](request, now)
+            if request.get("latch", True):
+                self._checker.fault(name, now)
+            return {}
+        if "do" in request:
+            name = str(request["do"])
+            if name not in self._deeds:
+                raise InputError(f"There is no deed {name!r}; choose one of: {', '.join(sorted(self._deeds))}.")
+            self._deeds[name](request, now)
+            return {}
+        if request.get("check") == "at_rest_after":
+            return self._checker.at_rest_after(
+                _number(request, "fault_time"), _number(request, "within", 0.3), _number(request, "speed", 1e-3)
+            )
+        if request.get("check") == "summary":
+            return self._checker.summary()
+        if request.get("ask") == "state":
+            return self._controller.state() | {"overruns": self._world.overruns}
+        if request.get("ask") == "log":
+            return {"log": list(self._controller.log)}
+        if request.get("ask") == "program":
+            return {"source": self._controller.program.source if self._controller.program else None}
+        if request.get("ask") == "connections":
+            return {"connections": [c.kind for c in self._network.of_kind("all")]}
+        raise InputError("Send fault, do, check (at_rest_after, summary) or ask (state, log, program, connections).")
+
+    def _links(self, request: Request) -> list[Connection]:
+        """Connections of the protocol that the request names (rtde unless it says so), or the one at `index`."""
+        found = self._network.of_kind(str(request.get("kind", "rtde")))
+        return [found[int(request["index"])]] if "index" in request and found else found
+
+    def _each(self, request: Request, **values: Any) -> None:
+        for connection in self._links(request):
+            for name, value in values.items():
+                setattr(connection.faults, name, value)
+
+    def _delay(self, request: Request, now: float) -> None:
+        self._each(
+            request,
+            delay_s=_number(request, "seconds"),
+            jitter_s=_number(request, "jitter", 0.0),
+            delay_until=now + _number(request, "for", math.inf),
+        )
+
+    def _freeze(self, request: Request, now: float) -> None:
+        until = now + _number(request, "seconds")
+        if "kind" in request:
+            self._each(request, freeze_until=until)
+        else:
+            self._world.frozen_until = until
+
+    def _clear_links(self, request: Request, now: float) -> None:
+        self._world.jitter_s = 0.0
+        self._each(
+            {"kind": "all"} | dict(request),
+            drop_until=0.0,
+            drop_share=0.0,
+            delay_until=0.0,
+            freeze_until=0.0,
+            deaf_until=0.0,
+            corrupt=0,
+            wrong_size=0,
+            piece=0,
+            half_open=False,
+        )
+
+    def _close(self, request: Request, *, reset: bool) -> None:
+        for connection in self._links(request):
+            connection.close(reset=reset)
+
+    def _robot_mode(self, mode: RobotMode) -> None:
+        self._controller.robot_mode = mode
+        if mode != RobotMode.RUNNING:
+            self._controller.stop_program()
+
+    def _start(self, script: str) -> None:
+        if not self._controller.start(script):
+            raise InputError(f"The program did not start: {self._controller.log[-1]}")
+
+    def _slider(self, request: Request, now: float) -> None:
+        value, ramp = _number(request, "value"), _number(request, "ramp", 0.0)
+        start, steps = self._controller.terminals.speed_slider, max(1, round(ramp / STEP_S))
+
+        def step(i: int) -> None:
+            self._controller.terminals.speed_slider = start + (value - start) * i / steps
+            if i < steps:
+                self._controller.later(STEP_S, lambda: step(i + 1))
+
+        step(1)
+
+    def _reboot(self, request: Request, now: float) -> None:
+        self._network.unplug(self)
+        self._controller.reboot()
+        self._world.unplugged_until = now + _number(request, "seconds", 2.0)
+
+
+def _number(request: Request, key: str, default: float | None = None) -> float:
+    value = request.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"Give a number as {key!r}.")
+    return float(value)
+
+
+def _six(request: Request, key: str, default: list[float] | None = None) -> list[float]:
+    value = request.get(key, default)
+    if not isinstance(value, list) or len(value) != 6:
+        raise InputError(f"Give six numbers as {key!r}.")
+    return [float(v) for v in value]
+
+
+def _required(done: bool, problem: str) -> None:
+    if not done:
+        raise InputError(f"Not done: {problem}.")

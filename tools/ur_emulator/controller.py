@@ -1,0 +1,323 @@
+"""The controller core: power, safety, program and watchdogs around the arm, one call of `step` every 2 ms."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.tools.ur_emulator.arm import EmulatedArm
+from weldcal.tools.ur_emulator.builtins import script_functions
+from weldcal.tools.ur_emulator.modes import POWERLESS, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.ur_emulator.motions import STEP_S, MotionRefused
+from weldcal.tools.ur_emulator.program import Program
+from weldcal.tools.ur_emulator.registers import Payload, Registers, Terminals, Watchdog
+from weldcal.tools.ur_emulator.script_syntax import ScriptError
+from weldcal.tools.ur_emulator.versions import Version
+
+START_TIMESTAMP_S = 100.0  # a controller has been on for a while; some clients wait for more than 40 s
+UNLOCK_AFTER_S = 5.0
+POWER_STEP_S = 0.5  # [M] how long power on and brake release take
+
+
+class Controller:
+    """Everything but the wire. Times count in frames of 2 ms; the wire's faults live in the servers."""
+
+    def __init__(self, model: ArmModel, q: NDArray[np.float64], version: Version) -> None:
+        self.version = version
+        self.arm = EmulatedArm(model, q)
+        self.inputs, self.outputs, self.terminals = Registers(), Registers(), Terminals()
+        self.external_wrench = [0.0] * 6
+        self.tcp_offset = [0.0] * 6
+        self.payload = Payload(0.0, [0.0] * 3, [0.0] * 6)
+        self.tool_contact_steps = 0
+        self.frame = 0
+        self.timestamp = START_TIMESTAMP_S
+        self.clock_rate = 1.0
+        self.robot_mode = RobotMode.RUNNING
+        self.safety_mode = SafetyMode.NORMAL
+        self.runtime_state = RuntimeState.STOPPED
+        self.remote = True
+        self.refuse_upload = False
+        self.start_delay_s = 0.0
+        self.program: Program | None = None
+        self.program_name = ""
+        self.sidekicks: list[Program] = []
+        self.watchdogs: dict[str, Watchdog] = {}
+        self.log: deque[str] = deque(maxlen=200)
+        self.events: deque[tuple[str, str, int]] = deque(maxlen=200)
+        self.protective_since = -(10**9)
+        self.script_count = 0
+        self._later: list[tuple[int, Callable[[], object]]] = []
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since start, by the count of frames."""
+        return self.frame * STEP_S
+
+    @property
+    def speed_scaling(self) -> float:
+        """Share of the commanded speed that the slider lets through."""
+        return self.terminals.speed_slider
+
+    def note(self, text: str) -> None:
+        """Writes to the log."""
+        self.log.append(f"{self.time_s:.3f} {text}")
+
+    def later(self, seconds: float, action: Callable[[], object]) -> None:
+        """Does something after some time."""
+        self._later.append((self.frame + round(seconds / STEP_S), action))
+
+    # programs
+
+    def submit(self, source: str) -> None:
+        """Text of one program from a script port: runs it where the state allows, or drops it without a word."""
+        line = source.strip()
+        words = line.rstrip("()").strip()
+        if words in ("stop program", "power on", "power off", "set robotmode run", "set unlock protective stop"):
+            self._word(words)
+            return
+        if not line or line.startswith("#"):
+            return
+        if not self.remote or self.refuse_upload:
+            self.note("program ignored: " + ("uploads are refused" if self.remote else "local mode"))
+            return
+        if self.start_delay_s > 0.0:
+            self.later(self.start_delay_s, lambda: self.start(source))
+        else:
+            self.start(source)
+
+    def _word(self, words: str) -> None:
+        if not self.remote:
+            self.note(f"ignored in local mode: {words}")
+        elif words == "stop program":
+            self.stop_program()
+        elif words == "power off":
+            self.power_off()
+        elif words == "set unlock protective stop":
+            self.unlock_protective_stop()
+        else:
+            self.power_on()
+            if words == "set robotmode run":
+                self.later(POWER_STEP_S + STEP_S, self.release_brakes)
+
+    def start(self, source: str) -> bool:
+        """Starts a program in place of the running one; a `sec` runs beside it."""
+        if self.robot_mode != RobotMode.RUNNING or self.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+            self.note("program ignored: the robot is not running or a safety stop is active")
+            return False
+        try:
+            program = Program(source, lambda made: script_functions(self, made))
+        except ScriptError as error:
+            self.note(f"compile error: {error}")
+            self.events.append(("RUNTIME_EXCEPTION", str(error), error.line))
+            return False
+        self.script_count += 1
+        if program.kind == "sec":
+            self.sidekicks.append(program)
+            return True
+        self._drop_program()
+        self.program, self.program_name = program, program.name
+        self.runtime_state = RuntimeState.PLAYING
+        self.note(f"program started: {program.name}")
+        self.events.append(("STARTED", program.name, 0))
+        return True
+
+    def stop_program(self) -> None:
+        """Ends the program; the arm brakes."""
+        if self.program is not None:
+            self._drop_program()
+            self.runtime_state = RuntimeState.STOPPING
+
+    def _drop_program(self) -> None:
+        if self.program is None:
+            return
+        self.program.close()
+        self.note(f"program stopped: {self.program.name}")
+        self.events.append(("STOPPED", self.program.name, 0))
+        self.program = None
+        self.arm.motion = None
+        self.watchdogs.clear()
+
+    def pause_program(self) -> None:
+        """The program stands still and the arm brakes on its path; `resume_program` goes on from there."""
+        if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
+            self.runtime_state = RuntimeState.PAUSING
+
+    def resume_program(self) -> bool:
+        """Dashboard `play`, also after a protective stop: the program goes on with whatever its registers hold."""
+        ready = self.robot_mode == RobotMode.RUNNING and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+        if self.program is None or not ready or not self.remote:
+            return False
+        self.runtime_state = RuntimeState.PLAYING
+        for watchdog in self.watchdogs.values():
+            watchdog.fed_at = self.frame
+        return True
+
+    # safety and power
+
+    def protective_stop(self, reason: str) -> None:
+        """The arm brakes and the program pauses until somebody unlocks."""
+        if self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+            self.set_safety_mode(SafetyMode.PROTECTIVE_STOP)
+            self.note(f"protective stop: {reason}")
+
+    def set_safety_mode(self, mode: SafetyMode) -> None:
+        """What the safety system would do; modes that stop also pause the program."""
+        self.safety_mode = mode
+        if mode == SafetyMode.PROTECTIVE_STOP:
+            self.protective_since = self.frame
+        if mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+            self.pause_program()
+        if mode in POWERLESS:
+            self.robot_mode = RobotMode.POWER_OFF
+        self.note(f"safety mode {mode.name}")
+
+    def unlock_protective_stop(self) -> bool:
+        """Only a protective stop that is at least 5 s old unlocks."""
+        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
+            return True
+        if (self.frame - self.protective_since) * STEP_S < UNLOCK_AFTER_S:
+            return False
+        self.set_safety_mode(SafetyMode.NORMAL)
+        return True
+
+    def power_on(self) -> None:
+        """POWER_OFF -> POWER_ON -> IDLE."""
+        if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode not in POWERLESS:
+            self.robot_mode = RobotMode.POWER_ON
+            self.later(POWER_STEP_S, lambda: self._advance(RobotMode.POWER_ON, RobotMode.IDLE))
+
+    def release_brakes(self) -> None:
+        """IDLE -> RUNNING."""
+        if self.robot_mode == RobotMode.IDLE:
+            self.later(POWER_STEP_S, lambda: self._advance(RobotMode.IDLE, RobotMode.RUNNING))
+        elif self.robot_mode == RobotMode.POWER_OFF:
+            self.power_on()
+            self.later(POWER_STEP_S + STEP_S, self.release_brakes)
+
+    def _advance(self, before: RobotMode, after: RobotMode) -> None:
+        if self.robot_mode == before:
+            self.robot_mode = after
+
+    def power_off(self) -> None:
+        """The brakes fall; the program ends."""
+        self.stop_program()
+        self.robot_mode = RobotMode.POWER_OFF
+
+    def reboot(self) -> None:
+        """Everything volatile is gone; the arm has no power and the clock starts again."""
+        self._drop_program()
+        self.sidekicks.clear()
+        self.inputs, self.outputs = Registers(), Registers()
+        self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
+        self.runtime_state = RuntimeState.STOPPED
+        self.timestamp = 0.0
+        self.note("rebooted")
+
+    # inputs
+
+    def written(self, names: tuple[str, ...]) -> None:
+        """Inputs arrived: those with a watchdog have been fed."""
+        for name in names:
+            if name in self.watchdogs:
+                self.watchdogs[name].fed_at = self.frame
+
+    def set_tcp(self, pose: list[float]) -> None:
+        """The tool centre point in the flange frame."""
+        self.tcp_offset = [float(value) for value in pose]
+        self.arm.set_tcp(self.tcp_offset)
+
+    # time
+
+    def step(self) -> None:
+        """One control frame: due actions, programs, watchdogs, arm."""
+        self.frame += 1
+        self.timestamp += STEP_S * self.clock_rate
+        if self._later:
+            due = [action for frame, action in self._later if frame <= self.frame]
+            self._later = [(frame, action) for frame, action in self._later if frame > self.frame]
+            for action in due:
+                action()
+        self._watch()
+        for program in list(self.sidekicks):
+            self._run(program)
+        if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
+            self._run(self.program)
+        self._move()
+
+    def _run(self, program: Program) -> None:
+        try:
+            program.step()
+        except ScriptError as error:
+            self.note(f"runtime error in line {error.line}: {error}")
+            self.events.append(("RUNTIME_EXCEPTION", str(error), error.line))
+            program.close()
+        if program.finished:
+            if program is self.program:
+                self.stop_program()
+            elif program in self.sidekicks:
+                self.sidekicks.remove(program)
+
+    def _watch(self) -> None:
+        if self.runtime_state != RuntimeState.PLAYING:
+            return
+        for name, watchdog in list(self.watchdogs.items()):
+            if (self.frame - watchdog.fed_at) * STEP_S > watchdog.period_s:
+                self.note(f"watchdog: {name} not written for {watchdog.period_s:.3f} s, {watchdog.action}")
+                if watchdog.action == "stop":
+                    self.stop_program()
+                    return
+                if watchdog.action == "pause":
+                    self.pause_program()
+                    return
+
+    def _move(self) -> None:
+        driven = (
+            self.runtime_state == RuntimeState.PLAYING
+            and self.program is not None
+            and self.program.owner is not None
+            and self.robot_mode == RobotMode.RUNNING
+            and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+        )
+        try:
+            self.arm.step(driven, self.speed_scaling)
+        except MotionRefused as refused:
+            self.protective_stop(str(refused))
+        if not driven and self.arm.at_rest:
+            if self.runtime_state == RuntimeState.STOPPING:
+                self.runtime_state = RuntimeState.STOPPED
+            elif self.runtime_state == RuntimeState.PAUSING:
+                self.runtime_state = RuntimeState.PAUSED
+
+    def state(self) -> dict[str, Any]:
+        """What a test may ask for, in JSON's own types."""
+        motion = self.arm.motion
+        return {
+            "frame": self.frame,
+            "timestamp": self.timestamp,
+            "q": self.arm.q.tolist(),
+            "qd": self.arm.qd.tolist(),
+            "q_target": self.arm.q_target.tolist(),
+            "qd_target": self.arm.qd_target.tolist(),
+            "tcp_pose": self.arm.tool_pose(),
+            "tcp_speed": self.arm.tool_speed(),
+            "tcp_offset": self.tcp_offset,
+            "payload_mass": self.payload.mass,
+            "robot_mode": self.robot_mode.name,
+            "safety_mode": self.safety_mode.name,
+            "runtime_state": self.runtime_state.name,
+            "remote": self.remote,
+            "speed_slider": self.terminals.speed_slider,
+            "program": self.program_name if self.program else None,
+            "programs_started": self.script_count,
+            "motion": type(motion).__name__ if motion is not None else None,
+            "command": self.inputs.integers[0],
+            "answer": self.outputs.integers[0],
+            "script_line": self.program.line if self.program else 0,
+            "watchdogs": sorted(self.watchdogs),
+        }

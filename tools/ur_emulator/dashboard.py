@@ -1,0 +1,152 @@
+"""The dashboard server on port 29999: one line in, one line out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from weldcal.tools.ur_emulator.controller import Controller
+from weldcal.tools.ur_emulator.modes import RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.ur_emulator.net import Connection, Server
+
+GREETING = "Connected: Universal Robots Dashboard Server"
+SERIAL = "20235500001"
+TOO_EARLY = (
+    "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking"
+)
+IDLE_PROGRAM = "def {name}():\n  while True:\n    sync()\n  end\nend\n"
+
+
+class DashboardServer(Server):
+    """Commands that a person or a client may give."""
+
+    kind = "dashboard"
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self._loaded: str | None = None
+        c = controller
+        v = c.version
+        self._fixed: dict[str, Callable[[], str]] = {
+            "polyscopeversion": lambda: f"URSoftware {v.major}.{v.minor}.{v.bugfix}.{v.build} (Jan 01 2025)",
+            "version": lambda: f"{v.major}.{v.minor}.{v.bugfix}.{v.build}",
+            "get serial number": lambda: SERIAL,
+            "get robot model": lambda: "UR10",
+            "is in remote control": lambda: str(c.remote).lower(),
+            "robotmode": lambda: f"Robotmode: {c.robot_mode.name}",
+            "safetymode": lambda: f"Safetymode: {c.safety_mode.name}",
+            "safetystatus": lambda: f"Safetystatus: {c.safety_mode.name}",
+            "running": lambda: f"Program running: {str(self._running()).lower()}",
+            "programstate": self._program_state,
+            "isprogramsaved": lambda: f"true {self._name()}",
+            "get loaded program": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
+            "get operational mode": lambda: "NONE",
+            "getloadedprogram": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
+            "stop": self._stop,
+            "play": self._play,
+            "pause": self._pause,
+            "unlock protective stop": self._unlock,
+            "power on": lambda: self._do(c.power_on, "Powering on"),
+            "power off": lambda: self._do(c.power_off, "Powering off"),
+            "brake release": lambda: self._do(c.release_brakes, "Brake releasing"),
+            "restart safety": self._restart_safety,
+            "close safety popup": lambda: "closing safety popup",
+            "close popup": lambda: "closing popup",
+            "savelog": lambda: "Log saved to disk",
+            "shutdown": lambda: "Shutting down",
+            "clear operational mode": lambda: "operational mode is no longer controlled by Dashboard Server",
+        }
+
+    def opened(self, connection: Connection, now: float) -> None:
+        connection.send(f"{GREETING}\n".encode(), now)
+
+    def arrived(self, connection: Connection, data: bytes, now: float) -> None:
+        connection.inbox += data
+        while b"\n" in connection.inbox:
+            line, _, rest = bytes(connection.inbox).partition(b"\n")
+            connection.inbox[:] = rest
+            text = line.decode("utf-8", "replace").strip()
+            connection.send(f"{self.answer(text)}\n".encode(), now)
+            if text.lower() in ("quit", "exit"):
+                connection.flush(now)
+                connection.close(reset=False)
+                return
+
+    def answer(self, command: str) -> str:
+        """The reply to one command, without its newline."""
+        lower = command.lower()
+        if lower in self._fixed:
+            return self._fixed[lower]()
+        word, _, argument = command.partition(" ")
+        match word.lower():
+            case "quit" | "exit":
+                return "Disconnected"
+            case "load":
+                return self._load(argument)
+            case "popup":
+                return "showing popup"
+            case "addtolog":
+                self._controller.note(f"dashboard: {argument}")
+                return "Added log message"
+            case "set":
+                return f"Setting operational mode: {argument.rpartition(' ')[2].upper()}"
+        return f"could not understand: '{command}'"
+
+    def _running(self) -> bool:
+        return self._controller.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING)
+
+    def _name(self) -> str:
+        return self._loaded or self._controller.program_name or "<unnamed>"
+
+    def _program_state(self) -> str:
+        state = self._controller.runtime_state
+        if state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
+            return f"PLAYING {self._name()}"
+        if state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+            return f"PAUSED {self._name()}"
+        return f"STOPPED {self._name()}"
+
+    def _do(self, action: Callable[[], None], reply: str) -> str:
+        if not self._controller.remote:
+            return f"Failed to execute: {reply.lower()}: the robot is in local mode"
+        action()
+        return reply
+
+    def _stop(self) -> str:
+        if not self._controller.remote:
+            return "Failed to execute: stop"
+        self._controller.stop_program()
+        return "Stopped"
+
+    def _play(self) -> str:
+        c = self._controller
+        if c.runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+            return "Starting program" if c.resume_program() else "Failed to execute: play"
+        if self._running():
+            return "Starting program"
+        ready = c.remote and self._loaded is not None
+        if ready and c.start(IDLE_PROGRAM.format(name=(self._loaded or "program").removesuffix(".urp"))):
+            return "Starting program"
+        return "Failed to execute: play"
+
+    def _pause(self) -> str:
+        if not self._controller.remote or self._controller.program is None:
+            return "Failed to execute: pause"
+        self._controller.pause_program()
+        return "Pausing program"
+
+    def _load(self, name: str) -> str:
+        if not name.endswith(".urp") or "missing" in name:
+            return f"File not found: {name}"
+        self._loaded = name
+        return f"Loading program: /programs/{name}, default.installation"
+
+    def _unlock(self) -> str:
+        return "Protective stop releasing" if self._controller.unlock_protective_stop() else TOO_EARLY
+
+    def _restart_safety(self) -> str:
+        c = self._controller
+        if c.safety_mode in (SafetyMode.VIOLATION, SafetyMode.FAULT, SafetyMode.RECOVERY):
+            c.stop_program()
+            c.set_safety_mode(SafetyMode.NORMAL)
+            c.robot_mode = RobotMode.POWER_OFF
+        return "Restarting safety"

@@ -1,0 +1,195 @@
+"""The emulator's process: every port, one loop, 500 frames a second."""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.tools.ur_emulator.checker import Checker
+from weldcal.tools.ur_emulator.control_channel import ControlServer, World
+from weldcal.tools.ur_emulator.controller import Controller
+from weldcal.tools.ur_emulator.dashboard import DashboardServer
+from weldcal.tools.ur_emulator.motions import STEP_S
+from weldcal.tools.ur_emulator.net import Network
+from weldcal.tools.ur_emulator.rtde_server import RtdeServer
+from weldcal.tools.ur_emulator.script_ports import PrimaryServer, RealTimeServer
+from weldcal.tools.ur_emulator.versions import parse_version
+
+CONTROL_PORT = 30090
+PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, DASHBOARD_PORT = 30001, 30002, 30003, 30004, 29999
+READY = "ready"
+# the elbow up, the tool down, away from every singularity
+HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)
+# beyond this the loop gives up on catching up and skips frames, and says so in its state
+LATE_S = 0.05
+
+
+def run_emulator(
+    *,
+    host: str = "127.0.0.1",
+    control_port: int = CONTROL_PORT,
+    polyscope: str = "5.21",
+    robot: str = "ur10e",
+    kinematics: Path | None = None,
+    q: tuple[float, ...] = HOME,
+    seed: int = 0,
+    parent: int | None = None,
+    ready: Callable[[str], None] | None = None,
+) -> None:
+    """Runs until it is told to quit, by signal or on the control channel, or until process `parent` is gone.
+
+    Args:
+        host: the loopback address to listen on.
+        control_port: port of the JSON-lines control channel.
+        polyscope: controller version, such as 5.12, 5.21 or 10.7.
+        robot: name of the arm.
+        kinematics: a robot's factory calibration; nominal where None.
+        q: joint angles at the start (rad).
+        seed: everything random follows from it.
+        parent: process whose end ends the emulator.
+        ready: called once with a sentence when every port listens.
+
+    Raises:
+        InputError: unknown arm or version, an address that is not loopback, or a port that is taken.
+    """
+    if not host.startswith("127."):
+        raise InputError(f"The emulator listens on loopback only; give an address 127.x.y.z, not {host}.")
+    if len(q) != 6:
+        raise InputError("Give six joint angles, in radians.")
+    controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
+    _Emulator(controller, host, control_port, seed).run(parent, ready)
+
+
+class _Emulator:
+    def __init__(self, controller: Controller, host: str, control_port: int, seed: int) -> None:
+        self._controller = controller
+        self._checker = Checker(controller)
+        self._world = World()
+        self._network = Network(host, seed)
+        self._rng = np.random.default_rng([seed, 1])
+        heard = self._checker.heard
+        self._rtde = RtdeServer(controller, lambda names, now: heard(now))
+        self._primary = PrimaryServer(controller, heard, primary=True)
+        secondary = PrimaryServer(controller, heard, primary=False)
+        real_time = RealTimeServer(controller, heard)
+        control = ControlServer(controller, self._network, self._rtde, self._checker, self._world)
+        self._servers = (self._rtde, self._primary, secondary, real_time)
+        ports = [(self._rtde, RTDE_PORT), (self._primary, PRIMARY_PORT), (secondary, SECONDARY_PORT)]
+        ports += [(real_time, REAL_TIME_PORT), (control, control_port)]
+        if controller.version.has_dashboard:
+            ports.append((DashboardServer(controller), DASHBOARD_PORT))
+        for server, port in ports:
+            try:
+                self._network.listen(server, port)
+            except OSError as error:
+                self._network.close()
+                raise InputError(
+                    f"Port {port} on {host} is taken ({error.strerror}); stop the other emulator or robot program."
+                ) from error
+        self._sentence = f"A UR controller answers on {host}; its control channel is port {control_port}."
+
+    def run(self, parent: int | None, ready: Callable[[str], None] | None) -> None:
+        def stop(*_: object) -> None:
+            self._world.quit = True
+
+        signal.signal(signal.SIGTERM, stop)
+        signal.signal(signal.SIGINT, stop)
+        if ready is not None:
+            ready(self._sentence)
+        gc.freeze()
+        try:
+            self._loop(parent)
+        finally:
+            self._network.close()
+
+    def _loop(self, parent: int | None) -> None:
+        clock = time.monotonic
+        world, network = self._world, self._network
+        deadline = clock() + STEP_S
+        while not world.quit:
+            now = clock()
+            if now < deadline:
+                network.poll(deadline - now, clock)
+                continue
+            if now < world.frozen_until:
+                time.sleep(min(world.frozen_until - now, 0.01))
+                deadline = clock()
+                continue
+            if now - deadline > LATE_S:
+                world.overruns += 1
+                deadline = now
+            self._frame(now)
+            deadline += STEP_S
+            if world.jitter_s > 0.0:
+                # frames come late by a random time, and the count of frames catches up
+                time.sleep(float(self._rng.uniform(0.0, world.jitter_s)))
+            elif now - deadline > 0.0:
+                network.poll(0.0, clock)
+            if parent is not None and self._controller.frame % 100 == 0 and not _alive(parent):
+                return
+
+    def _frame(self, now: float) -> None:
+        world, network, controller = self._world, self._network, self._controller
+        if world.unplugged_until is not None and now >= world.unplugged_until:
+            world.unplugged_until = None
+            network.plug()
+        controller.step()
+        self._checker.frame(now)
+        if world.unplugged_until is None:
+            for server in self._servers:
+                server.frame(now)
+            while controller.events:
+                self._primary.announce(controller.events.popleft(), now)
+        network.flush(now)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def main() -> None:
+    """Entry point of `python -m weldcal.tools.ur_emulator`."""
+    parser = argparse.ArgumentParser(prog="python -m weldcal.tools.ur_emulator", description=__doc__)
+    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
+    parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
+    parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
+    parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
+    parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
+    parser.add_argument("--seed", type=int, default=0, help="everything random follows from this number")
+    parser.add_argument("--parent", type=int, help="end when this process ends")
+    options = parser.parse_args()
+
+    def ready(sentence: str) -> None:
+        sys.stdout.write(f"{READY}: {sentence}\n")
+        sys.stdout.flush()
+
+    try:
+        run_emulator(
+            host=options.host,
+            control_port=options.control_port,
+            polyscope=options.polyscope,
+            kinematics=options.kinematics,
+            q=tuple(options.q),
+            seed=options.seed,
+            parent=options.parent,
+            ready=ready,
+        )
+    except WeldcalError as error:
+        sys.stderr.write(f"{error}\n")
+        sys.exit(1)

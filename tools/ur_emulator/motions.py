@@ -1,0 +1,274 @@
+"""How URScript's motions move the joints: each turns the state of the arm into the joint velocity of the next 2 ms.
+
+Marked [M] in docs/ur_emulator.md: profiles are trapezoids without jerk limit, blends are stops, servoj is a first-order
+chase, and the reaction to limits is a protective stop.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.tools.ur_emulator.poses import pose_error, rotation_matrix, rotation_vector
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.002
+# [M] where speedl gives up: smallest singular value of the tool's Jacobian (m and rad as they are)
+SINGULAR = 0.01
+REST_RAD_S = 1e-6
+
+
+class MotionRefused(Exception):
+    """The arm cannot follow: the controller answers with a protective stop; the text says why."""
+
+
+class ArmState(Protocol):
+    """What a motion reads."""
+
+    model: ArmModel
+    q_target: Array
+    qd_target: Array
+    p_FT: Array
+
+
+class Motion(Protocol):
+    """A motion under way."""
+
+    streamed: bool
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        """Joint velocity (6) rad/s for the next step; scaling is the speed slider."""
+
+    def braked(self, factor: float) -> None:
+        """The arm was slowed by `factor` instead, along its path."""
+
+    @property
+    def done(self) -> bool:
+        """The target is reached."""
+
+
+def limited(current: Array, wanted: Array, step: float, model: ArmModel) -> Array:
+    """`current` moved towards `wanted`: the leading joint by at most `step`, each joint by what its drive can do."""
+    change = wanted - current
+    largest = float(np.abs(change).max())
+    if largest > step:
+        change = change * (step / largest)
+    drive = model.acceleration_limit * STEP_S
+    return np.asarray(current + np.clip(change, -drive, drive), dtype=np.float64)
+
+
+class JointVelocity:
+    """speedj."""
+
+    streamed = True
+
+    def __init__(self, target: Array, acceleration: float) -> None:
+        self.target, self.acceleration = target, acceleration
+        self._reached = False
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        wanted = self.target * scaling
+        qd = limited(arm.qd_target, wanted, self.acceleration * STEP_S, arm.model)
+        self._reached = bool(np.abs(qd - wanted).max() < REST_RAD_S)
+        return qd
+
+    def braked(self, factor: float) -> None:
+        self._reached = False
+
+    @property
+    def done(self) -> bool:
+        return self._reached
+
+
+class ToolVelocity:
+    """speedl: the twist is commanded as [v; w] of the tool centre point in base axes, as URScript orders it."""
+
+    streamed = True
+
+    def __init__(self, target: Array, acceleration: float, angular: float, start: Array) -> None:
+        self.target, self._linear, self._angular = target, acceleration, angular
+        # kept as its own variable: the twist recomputed through the Jacobian never equals the target
+        self.twist = start.copy()
+        self._reached = False
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        wanted = self.target * scaling
+        change = wanted - self.twist
+        time = max(float(np.linalg.norm(change[:3])) / self._linear, float(np.linalg.norm(change[3:])) / self._angular)
+        self.twist = wanted.copy() if time <= STEP_S else self.twist + change * (STEP_S / time)
+        self._reached = time <= STEP_S
+        return joint_velocity(arm, self.twist)
+
+    def braked(self, factor: float) -> None:
+        self.twist = self.twist * factor
+        self._reached = False
+
+    @property
+    def done(self) -> bool:
+        return self._reached
+
+
+class Path:
+    """movej, movel: a trapezoid in the path's own length, along q(s) or along a pose in space."""
+
+    streamed = False
+
+    def __init__(self, joints: Callable[[float, Array], Array], length: float, speed: float, acceleration: float):
+        self._joints, self._length = joints, length
+        self._speed, self._acceleration = speed, acceleration
+        self._s, self._sdot = 0.0, 0.0
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        left = self._length - self._s
+        faster = self._sdot + self._acceleration * STEP_S
+        slower = self._sdot - self._acceleration * STEP_S
+        self._sdot = min(faster, max(self._speed * scaling, slower), math.sqrt(2.0 * self._acceleration * left))
+        if self._sdot * STEP_S >= left:
+            self._s, self._sdot = self._length, 0.0
+        else:
+            self._s += self._sdot * STEP_S
+        return self._towards(arm)
+
+    def braked(self, factor: float) -> None:
+        # the arm leaves its place on the path by nothing: the next step starts from the slower speed
+        self._sdot *= factor
+        self._s = min(self._length, self._s + self._sdot * STEP_S)
+
+    def _towards(self, arm: ArmState) -> Array:
+        return np.asarray((self._joints(self._s, arm.q_target) - arm.q_target) / STEP_S, dtype=np.float64)
+
+    @property
+    def done(self) -> bool:
+        return self._s >= self._length
+
+
+class Servo:
+    """servoj: a first-order chase of the newest joint target with the look-ahead as time constant [M]."""
+
+    streamed = True
+
+    def __init__(self, goal: Array, lookahead: float) -> None:
+        self._goal, self._lookahead = goal, lookahead
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        limit = arm.model.velocity_limit * scaling
+        wanted = np.clip((self._goal - arm.q_target) / self._lookahead, -limit, limit)
+        return limited(arm.qd_target, wanted, math.inf, arm.model)
+
+    def braked(self, factor: float) -> None:
+        return
+
+    @property
+    def done(self) -> bool:
+        return False
+
+
+class Stop:
+    """stopj, and stopl where the arm can hold its line: every joint slows by the same share."""
+
+    streamed = False
+
+    def __init__(self, deceleration: float, twist: Array | None = None) -> None:
+        self._deceleration, self._twist = deceleration, twist
+        self._share = 1.0
+        self._done = False
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        if self._twist is not None and (speed := float(np.abs(self._twist).max())) > 0.0:
+            norm = float(np.linalg.norm(self._twist[:3])) or speed
+            self._share = max(0.0, self._share - self._deceleration * STEP_S / norm)
+            qd = joint_velocity(arm, self._twist * self._share)
+        else:
+            qd = slowed(arm.qd_target, self._deceleration)
+        self._done = bool(np.abs(qd).max() < REST_RAD_S)
+        return qd
+
+    def braked(self, factor: float) -> None:
+        self._share *= factor
+        self._done = factor == 0.0
+
+    @property
+    def done(self) -> bool:
+        return self._done
+
+
+def slowed(qd: Array, deceleration: float) -> Array:
+    """qd with its leading joint slowed by `deceleration` (rad/s^2) over one step, the direction kept."""
+    speed = float(np.abs(qd).max())
+    if speed <= deceleration * STEP_S:
+        return np.zeros(6)
+    return qd * (1.0 - deceleration * STEP_S / speed)
+
+
+def tool_jacobian(arm: ArmState) -> Array:
+    """J (6, 6) of the tool centre point, [v; w] = J qd, in URScript's order."""
+    J = kinematics_and_jacobian(arm.model, arm.q_target, arm.p_FT)[2]
+    return np.concatenate([J[3:], J[:3]])
+
+
+def joint_velocity(arm: ArmState, twist: Array) -> Array:
+    """Joint velocity of a tool twist [v; w].
+
+    Raises:
+        MotionRefused: the arm is near a singularity.
+    """
+    if not twist.any():
+        return np.zeros(6)
+    J = tool_jacobian(arm)
+    if float(np.linalg.svd(J, compute_uv=False)[-1]) < SINGULAR:
+        raise MotionRefused("the arm is near a singularity")
+    return np.asarray(np.linalg.solve(J, twist), dtype=np.float64)
+
+
+def joint_path(q_from: Array, q_to: Array, speed: float, acceleration: float, limit: Array) -> Path | None:
+    """movej's path, its speed that of the leading joint; None where there is nothing to move."""
+    change = q_to - q_from
+    length = float(np.abs(change).max())
+    if length < 1e-9:
+        return None
+    direction = change / length
+    # [M] movej never asks a joint for more than it can do
+    speed = min(speed, float((limit / np.maximum(np.abs(direction), 1e-9)).min()))
+    return Path(lambda s, _: q_to if s >= length else q_from + direction * s, length, speed, acceleration)
+
+
+def tool_path(model: ArmModel, X_from: Array, X_to: Array, speed: float, acceleration: float) -> Path | None:
+    """movel's path of the flange poses (4, 4), its speed that of the translation, or of the turn where that is all."""
+    step = X_to[:3, 3] - X_from[:3, 3]
+    turn = rotation_vector(X_to[:3, :3] @ X_from[:3, :3].T)
+    distance, angle = float(np.linalg.norm(step)), float(np.linalg.norm(turn))
+    length = distance if distance > 1e-6 else angle
+    if length < 1e-9:
+        return None
+
+    def joints(s: float, q_near: Array) -> Array:
+        X = np.eye(4)
+        X[:3, :3] = rotation_matrix(turn * (s / length)) @ X_from[:3, :3]
+        X[:3, 3] = X_from[:3, 3] + step * (s / length)
+        q = newton(model, X, q_near)
+        if q is None:
+            raise MotionRefused("the straight line leaves the arm's reach")
+        return q
+
+    return Path(joints, length, speed, acceleration)
+
+
+def newton(model: ArmModel, X_goal: Array, q_near: Array, steps: int = 12) -> Array | None:
+    """Joint angles near q_near that put the flange at X_goal (4, 4) within 1e-9 m and rad, or None."""
+    q = np.array(q_near, dtype=np.float64)
+    for _ in range(steps):
+        R, p, J = kinematics_and_jacobian(model, q)
+        error = pose_error(X_goal, R, p)
+        if float(np.abs(error).max()) < 1e-10:
+            return q
+        # a little damping keeps the step finite at a singularity
+        change = J.T @ np.linalg.solve(J @ J.T + 1e-10 * np.eye(6), error)
+        largest = float(np.abs(change).max())
+        q += change if largest < 0.3 else change * (0.3 / largest)
+    return None

@@ -1,0 +1,243 @@
+"""Sockets of the emulator: one loop, many connections, and the faults that a network can have, one connection at a time."""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import socket
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+# A client that does not read is dropped after this long, as the controller does.
+UNREAD_LIMIT_S = 10.0
+MAX_QUEUED = 1 << 20
+
+
+@dataclass
+class LinkFaults:
+    """What is wrong with one connection; times are on the host's monotonic clock (s)."""
+
+    drop_until: float = 0.0
+    drop_share: float = 0.0
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    delay_until: float = 0.0
+    freeze_until: float = 0.0
+    deaf_until: float = 0.0
+    corrupt: int = 0
+    wrong_size: int = 0
+    piece: int = 0
+    half_open: bool = False
+
+
+class Connection:
+    """One accepted socket: bytes in, whole packages out."""
+
+    def __init__(self, kind: str, sock: socket.socket, rng: np.random.Generator) -> None:
+        self.kind = kind
+        self.sock = sock
+        self.faults = LinkFaults()
+        self.inbox = bytearray()
+        self.closed = False
+        self.patient = False  # never dropped for not reading
+        self._rng = rng
+        self._waiting: deque[tuple[float, bytes]] = deque()
+        self._outbox = bytearray()
+        self._stuck_since: float | None = None
+
+    def send(self, package: bytes, now: float, *, droppable: bool = False) -> None:
+        """Queues a package; one that is droppable is left out where the client does not read, and by the faults."""
+        faults = self.faults
+        if faults.half_open or self.closed:
+            return
+        if droppable:
+            if now < faults.drop_until or (faults.drop_share > 0.0 and self._rng.random() < faults.drop_share):
+                return
+            if self._outbox and self._stuck_since is not None:
+                return
+        if faults.corrupt > 0 and len(package) > 3:
+            faults.corrupt -= 1
+            spoiled = bytearray(package)
+            spoiled[int(self._rng.integers(3, len(package)))] ^= 0xFF
+            package = bytes(spoiled)
+        if faults.wrong_size > 0 and len(package) > 3:
+            faults.wrong_size -= 1
+            package = struct.pack(">H", len(package) + 5) + package[2:]
+        due = now
+        if now < faults.delay_until:
+            due = now + faults.delay_s + (self._rng.uniform(0.0, faults.jitter_s) if faults.jitter_s else 0.0)
+        if self._waiting or due > now:
+            # packages keep their order, whatever the jitter
+            self._waiting.append((max(due, self._waiting[-1][0]) if self._waiting else due, package))
+        else:
+            self._outbox += package
+
+    @property
+    def unread(self) -> bool:
+        """The client does not read: its socket is full."""
+        return self._stuck_since is not None
+
+    def flush(self, now: float) -> None:
+        """Writes what is due and what fits."""
+        while self._waiting and self._waiting[0][0] <= now:
+            self._outbox += self._waiting.popleft()[1]
+        if not self._outbox or self.closed or self.faults.half_open or now < self.faults.freeze_until:
+            return
+        piece = self.faults.piece
+        try:
+            sent = self.sock.send(self._outbox[:piece] if piece else self._outbox)
+        except (BlockingIOError, InterruptedError):
+            sent = 0
+        except OSError:
+            self.closed = True
+            return
+        del self._outbox[:sent]
+        if not self._outbox or piece:
+            self._stuck_since = None
+        elif self._stuck_since is None:
+            self._stuck_since = now
+        elif (now - self._stuck_since > UNREAD_LIMIT_S and not self.patient) or len(self._outbox) > MAX_QUEUED:
+            self.close(reset=True)
+
+    def receive(self, now: float) -> bytes:
+        """What has arrived; empty where there is nothing, or where a fault keeps us from reading."""
+        try:
+            data = self.sock.recv(65536)
+        except (BlockingIOError, InterruptedError):
+            return b""
+        except OSError:
+            self.closed = True
+            return b""
+        if not data:
+            self.closed = True
+        return b"" if now < self.faults.deaf_until else data
+
+    def readable(self, now: float) -> bool:
+        """Whether the loop should look at this socket."""
+        return not (self.closed or self.faults.half_open or now < self.faults.freeze_until)
+
+    def close(self, *, reset: bool) -> None:
+        """RST or FIN."""
+        if reset:
+            with contextlib.suppress(OSError):
+                self.sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        with contextlib.suppress(OSError):
+            self.sock.close()
+        self.closed = True
+
+
+class Server:
+    """The protocol of one port."""
+
+    kind = ""
+
+    def opened(self, connection: Connection, now: float) -> None:
+        """A client has come."""
+
+    def arrived(self, connection: Connection, data: bytes, now: float) -> None:
+        """Bytes from a client."""
+
+    def gone(self, connection: Connection) -> None:
+        """A client has left."""
+
+    def frame(self, now: float) -> None:
+        """A control frame is over."""
+
+
+class Network:
+    """Listeners and connections of all servers."""
+
+    def __init__(self, host: str, seed: int) -> None:
+        self._host = host
+        self._rng = np.random.default_rng(seed)
+        self._listeners: dict[socket.socket, tuple[Server, int]] = {}
+        self._ports: list[tuple[Server, int]] = []
+        self.connections: dict[Connection, Server] = {}
+
+    def listen(self, server: Server, port: int) -> None:
+        """Raises OSError where the port is taken."""
+        sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            sock.bind((self._host, port))
+        except OSError:
+            sock.close()
+            raise
+        sock.listen(16)
+        sock.setblocking(False)
+        self._listeners[sock] = (server, port)
+
+    def unplug(self, *kept: Server) -> None:
+        """Closes every listener and resets every connection but those of the servers named, as a reboot does."""
+        for sock, (server, port) in list(self._listeners.items()):
+            if server not in kept:
+                sock.close()
+                del self._listeners[sock]
+                self._ports.append((server, port))
+        for connection, server in self.connections.items():
+            if server not in kept:
+                connection.close(reset=True)
+
+    def plug(self) -> None:
+        """Listens again where `unplug` stopped."""
+        ports, self._ports = self._ports, []
+        for server, port in ports:
+            self.listen(server, port)
+
+    def poll(self, timeout_s: float, clock: Callable[[], float]) -> None:
+        """Reads what there is, waiting at most timeout_s for the first byte."""
+        now = clock()
+        by_socket = {c.sock: c for c in self.connections if c.readable(now)}
+        ready, _, _ = select.select([*self._listeners, *by_socket], [], [], max(0.0, timeout_s))
+        now = clock()
+        for sock in ready:
+            if sock in self._listeners:
+                self._accept(sock, now)
+                continue
+            connection = by_socket[sock]
+            data = connection.receive(now)
+            if connection.closed:
+                # at once: what this client has claimed is free for one that has just come
+                self._forget(connection)
+            if data:
+                self.connections[connection].arrived(connection, data, now)
+                connection.flush(now)
+
+    def _accept(self, listener: socket.socket, now: float) -> None:
+        server, _ = self._listeners[listener]
+        try:
+            sock, _ = listener.accept()
+        except OSError:
+            return
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection = Connection(server.kind, sock, self._rng)
+        self.connections[connection] = server
+        server.opened(connection, now)
+        connection.flush(now)
+
+    def flush(self, now: float) -> None:
+        """Writes what is due and forgets who has left."""
+        for connection in list(self.connections):
+            connection.flush(now)
+            if connection.closed:
+                self._forget(connection)
+
+    def _forget(self, connection: Connection) -> None:
+        self.connections.pop(connection).gone(connection)
+        connection.close(reset=False)
+
+    def of_kind(self, kind: str) -> list[Connection]:
+        """Connections of one protocol, or all but the control channel's for "all"."""
+        return [c for c in self.connections if c.kind == kind or (kind == "all" and c.kind != "control")]
+
+    def close(self) -> None:
+        """Closes everything."""
+        for sock in self._listeners:
+            sock.close()
+        for connection in self.connections:
+            connection.close(reset=False)

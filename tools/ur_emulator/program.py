@@ -1,0 +1,169 @@
+"""One running URScript program: its threads, one slice each per frame, and who of them moves the arm."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from weldcal.tools.ur_emulator.script_compiler import SOURCE_NAME, Halted, Hooks, Slices, compile_program
+from weldcal.tools.ur_emulator.script_parser import parse_program
+from weldcal.tools.ur_emulator.script_syntax import ScriptError
+
+# How often a loop may turn within one 2 ms slice without giving it up; the real limit is time, this one repeats.
+LOOP_LIMIT = 4000
+
+
+@dataclass
+class Thread:
+    """One thread of the script."""
+
+    number: int
+    name: str
+    slices: Slices
+
+
+class Program:
+    """A compiled program and its threads; `step` runs one frame.
+
+    Args:
+        source: the text of one program.
+        builtins: the controller's functions by their URScript name, made for this program.
+        blocking: names of those that are generators and may take more than one frame.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        builtins: Callable[[Program], tuple[Mapping[str, Callable[..., Any]], Iterable[str]]],
+    ) -> None:
+        self.source = source
+        self.current: Thread | None = None
+        self.owner: Thread | None = None
+        self._threads: dict[int, Thread] = {}
+        self._critical: Thread | None = None
+        self._loops = 0
+        self._count = 0
+        functions, blocking = builtins(self)
+        hooks = Hooks(self._loop, self._run, self._kill, self._alive, self._enter, self._leave)
+        try:
+            self._compiled = compile_program(parse_program(source), functions, blocking, hooks)
+        except RecursionError:
+            raise ScriptError("The script is nested too deeply.") from None
+        self.name = self._compiled.name
+        self.kind = self._compiled.kind
+        self._main = self._run(self._compiled.main(), "main")
+
+    @property
+    def finished(self) -> bool:
+        """The main body has ended; the real controller then ends the other threads, and so do we."""
+        return self._main not in self._threads
+
+    @property
+    def line(self) -> int:
+        """The URScript line at which the main body stands."""
+        thread = self._threads.get(self._main)
+        frame = getattr(thread.slices, "gi_frame", None) if thread else None
+        return self._script_line(frame.f_lineno) if frame is not None else 0
+
+    def step(self) -> None:
+        """One slice of every thread, the main body first.
+
+        Raises:
+            ScriptError: the script made a mistake, with its line.
+        """
+        for thread in list(self._threads.values()):
+            self._slice(thread)
+            if self.finished:
+                break
+
+    def close(self) -> None:
+        """Ends every thread, which gives the arm back."""
+        for thread in list(self._threads.values()):
+            self._end(thread)
+
+    def claim(self) -> Thread:
+        """The current thread takes the arm.
+
+        Raises:
+            ScriptError: another thread has it.
+        """
+        assert self.current is not None
+        if self.owner is not None and self.owner is not self.current:
+            raise ScriptError("Another thread is already controlling the robot")
+        self.owner = self.current
+        return self.current
+
+    def release(self, thread: Thread) -> None:
+        """Gives the arm back."""
+        if self.owner is thread:
+            self.owner = None
+
+    def _slice(self, thread: Thread) -> None:
+        if thread.number not in self._threads or (self._critical is not None and self._critical is not thread):
+            return
+        self.current, self._loops = thread, 0
+        try:
+            next(thread.slices)
+        except StopIteration:
+            self._end(thread)
+        except Halted:
+            self.close()
+        except ScriptError as error:
+            raise self._located(error) from error
+        except RecursionError as error:
+            raise self._located(ScriptError("The script calls itself too deeply."), error) from error
+        except (NameError, TypeError, ValueError, OverflowError) as error:
+            raise self._located(ScriptError(_plain(error)), error) from error
+        finally:
+            self.current = None
+
+    def _located(self, error: ScriptError, cause: BaseException | None = None) -> ScriptError:
+        frames = [f for f in traceback.extract_tb((cause or error).__traceback__) if f.filename == SOURCE_NAME]
+        line = self._script_line(frames[-1].lineno or 0) if frames else error.line
+        return ScriptError(str(error), line)
+
+    def _script_line(self, generated: int) -> int:
+        lines = self._compiled.lines
+        return lines[generated - 1] if 0 < generated <= len(lines) else 0
+
+    def _end(self, thread: Thread) -> None:
+        self._threads.pop(thread.number, None)
+        if self._critical is thread:
+            self._critical = None
+        if thread is not self.current:
+            thread.slices.close()
+        self.release(thread)
+
+    def _loop(self) -> None:
+        self._loops += 1
+        if self._loops > LOOP_LIMIT:
+            raise ScriptError("Runtime is too much behind: a loop takes no time; add sync() to it.")
+
+    def _run(self, slices: Slices, name: str) -> int:
+        self._count += 1
+        self._threads[self._count] = Thread(self._count, name, slices)
+        return self._count
+
+    def _kill(self, number: Any) -> None:
+        thread = self._threads.get(number)
+        if thread is not None and thread is self.current:
+            raise ScriptError("A thread cannot kill itself.")
+        if thread is not None:
+            self._end(thread)
+
+    def _alive(self, number: Any) -> bool:
+        return number in self._threads
+
+    def _enter(self) -> None:
+        self._critical = self.current
+
+    def _leave(self) -> None:
+        self._critical = None
+
+
+def _plain(error: BaseException) -> str:
+    if isinstance(error, NameError):
+        return f"A variable is read before it is set: {str(getattr(error, 'name', '') or '').removeprefix('v_')}"
+    return f"Wrong arguments: {str(error).replace('b_', '').replace('v_', '')}"

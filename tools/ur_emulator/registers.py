@@ -1,0 +1,68 @@
+"""Registers and terminals: what RTDE inputs write and scripts read, and the other way round. Values outlive programs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from weldcal.tools.ur_emulator.script_syntax import ScriptError
+
+N_NUMBERS = 48
+N_BITS = 128
+
+
+class Registers:
+    """General purpose registers of one direction."""
+
+    def __init__(self) -> None:
+        self.integers = [0] * N_NUMBERS
+        self.doubles = [0.0] * N_NUMBERS
+        self.bits = [False] * N_BITS
+
+    def word(self, first: int) -> int:
+        """32 bits from `first` as one number."""
+        return sum(1 << i for i in range(32) if self.bits[first + i])
+
+    def set_word(self, first: int, value: int) -> None:
+        """32 bits from `first` out of one number."""
+        for i in range(32):
+            self.bits[first + i] = bool(value >> i & 1)
+
+
+@dataclass
+class Watchdog:
+    """rtde_set_watchdog: an input that must be written again within `period_s`, counted from frame `fed_at`."""
+
+    period_s: float
+    action: str
+    fed_at: int
+
+
+@dataclass
+class Payload:
+    """What the arm carries (kg, m, kg m^2)."""
+
+    mass: float
+    center: list[float]
+    inertia: list[float]
+
+
+class Terminals:
+    """Digital and analog terminals and the speed slider."""
+
+    def __init__(self) -> None:
+        self.digital_inputs = 0
+        self.digital_outputs = 0
+        self.analog_outputs = [0.0, 0.0]
+        self.analog_output_types = 0
+        self.speed_slider = 1.0
+
+    def set_digital(self, first: int, mask: int, value: int) -> None:
+        """Sets the outputs that `mask` names, counted from `first` (0 standard, 8 configurable, 16 tool)."""
+        self.digital_outputs = self.digital_outputs & ~(mask << first) | (value & mask) << first
+
+
+def register_index(index: object, count: int) -> int:
+    """Raises ScriptError where a script names a register that is not there."""
+    if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < count:
+        raise ScriptError(f"There is no register {index!r}; they run from 0 to {count - 1}.")
+    return index

@@ -1,0 +1,255 @@
+"""URScript's functions that answer at once, by their own names: registers, states, kinematics, poses."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.errors import InputError
+from weldcal.tools.ur_emulator.motions import STEP_S, newton
+from weldcal.tools.ur_emulator.poses import inverse, matrix, pose_of
+from weldcal.tools.ur_emulator.registers import N_BITS, N_NUMBERS, Watchdog, register_index
+from weldcal.tools.ur_emulator.script_compiler import Pose
+from weldcal.tools.ur_emulator.script_syntax import ScriptError
+
+if TYPE_CHECKING:
+    from weldcal.tools.ur_emulator.controller import Controller
+    from weldcal.tools.ur_emulator.program import Program
+
+Array = NDArray[np.float64]
+
+
+def six(values: Any, what: str) -> Array:
+    """Six finite numbers out of a script; raises ScriptError where they are not."""
+    if not isinstance(values, list) or len(values) != 6:
+        raise ScriptError(f"{what} needs six numbers, it got {values!r}.")
+    array = np.array(values, dtype=np.float64)
+    if not np.isfinite(array).all():
+        raise ScriptError(f"{what} got a number that is not finite.")
+    return array
+
+
+def positive(value: Any, what: str) -> float:
+    """A positive finite number out of a script; raises ScriptError where it is not."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0.0:
+        raise ScriptError(f"{what} must be a positive number, it is {value!r}.")
+    return float(value)
+
+
+class Answers:
+    """Functions that answer at once."""
+
+    def __init__(self, controller: Controller, program: Program) -> None:
+        self._controller = controller
+        self._program = program
+
+    def read_input_integer_register(self, index: int) -> int:
+        return self._controller.inputs.integers[register_index(index, N_NUMBERS)]
+
+    def read_input_float_register(self, index: int) -> float:
+        return self._controller.inputs.doubles[register_index(index, N_NUMBERS)]
+
+    def read_input_boolean_register(self, index: int) -> bool:
+        return self._controller.inputs.bits[register_index(index, N_BITS)]
+
+    def read_output_integer_register(self, index: int) -> int:
+        return self._controller.outputs.integers[register_index(index, N_NUMBERS)]
+
+    def read_output_float_register(self, index: int) -> float:
+        return self._controller.outputs.doubles[register_index(index, N_NUMBERS)]
+
+    def read_output_boolean_register(self, index: int) -> bool:
+        return self._controller.outputs.bits[register_index(index, N_BITS)]
+
+    def write_output_integer_register(self, index: int, value: int) -> None:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not -(2**31) <= value < 2**31:
+            raise ScriptError(f"An integer register cannot hold {value!r}.")
+        self._controller.outputs.integers[register_index(index, N_NUMBERS)] = int(value)
+
+    def write_output_float_register(self, index: int, value: float) -> None:
+        self._controller.outputs.doubles[register_index(index, N_NUMBERS)] = float(value)
+
+    def write_output_boolean_register(self, index: int, value: bool) -> None:
+        self._controller.outputs.bits[register_index(index, N_BITS)] = bool(value)
+
+    def rtde_set_watchdog(self, variable: str, min_frequency: float, action: str = "pause") -> None:
+        if action not in ("ignore", "pause", "stop"):
+            raise ScriptError(f"rtde_set_watchdog knows ignore, pause and stop, not {action!r}.")
+        if action == "ignore":
+            self._controller.watchdogs.pop(variable, None)
+            return
+        period = 1.0 / positive(min_frequency, "The frequency of a watchdog")
+        self._controller.watchdogs[variable] = Watchdog(period, action, self._controller.frame)
+
+    def get_steptime(self) -> float:
+        return STEP_S
+
+    def get_actual_joint_positions(self) -> list[float]:
+        return list(self._controller.arm.q.tolist())
+
+    def get_target_joint_positions(self) -> list[float]:
+        return list(self._controller.arm.q_target.tolist())
+
+    def get_actual_joint_speeds(self) -> list[float]:
+        return list(self._controller.arm.qd.tolist())
+
+    def get_target_joint_speeds(self) -> list[float]:
+        return list(self._controller.arm.qd_target.tolist())
+
+    def get_actual_joint_positions_history(self, steps: int = 0) -> list[float]:
+        history = self._controller.arm.history
+        return list((history[-1 - min(int(steps), len(history) - 1)] if history else self._controller.arm.q).tolist())
+
+    def get_actual_tcp_pose(self) -> Pose:
+        return Pose(self._controller.arm.tool_pose())
+
+    def get_target_tcp_pose(self) -> Pose:
+        return Pose(self._controller.arm.tool_pose(target=True))
+
+    def get_actual_tcp_speed(self) -> list[float]:
+        return list(self._controller.arm.tool_speed())
+
+    def get_target_tcp_speed(self) -> list[float]:
+        return list(self._controller.arm.tool_speed(target=True))
+
+    def get_actual_tool_flange_pose(self) -> Pose:
+        return Pose(pose_of(self._controller.arm.flange(self._controller.arm.q)))
+
+    def get_target_waypoint(self) -> Pose:
+        return self.get_target_tcp_pose()
+
+    def get_tcp_force(self) -> list[float]:
+        return [0.0] * 6
+
+    def get_joint_torques(self) -> list[float]:
+        return [0.0] * 6
+
+    def set_tcp(self, pose: Any) -> None:
+        self._controller.set_tcp(six(pose, "set_tcp").tolist())
+
+    def get_tcp_offset(self) -> Pose:
+        return Pose(self._controller.tcp_offset)
+
+    def set_payload(self, m: float, cog: Any = None) -> None:
+        self._controller.payload.mass = float(m)
+        if cog is not None:
+            self._controller.payload.center = [float(value) for value in cog]
+
+    def set_target_payload(self, m: float, cog: Any, inertia: Any = None, transition_time: float = 0.0) -> None:
+        self.set_payload(m, cog)
+        if inertia is not None:
+            self._controller.payload.inertia = [float(value) for value in inertia]
+
+    def get_target_payload(self) -> float:
+        return self._controller.payload.mass
+
+    def get_target_payload_cog(self) -> list[float]:
+        return list(self._controller.payload.center)
+
+    def get_target_payload_inertia(self) -> list[float]:
+        return list(self._controller.payload.inertia)
+
+    def get_forward_kin(self, q: Any = None, tcp: Any = None) -> Pose:
+        arm = self._controller.arm
+        X_FT = arm.X_FT if tcp is None else matrix(six(tcp, "get_forward_kin").tolist())
+        return Pose(pose_of(arm.flange(arm.q if q is None else six(q, "get_forward_kin")) @ X_FT))
+
+    def get_inverse_kin(
+        self, x: Any, qnear: Any = None, maxPositionError: float = 1e-10, maxOrientationError: float = 1e-10
+    ) -> list[float]:
+        q = self._inverse(x, qnear)
+        if q is None:
+            raise ScriptError("get_inverse_kin: the pose is out of reach.")
+        return list(q.tolist())
+
+    def get_inverse_kin_has_solution(
+        self, x: Any, qnear: Any = None, maxPositionError: float = 1e-10, maxOrientationError: float = 1e-10
+    ) -> bool:
+        return self._inverse(x, qnear) is not None
+
+    def _inverse(self, pose: Any, q_near: Any) -> Array | None:
+        arm = self._controller.arm
+        X = arm.flange_goal(six(pose, "A pose").tolist())
+        near = arm.q_target if q_near is None else six(q_near, "qnear")
+        found = newton(arm.model, X, near)
+        if found is not None and float(np.abs(found - near).max()) < 1.0:
+            return found
+        try:
+            R = RotationMatrix.ProjectToRotationMatrix(X[:3, :3])[0]
+            return nearest_solution(arm.model, RigidTransform(R, X[:3, 3]), near)
+        except InputError as error:
+            raise ScriptError(str(error)) from error
+
+    def pose_trans(self, p_from: Any, p_from_to: Any) -> Pose:
+        return Pose(pose_of(matrix(p_from) @ matrix(p_from_to)))
+
+    def pose_inv(self, p_from: Any) -> Pose:
+        return Pose(pose_of(inverse(matrix(p_from))))
+
+    def pose_add(self, p_1: Any, p_2: Any) -> Pose:
+        X, Y = matrix(p_1), matrix(p_2)
+        X[:3, :3] = X[:3, :3] @ Y[:3, :3]
+        X[:3, 3] += Y[:3, 3]
+        return Pose(pose_of(X))
+
+    def pose_sub(self, p_to: Any, p_from: Any) -> Pose:
+        X, Y = matrix(p_to), matrix(p_from)
+        X[:3, :3] = X[:3, :3] @ Y[:3, :3].T
+        X[:3, 3] -= Y[:3, 3]
+        return Pose(pose_of(X))
+
+    def pose_dist(self, pose_from: Any, pose_to: Any) -> float:
+        return math.dist(pose_from[:3], pose_to[:3])
+
+    def point_dist(self, p_from: Any, p_to: Any) -> float:
+        return math.dist(p_from[:3], p_to[:3])
+
+    def is_steady(self) -> bool:
+        return self._controller.arm.at_rest
+
+    def is_within_safety_limits(self, pose: Any) -> bool:
+        if isinstance(pose, Pose):
+            return self._inverse(pose, None) is not None
+        q, model = six(pose, "is_within_safety_limits"), self._controller.arm.model
+        return bool((q >= model.position_lower).all() and (q <= model.position_upper).all())
+
+    def tool_contact(self, direction: Any = None) -> int:
+        return self._controller.tool_contact_steps
+
+    def set_standard_digital_out(self, n: int, b: bool) -> None:
+        self._controller.terminals.set_digital(0, 1 << register_index(n, 8), (1 if b else 0) << n)
+
+    def set_digital_out(self, n: int, b: bool) -> None:
+        self.set_standard_digital_out(n, b)
+
+    def get_standard_digital_in(self, n: int) -> bool:
+        return bool(self._controller.terminals.digital_inputs >> register_index(n, 8) & 1)
+
+    def norm(self, a: Any) -> float:
+        return math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a))
+
+    def length(self, v: Any) -> int:
+        return len(v)
+
+    def integer_to_binary_list(self, x: int, l: int = 32) -> list[bool]:  # noqa: E741  (URScript's own name)
+        return [bool(x >> i & 1) for i in range(l)]
+
+    def d2r(self, d: float) -> float:
+        return math.radians(d)
+
+    def r2d(self, r: float) -> float:
+        return math.degrees(r)
+
+    def pow(self, base: float, exponent: float) -> float:
+        return float(base**exponent)
+
+    def to_str(self, val: Any) -> str:
+        return str(val)
+
+    def textmsg(self, s1: Any, s2: Any = "") -> None:
+        self._controller.note(f"script: {s1}{s2}")

@@ -1,0 +1,302 @@
+"""A URScript tree into Python generator functions: every routine yields where its slice of the 2 ms frame is over.
+
+Variables assigned in the main body or declared global are global, all others belong to their routine. URScript names
+are prefixed (v_, f_, b_), since scripts call variables `async` or `time`. Assignment copies lists.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from weldcal.tools.ur_emulator.script_syntax import (
+    Assign,
+    Call,
+    Command,
+    Conditional,
+    Evaluate,
+    Expression,
+    Index,
+    Items,
+    Literal,
+    Loop,
+    Name,
+    Operation,
+    Routine,
+    ScriptError,
+    Statement,
+)
+
+SOURCE_NAME = "<urscript>"
+Slices = Generator[None, None, Any]
+
+
+class Pose(list[float]):
+    """p[x, y, z, rx, ry, rz]: metres and a rotation vector in radians."""
+
+
+class Halted(Exception):  # the script's own `halt`, not an error
+    """The script ended itself."""
+
+
+@dataclass(frozen=True)
+class Compiled:
+    """The main generator function, the routines that `run` may start, and the URScript line of each generated line."""
+
+    name: str
+    kind: str
+    main: Callable[[], Slices]
+    lines: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """What compiled code calls back: one step of a loop, start, kill and join of a thread, critical sections."""
+
+    loop: Callable[[], None]
+    run: Callable[[Slices, str], int]
+    kill: Callable[[Any], None]
+    alive: Callable[[Any], bool]
+    enter: Callable[[], None]
+    leave: Callable[[], None]
+
+
+def compile_program(
+    routine: Routine, builtins: Mapping[str, Callable[..., Any]], blocking: Iterable[str], hooks: Hooks
+) -> Compiled:
+    """Raises ScriptError where a name is called that neither the script nor the controller defines."""
+    emitter = _Emitter(routine, frozenset(builtins), frozenset(blocking))
+    emitter.program()
+    namespace: dict[str, Any] = {f"b_{name}": function for name, function in builtins.items()}
+    namespace |= {
+        "Pose": Pose,
+        "Halted": Halted,
+        "copied": _copied,
+        "item": _item,
+        "place": _place,
+        "truth": _truth,
+        "number": _number,
+        "divided": _divided,
+        "loop": hooks.loop,
+        "start": hooks.run,
+        "kill": hooks.kill,
+        "alive": hooks.alive,
+        "enter": hooks.enter,
+        "leave": hooks.leave,
+    }
+    exec(compile("\n".join(emitter.text), SOURCE_NAME, "exec"), namespace)
+    return Compiled(routine.name, routine.kind, namespace["main"], tuple(emitter.lines))
+
+
+class _Emitter:
+    def __init__(self, routine: Routine, builtins: frozenset[str], blocking: frozenset[str]) -> None:
+        self._routine = routine
+        self._builtins = builtins
+        self._blocking = blocking
+        self._routines: dict[str, Routine] = {}
+        self._collect(routine.inner)
+        self._globals = _assigned(routine.body) | _declared(routine.body)
+        for inner in self._routines.values():
+            self._globals |= _declared(inner.body)
+        self.text: list[str] = []
+        self.lines: list[int] = []
+        self._line = routine.line
+
+    def _collect(self, routines: tuple[Routine, ...]) -> None:
+        for inner in routines:
+            self._routines[inner.name] = inner
+            self._collect(inner.inner)
+
+    def emit(self, depth: int, text: str) -> None:
+        self.text.append("    " * depth + text)
+        self.lines.append(self._line)
+
+    def program(self) -> None:
+        for inner in self._routines.values():
+            self._function(inner)
+        self._line = self._routine.line
+        self.emit(0, "def main():")
+        self._scope(self._globals)
+        self._body(self._routine.body, 1)
+
+    def _function(self, routine: Routine) -> None:
+        self._line = routine.line
+        parameters = [
+            f"v_{name}" if default is None else f"v_{name}={self.value(default)}"
+            for name, default in routine.parameters
+        ]
+        self.emit(0, f"def f_{routine.name}({', '.join(parameters)}):")
+        own = {name for name, _ in routine.parameters} | _declared(routine.body, "local")
+        self._scope((self._globals & _assigned(routine.body)) - own)
+        self._body(routine.body, 1)
+
+    def _scope(self, names: Iterable[str]) -> None:
+        listed = ", ".join(f"v_{name}" for name in sorted(names))
+        if listed:
+            self.emit(1, f"global {listed}")
+        # a function with a yield is a generator, even where its script never gives up its slice
+        self.emit(1, "if False: yield")
+
+    def _body(self, statements: tuple[Statement, ...], depth: int) -> None:
+        for statement in statements:
+            self._statement(statement, depth)
+        if not statements:
+            self.emit(depth, "pass")
+
+    def _statement(self, statement: Statement, depth: int) -> None:
+        self._line = statement.line
+        match statement:
+            case Assign():
+                self._assign(statement, depth)
+            case Evaluate(value=value):
+                self.emit(depth, self.value(value))
+            case Conditional(branches=branches, otherwise=otherwise):
+                for i, (condition, body) in enumerate(branches):
+                    # `elif` whose condition calls a routine stays correct: Python evaluates it only when it is reached
+                    self.emit(depth, f"{'elif' if i else 'if'} truth({self.value(condition)}):")
+                    self._body(body, depth + 1)
+                if otherwise:
+                    self.emit(depth, "else:")
+                    self._body(otherwise, depth + 1)
+            case Loop(condition=condition, body=body):
+                self.emit(depth, f"while truth({self.value(condition)}):")
+                self.emit(depth + 1, "loop()")
+                self._body(body, depth + 1)
+            case Command():
+                self._command(statement, depth)
+
+    def _assign(self, statement: Assign, depth: int) -> None:
+        value = self.value(statement.value)
+        if isinstance(statement.value, Name | Index | Call):
+            value = f"copied({value})"
+        if not statement.indices:
+            self.emit(depth, f"v_{statement.name} = {value}")
+            return
+        target = f"v_{statement.name}"
+        for index in statement.indices[:-1]:
+            target = f"item({target}, {self.value(index)})"
+        self.emit(depth, f"place({target}, {self.value(statement.indices[-1])}, {value})")
+
+    def _command(self, statement: Command, depth: int) -> None:
+        value = self.value(statement.value) if statement.value is not None else ""
+        match statement.word:
+            case "halt":
+                self.emit(depth, "raise Halted")
+            case "kill":
+                self.emit(depth, f"kill({value})")
+            case "join":
+                self.emit(depth, f"joined = {value}")
+                self.emit(depth, "while alive(joined): yield")
+            case "enter_critical":
+                self.emit(depth, "enter()")
+            case "exit_critical":
+                self.emit(depth, "leave()")
+            case word:
+                self.emit(depth, f"{word} {value}".rstrip())
+
+    def value(self, expression: Expression) -> str:
+        match expression:
+            case Literal(value=value):
+                return repr(value)
+            case Name(name=name):
+                return f"v_{name}"
+            case Items(items=items, pose=pose):
+                listed = "[" + ", ".join(self.value(item) for item in items) + "]"
+                return f"Pose({listed})" if pose else listed
+            case Index(target=target, index=index):
+                return f"item({self.value(target)}, {self.value(index)})"
+            case Call():
+                return self._call(expression)
+            case Operation(operator=operator, operands=operands):
+                return self._operation(operator, [self.value(operand) for operand in operands])
+
+    def _operation(self, operator: str, values: list[str]) -> str:
+        if operator == "not":
+            return f"(not truth({values[0]}))"
+        if len(values) == 1:
+            return f"({operator}number({values[0]}))"
+        left, right = values
+        if operator == "xor":
+            return f"(truth({left}) != truth({right}))"
+        if operator in ("and", "or"):
+            return f"(truth({left}) {operator} truth({right}))"
+        if operator in ("/", "%"):
+            return f"divided({left}, {right}, {operator!r})"
+        if operator in ("+", "-", "*"):
+            return f"(number({left}) {operator} number({right}))"
+        return f"({left} {operator} {right})"
+
+    def _call(self, call: Call) -> str:
+        arguments = [self.value(argument) for argument in call.arguments]
+        if call.name in self._routines:
+            arguments += [f"v_{key}={self.value(value)}" for key, value in call.keywords]
+            made = f"f_{call.name}({', '.join(arguments)})"
+            if call.run:
+                if self._routines[call.name].kind != "thread":
+                    raise ScriptError(f"Line {self._line}: {call.name} is not a thread and cannot be run.", self._line)
+                return f"start({made}, {call.name!r})"
+            return f"(yield from {made})"
+        if call.name not in self._builtins or call.run:
+            raise ScriptError(f"Line {self._line}: {call.name} is not defined.", self._line)
+        arguments += [f"{key}={self.value(value)}" for key, value in call.keywords]
+        made = f"b_{call.name}({', '.join(arguments)})"
+        return f"(yield from {made})" if call.name in self._blocking else made
+
+
+def _walk(statements: tuple[Statement, ...]) -> Iterable[Assign]:
+    for statement in statements:
+        if isinstance(statement, Assign):
+            yield statement
+        elif isinstance(statement, Conditional):
+            for _, body in statement.branches:
+                yield from _walk(body)
+            yield from _walk(statement.otherwise)
+        elif isinstance(statement, Loop):
+            yield from _walk(statement.body)
+
+
+def _assigned(statements: tuple[Statement, ...]) -> set[str]:
+    return {assign.name for assign in _walk(statements) if not assign.indices}
+
+
+def _declared(statements: tuple[Statement, ...], scope: str = "global") -> set[str]:
+    return {assign.name for assign in _walk(statements) if assign.scope == scope}
+
+
+def _copied(value: Any) -> Any:
+    if value is None:
+        raise ScriptError("A function that returns nothing is used as a value.")
+    return type(value)(value) if isinstance(value, list) else value
+
+
+def _item(values: Any, index: Any) -> Any:
+    if not isinstance(values, list) or isinstance(index, bool) or not isinstance(index, int):
+        raise ScriptError("Only a list or a pose has an index, and the index is a whole number.")
+    if not 0 <= index < len(values):
+        raise ScriptError(f"Index {index} is outside of a list of {len(values)}.")
+    return values[index]
+
+
+def _place(values: Any, index: Any, value: Any) -> None:
+    _item(values, index)
+    values[index] = value
+
+
+def _truth(value: Any) -> bool:
+    if value is not True and value is not False:
+        raise ScriptError(f"A condition must be True or False, it is {value!r}.")
+    return value
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ScriptError(f"Arithmetic needs a number, it got {value!r}.")
+    return value
+
+
+def _divided(left: Any, right: Any, operator: str) -> float | int:
+    if _number(right) == 0:
+        raise ScriptError("Division by zero.")
+    return _number(left) / right if operator == "/" else math.fmod(_number(left), right)

@@ -1,0 +1,289 @@
+"""URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
+
+from __future__ import annotations
+
+from weldcal.tools.ur_emulator.script_lexer import Token, tokenize
+from weldcal.tools.ur_emulator.script_syntax import (
+    Assign,
+    Call,
+    Command,
+    Conditional,
+    Evaluate,
+    Expression,
+    Index,
+    Items,
+    Literal,
+    Loop,
+    Name,
+    Operation,
+    Routine,
+    ScriptError,
+    Statement,
+)
+
+# Loosest first, as the URScript manual orders them; `not` binds tighter than `and`.
+_BINARY = (
+    ("or",),
+    ("xor",),
+    ("and",),
+    ("==", "!="),
+    ("<", ">", "<=", ">="),
+    ("+", "-"),
+    ("*", "/", "%"),
+)
+
+
+def parse_program(source: str) -> Routine:
+    """The one def or sec of `source`, or a single line as a program of its own.
+
+    Raises:
+        ScriptError: the text is not a program of the subset.
+    """
+    words = source.split(None, 1)
+    if words and words[0] not in ("def", "sec"):
+        body, inner = _Parser(tokenize(source)).block(frozenset())
+        return Routine(1, "def", "line", (), body, inner)
+    parser = _Parser(tokenize(source))
+    parser.skip_newlines()
+    routine = parser.routine()
+    parser.skip_newlines()
+    if parser.token.kind != "end":
+        raise parser.error("a second program")
+    return routine
+
+
+class _Parser:
+    def __init__(self, tokens: list[Token]) -> None:
+        self._tokens = tokens
+        self._position = 0
+
+    @property
+    def token(self) -> Token:
+        return self._tokens[self._position]
+
+    def error(self, found: str | None = None) -> ScriptError:
+        what = found or repr(self.token.text or "the end")
+        return ScriptError(f"Syntax error in line {self.token.line}: {what} does not belong there.", self.token.line)
+
+    def take(self) -> Token:
+        token = self.token
+        if token.kind != "end":
+            self._position += 1
+        return token
+
+    def at(self, *texts: str) -> bool:
+        return self.token.kind in ("sign", "keyword") and self.token.text in texts
+
+    def expect(self, text: str) -> Token:
+        if not self.at(text):
+            raise self.error()
+        return self.take()
+
+    def word(self) -> str:
+        if self.token.kind != "word":
+            raise self.error()
+        return self.take().text
+
+    def skip_newlines(self) -> None:
+        while self.token.kind == "newline":
+            self._position += 1
+
+    def routine(self) -> Routine:
+        opening = self.take()
+        if opening.text not in ("def", "thread", "sec"):
+            raise self.error(repr(opening.text))
+        name = self.word()
+        self.expect("(")
+        parameters: list[tuple[str, Expression | None]] = []
+        while not self.at(")"):
+            parameter, default = self.word(), None
+            if self.at("="):
+                self.take()
+                default = self.expression()
+            parameters.append((parameter, default))
+            if not self.at(")"):
+                self.expect(",")
+        self.expect(")")
+        self.expect(":")
+        body, inner = self.block(frozenset({"end"}))
+        self.expect("end")
+        return Routine(opening.line, opening.text, name, tuple(parameters), body, inner)
+
+    def block(self, closing: frozenset[str]) -> tuple[tuple[Statement, ...], tuple[Routine, ...]]:
+        statements: list[Statement] = []
+        inner: list[Routine] = []
+        while True:
+            self.skip_newlines()
+            if self.token.kind == "end":
+                if closing:
+                    raise ScriptError(f"Line {self.token.line}: a block is not closed by `end`.", self.token.line)
+                return tuple(statements), tuple(inner)
+            if self.token.kind == "keyword" and self.token.text in closing:
+                return tuple(statements), tuple(inner)
+            if self.at("def", "thread", "sec"):
+                inner.append(self.routine())
+            else:
+                statements.append(self.statement())
+
+    def statements(self, *closing: str) -> tuple[Statement, ...]:
+        body, inner = self.block(frozenset(closing))
+        if inner:
+            raise ScriptError(f"Line {inner[0].line}: define {inner[0].name} outside of if and while.", inner[0].line)
+        return body
+
+    def statement(self) -> Statement:
+        line = self.token.line
+        if self.at("if"):
+            return self.conditional()
+        if self.at("while"):
+            self.take()
+            condition = self.expression()
+            self.expect(":")
+            body = self.statements("end")
+            self.expect("end")
+            return Loop(line, condition, body)
+        if self.at("break", "continue", "halt", "pass", "enter_critical", "exit_critical"):
+            word = self.take().text
+            if self.at("("):
+                self.take()
+                self.expect(")")
+            return Command(line, word)
+        if self.at("kill", "join"):
+            return Command(line, self.take().text, self.expression())
+        if self.at("return"):
+            self.take()
+            nothing = self.token.kind in ("newline", "end") or self.at("end", "else", "elif")
+            return Command(line, "return", None if nothing else self.expression())
+        scope = self.take().text if self.at("global", "local") else ""
+        target = self.expression()
+        if self.at("="):
+            self.take()
+            return self._assignment(line, target, scope)
+        if scope:
+            raise self.error()
+        return Evaluate(line, target)
+
+    def _assignment(self, line: int, target: Expression, scope: str) -> Assign:
+        indices: list[Expression] = []
+        while isinstance(target, Index):
+            indices.append(target.index)
+            target = target.target
+        if not isinstance(target, Name):
+            raise self.error("the left side of =")
+        return Assign(line, target.name, tuple(reversed(indices)), self.expression(), scope)
+
+    def conditional(self) -> Conditional:
+        line = self.take().line
+        branches: list[tuple[Expression, tuple[Statement, ...]]] = []
+        otherwise: tuple[Statement, ...] = ()
+        while True:
+            condition = self.expression()
+            self.expect(":")
+            branches.append((condition, self.statements("elif", "else", "end")))
+            if not self.at("elif"):
+                break
+            self.take()
+        if self.at("else"):
+            self.take()
+            self.expect(":")
+            otherwise = self.statements("end")
+        self.expect("end")
+        return Conditional(line, tuple(branches), otherwise)
+
+    def expression(self, level: int = 0) -> Expression:
+        if level == len(_BINARY):
+            return self.unary()
+        left = self.expression(level + 1)
+        while self.at(*_BINARY[level]):
+            operator = self.take().text
+            left = Operation(operator, (left, self.expression(level + 1)))
+        return left
+
+    def unary(self) -> Expression:
+        self.skip_newlines()
+        if self.at("not", "-", "+"):
+            operator = self.take().text
+            return Operation(operator, (self.unary(),))
+        return self.postfix()
+
+    def postfix(self) -> Expression:
+        value = self.primary()
+        while self.at("["):
+            self.take()
+            index = self.expression()
+            self.expect("]")
+            value = Index(value, index)
+        return value
+
+    def primary(self) -> Expression:
+        token = self.take()
+        if token.kind == "number":
+            whole = token.text.isdigit()
+            return Literal(int(token.text) if whole else float(token.text))
+        if token.kind == "text":
+            return Literal(token.text[1:-1])
+        if token.text in ("True", "False"):
+            return Literal(token.text == "True")
+        if token.text == "(":
+            value = self.expression()
+            self.expect(")")
+            return value
+        if token.text == "[":
+            return Items(self.items("]"), pose=False)
+        if token.text == "run":
+            call = self.primary()
+            if not isinstance(call, Call):
+                raise self.error("what follows run")
+            return Call(call.name, call.arguments, call.keywords, run=True)
+        if token.kind == "word":
+            return self.named(token)
+        self._position -= token.kind != "end"
+        raise self.error()
+
+    def named(self, token: Token) -> Expression:
+        if self.at("("):
+            return self.call(token.text)
+        if token.text == "p" and self.at("["):
+            # p[0] reads a variable that somebody called p; six numbers are a pose
+            self.take()
+            items = self.items("]")
+            if len(items) == 1:
+                return Index(Name("p"), items[0])
+            if len(items) != 6:
+                raise self.error("a pose that has not six numbers")
+            return Items(items, pose=True)
+        return Name(token.text)
+
+    def call(self, name: str) -> Call:
+        self.expect("(")
+        arguments: list[Expression] = []
+        keywords: list[tuple[str, Expression]] = []
+        self.skip_newlines()
+        while not self.at(")"):
+            following = self._tokens[min(self._position + 1, len(self._tokens) - 1)]
+            if self.token.kind == "word" and following.text == "=":
+                key = self.word()
+                self.take()
+                keywords.append((key, self.expression()))
+            else:
+                if keywords:
+                    raise self.error("a positional argument after a named one")
+                arguments.append(self.expression())
+            self.skip_newlines()
+            if not self.at(")"):
+                self.expect(",")
+                self.skip_newlines()
+        self.expect(")")
+        return Call(name, tuple(arguments), tuple(keywords))
+
+    def items(self, closing: str) -> tuple[Expression, ...]:
+        found: list[Expression] = []
+        self.skip_newlines()
+        while not self.at(closing):
+            found.append(self.expression())
+            self.skip_newlines()
+            if not self.at(closing):
+                self.expect(",")
+                self.skip_newlines()
+        self.expect(closing)
+        return tuple(found)

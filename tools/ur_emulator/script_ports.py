@@ -1,0 +1,158 @@
+"""Ports that take script text and stream state: primary 30001, secondary 30002, real-time 30003."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.tools.ur_emulator.controller import Controller
+from weldcal.tools.ur_emulator.dh import dh_parameters
+from weldcal.tools.ur_emulator.modes import RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.ur_emulator.net import Connection, Server
+from weldcal.tools.ur_emulator.script_lexer import split_programs
+
+STATE_PERIOD_FRAMES = 50  # 10 Hz
+STATE, MESSAGE = 16, 20
+CALIBRATED, NOMINAL = 2, 0
+KEY, EXCEPTION, VERSION = 7, 10, 3
+SOURCE_CONTROLLER = -2
+REAL_TIME_BYTES = 1220
+
+
+class ScriptServer(Server):
+    """A port that runs the programs it is sent."""
+
+    def __init__(self, controller: Controller, on_script: Callable[[float], None]) -> None:
+        self._controller = controller
+        self._on_script = on_script
+        self._clients: list[Connection] = []
+
+    def opened(self, connection: Connection, now: float) -> None:
+        self._clients.append(connection)
+
+    def gone(self, connection: Connection) -> None:
+        self._clients.remove(connection)
+
+    def arrived(self, connection: Connection, data: bytes, now: float) -> None:
+        connection.inbox += data
+        programs, rest = split_programs(connection.inbox.decode("utf-8", "replace"))
+        connection.inbox[:] = rest.encode()
+        for program in programs:
+            self._on_script(now)
+            self._controller.submit(program)
+
+
+class RealTimeServer(ScriptServer):
+    """30003: 1220 bytes of state at 500 Hz to whoever reads them; the control client never does."""
+
+    kind = "script"
+
+    def opened(self, connection: Connection, now: float) -> None:
+        super().opened(connection, now)
+        connection.patient = True
+
+    def frame(self, now: float) -> None:
+        package: bytes | None = None
+        for connection in self._clients:
+            if connection.unread:
+                continue
+            package = package or self._package()
+            connection.send(package, now, droppable=True)
+
+    def _package(self) -> bytes:
+        c, arm = self._controller, self._controller.arm
+        zero6 = [0.0] * 6
+        values = [
+            *(c.timestamp, *arm.q_target, *arm.qd_target, *arm.qdd_target, *zero6, *zero6),
+            *(*arm.q, *arm.qd, *zero6, *zero6),
+            *(*arm.tool_pose(), *arm.tool_speed(), *zero6, *arm.tool_pose(target=True), *arm.tool_speed(target=True)),
+            *(float(c.terminals.digital_inputs), *[30.0] * 6, 0.4, 0.0, float(c.robot_mode), *[253.0] * 6),
+            *(float(c.safety_mode), *zero6, 0.0, 0.0, 9.81, *zero6, c.speed_scaling, 0.0, 0.0, 0.0),
+            *(48.0, 48.0, 0.8, *[48.0] * 6, float(c.terminals.digital_outputs), float(c.runtime_state)),
+            *([0.0] * 6 + [float(c.safety_mode)] + [0.0] * 3),
+            *(c.payload.mass, *c.payload.center, *c.payload.inertia),
+        ]
+        return struct.pack(f">i{len(values)}d", REAL_TIME_BYTES, *values)
+
+
+class PrimaryServer(ScriptServer):
+    """30001 with messages, 30002 without: version on connection, robot state ten times a second."""
+
+    def __init__(self, controller: Controller, on_script: Callable[[float], None], *, primary: bool) -> None:
+        super().__init__(controller, on_script)
+        self.kind = "primary" if primary else "secondary"
+        self._messages = primary
+        self._kinematics = kinematics_info(controller.arm.model)
+        self._configuration = _configuration(controller.arm.model)
+
+    def opened(self, connection: Connection, now: float) -> None:
+        super().opened(connection, now)
+        v = self._controller.version
+        name, date = b"URControl", b"01-01-2025, 00:00:00"
+        body = bytes([len(name)]) + name + struct.pack(">BBii", v.major, v.minor, v.bugfix, v.build) + date
+        connection.send(self._message(VERSION, body), now)
+        connection.send(self._state(), now)
+
+    def frame(self, now: float) -> None:
+        if not self._clients:
+            return
+        if self._controller.frame % STATE_PERIOD_FRAMES == 0:
+            package = self._state()
+            for connection in self._clients:
+                connection.send(package, now, droppable=True)
+
+    def announce(self, event: tuple[str, str, int], now: float) -> None:
+        """Key messages and runtime exceptions, for the primary port."""
+        kind, text, line = event
+        if kind == "RUNTIME_EXCEPTION":
+            package = self._message(EXCEPTION, struct.pack(">ii", line, 0) + text.encode())
+        else:
+            title = f"PROGRAM_XXX_{kind}".encode()
+            package = self._message(KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text.encode())
+        for connection in self._clients if self._messages else []:
+            connection.send(package, now)
+
+    def _message(self, kind: int, body: bytes) -> bytes:
+        stamp = int(self._controller.timestamp * 1e6)
+        payload = struct.pack(">QbB", stamp, SOURCE_CONTROLLER, kind) + body
+        return struct.pack(">iB", len(payload) + 5, MESSAGE) + payload
+
+    def _state(self) -> bytes:
+        c, arm = self._controller, self._controller.arm
+        power = c.robot_mode >= RobotMode.POWER_ON
+        stopped = c.safety_mode == SafetyMode.PROTECTIVE_STOP
+        emergency = c.safety_mode in (SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP)
+        playing = c.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING)
+        paused = c.runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING)
+        mode = struct.pack(
+            ">Q7?bB3d",
+            *(int(c.timestamp * 1e6), True, True, power, emergency, stopped, playing, paused),
+            *(int(c.robot_mode), 0, c.terminals.speed_slider, c.speed_scaling, 1.0),
+        )
+        joints = b"".join(
+            struct.pack(">3d4fB", arm.q[i], arm.q_target[i], arm.qd[i], 0.0, 48.0, 30.0, 30.0, 253) for i in range(6)
+        )
+        tool = struct.pack(">12d", *arm.tool_pose(), *c.tcp_offset)
+        parts = ((0, mode), (1, joints), (4, tool), (5, self._kinematics), (6, self._configuration))
+        payload = b"".join(struct.pack(">IB", len(part) + 5, kind) + part for kind, part in parts)
+        return struct.pack(">iB", len(payload) + 5, STATE) + payload
+
+
+def kinematics_info(model: ArmModel) -> bytes:
+    """The body of KinematicsInfo: six checksums, theta, a, d, alpha of the chain in use, and whether it is calibrated."""
+    dh = dh_parameters(model)
+    numbers = [*dh.theta, *dh.a, *dh.d, *dh.alpha]
+    packed = struct.pack(">24d", *numbers)
+    checksums = [sum(packed[joint * 8 :: 48]) & 0xFFFFFFFF for joint in range(6)]
+    status = NOMINAL if model.calibration is None else CALIBRATED
+    return struct.pack(">6I", *checksums) + packed + struct.pack(">I", status)
+
+
+def _configuration(model: ArmModel) -> bytes:
+    dh = dh_parameters(model)
+    limits = [v for pair in zip(model.position_lower, model.position_upper, strict=True) for v in pair]
+    speeds = [v for pair in zip(model.velocity_limit, model.acceleration_limit, strict=True) for v in pair]
+    defaults = [1.05, 1.4, 0.25, 1.2, 0.35]
+    body = struct.pack(">29d", *limits, *speeds, *defaults)
+    return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, 3, 0)
