@@ -22,7 +22,7 @@ from weldcal.tools.outcome import (
     calibration_status,
     weld_outcome,
 )
-from weldcal.tools.report.demo_report import demo_report
+from weldcal.tools.report.demo_report import demo_pictures, demo_report
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.run_files import error_summary, write_calibration, write_scans, write_weld_csv
 from weldcal.tools.simulation import Progress, Run, no_progress, run_cell
@@ -180,7 +180,7 @@ def measure(run: Run, options: DemoOptions) -> DemoResult:
 
 
 def write_result(result: DemoResult, meshcat: Meshcat | None) -> None:
-    """Write calibration.yaml, scans/, weld.csv, recording.html and report.html; each file whole or not at all."""
+    """Write calibration.yaml and its exports, scans/, weld.csv, plots/, recording.html, report.html; each whole or not at all."""
     folder, run = result.folder, result.run
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(run.cell, result.status, result.options.seed, folder)
@@ -189,7 +189,10 @@ def write_result(result: DemoResult, meshcat: Meshcat | None) -> None:
         write_weld_csv(result.weld.log, folder)
     if meshcat is not None:
         write_atomic(folder / "recording.html", meshcat.StaticHtml())
-    write_atomic(folder / "report.html", demo_report(result, recording=meshcat is not None))
+    pictures = demo_pictures(result)
+    for name, picture in pictures.items():
+        write_atomic(folder / "plots" / f"{name}.svg", picture)
+    write_atomic(folder / "report.html", demo_report(result, pictures, recording=meshcat is not None))
 
 
 def _set_the_scene(meshcat: Meshcat) -> None:

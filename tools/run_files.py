@@ -10,7 +10,7 @@ import numpy as np
 
 from weldcal.calibration.dataset import save_dataset
 from weldcal.calibration.dataset_header import DatasetHeader, Feature, ScannerGuess
-from weldcal.calibration.result import CalibrationResult, PoseRecord, save_result
+from weldcal.calibration.result import CalibrationResult, PoseRecord, export_all, save_result
 from weldcal.calibration.solve import CalibrationEstimate
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.cell import Cell, feature_standard
@@ -71,9 +71,12 @@ def _record(id: str, estimate: CalibrationEstimate, k: int) -> PoseRecord:
 
 
 def write_calibration(cell: Cell, status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
-    """Write calibration.yaml, where there is a calibration."""
+    """Write calibration.yaml and the forms that other tools read, where there is a calibration."""
     result = live_result(cell, status, seed)
-    return None if result is None else save_result(result, folder)
+    if result is None:
+        return None
+    export_all(result, folder)
+    return save_result(result, folder)
 
 
 def write_scans(run: Run, status: CalibrationStatus, folder: Path) -> Path | None:

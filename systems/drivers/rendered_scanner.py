@@ -49,12 +49,12 @@ def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_r
     return RigidTransform(RotationMatrix(AngleAxis(rotation_rad, axis)), translation_m * direction)
 
 
-class TriggeredDepthScanner(LeafSystem):
+class DepthSensor(LeafSystem):
     """Takes one noisy organised cloud per trigger.
 
     .. pydrake_system::
 
-        name: TriggeredDepthScanner
+        name: DepthSensor
         input_ports:
         - trigger
         - depth_image
@@ -130,7 +130,7 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
     sensor = build.builder.AddSystem(RgbdSensor(world.scene_graph.world_frame_id(), X_BC, camera))
     sensor.set_name("scanner_depth")
-    scanner = build.builder.AddSystem(TriggeredDepthScanner(preset, int(build.rng.integers(2**31)), config.exposure_s))
+    scanner = build.builder.AddSystem(DepthSensor(preset, int(build.rng.integers(2**31)), config.exposure_s))
     scanner.set_name("scanner")
     build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.builder.Connect(sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))

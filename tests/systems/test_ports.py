@@ -25,7 +25,7 @@ from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, Nex
 from weldcal.systems.cell_visualizer import CellVisualizer
 from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
-from weldcal.systems.drivers.rendered_scanner import TriggeredDepthScanner
+from weldcal.systems.drivers.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.flange_mover import FlangeMover
@@ -60,7 +60,7 @@ JOB = JobPlan(True, True, Q_HOME, 10, 1, 5e-4, 1e-4)
 
 MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
-    TriggeredDepthScanner: lambda: TriggeredDepthScanner(IDEAL, 0, 0.1),
+    DepthSensor: lambda: DepthSensor(IDEAL, 0, 0.1),
     StreamingColourCamera: lambda: StreamingColourCamera(RenderedFingerCamera(), 0, 0.002),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
@@ -95,7 +95,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "sample_time": 1,
         "status": UrStatus,
     },
-    TriggeredDepthScanner: {"trigger": 1, "depth_image": ImageDepth32F, "scan": Scan},
+    DepthSensor: {"trigger": 1, "depth_image": ImageDepth32F, "scan": Scan},
     StreamingColourCamera: {"streaming": 1, "color_image": ImageRgba8U, "image": Image, "capture_time": 1},
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {

@@ -27,8 +27,8 @@ from weldcal.models.scanners import depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.rendered_scanner import (
     ApplyDriverConfig,
+    DepthSensor,
     RenderedScanner,
-    TriggeredDepthScanner,
     random_pose_error,
 )
 from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER
@@ -153,7 +153,7 @@ class Bench:
     """A scanner alone, looking at a wall that the test moves."""
 
     def __init__(self, preset: str = "phoxi_m", seed: int = 3, exposure_s: float = 0.1) -> None:
-        self.scanner = TriggeredDepthScanner(get_scanner(preset, width=64, height=48), seed, exposure_s)
+        self.scanner = DepthSensor(get_scanner(preset, width=64, height=48), seed, exposure_s)
         self.simulator = Simulator(self.scanner)
         self.context = self.simulator.get_mutable_context()
         self.wall(0.65)

@@ -31,10 +31,9 @@ STORY = {
 }
 
 
-def demo_report(result: DemoResult, *, recording: bool) -> str:
-    """The whole report as one self-contained HTML text."""
+def demo_pictures(result: DemoResult) -> dict[str, bytes]:
+    """The plots of a run by name, as SVG."""
     cell, status, weld = result.run.cell, result.status, result.weld
-    estimate = status.estimate
     pictures = {}
     if status.history:
         required = cell.scenario.calibration.required_error_mm * 1e-3
@@ -43,6 +42,13 @@ def demo_report(result: DemoResult, *, recording: bool) -> str:
         pictures["seam"] = plots_demo.seam_paths(weld)
         pictures["errors"] = plots_demo.error_along_seam(weld)
         pictures["along"] = plots_demo.along_the_weld(weld, cell.servo_config.weld_speed_m_s)
+    return pictures
+
+
+def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bool) -> str:
+    """The whole report as one self-contained HTML text."""
+    cell, status, weld = result.run.cell, result.status, result.weld
+    estimate = status.estimate
     pose = []
     if estimate is not None:
         sigma = np.sqrt(np.diag(estimate.covariance))
