@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,6 +65,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         result=result,
         summary=result.summary(),
         scenario=cell.scenario,
+        scenario_name=Path(result.options.scenario).stem,
         status=status,
         weld=weld,
         tip_error_mm=None if weld is None else 1e3 * plots_demo.tip_error(weld),

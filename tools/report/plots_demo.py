@@ -54,7 +54,9 @@ def convergence(status: CalibrationStatus, required_m: float) -> bytes:
 
 def seam_paths(weld: WeldOutcome) -> bytes:
     """Planned seam, true seam, and the paths of tip, torch and robot, seen from above in the base frame (Fig. 13)."""
-    picture = Figure(figsize=(7.2, 5.2), layout="constrained")
+    reach = np.ptp(np.vstack([weld.log.p_BRobot, weld.log.p_BTorch]), axis=0)
+    height = float(np.clip(6.4 * reach[0] / max(reach[1], 1e-6) + 1.6, 2.8, 7.0))
+    picture = Figure(figsize=(7.2, height), layout="constrained")
     axes = picture.subplots()
     true = weld.true_seam.position(np.linspace(0.0, weld.true_seam.length, 400))
     if weld.planned is not None:
@@ -70,7 +72,7 @@ def seam_paths(weld: WeldOutcome) -> bytes:
     axes.plot(1e3 * log.p_BTorch[on, 1], 1e3 * log.p_BTorch[on, 0], color=TORCH, lw=1.8, label="torch, arc on")
     axes.set_aspect("equal")
     _plain(axes, "y of the base, mm", "x of the base, mm")
-    axes.legend(frameon=False, fontsize=8)
+    picture.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=8)
     return svg(picture)
 
 
@@ -93,7 +95,8 @@ def along_the_weld(weld: WeldOutcome, weld_speed_m_s: float) -> bytes:
     log = weld.log
     picture = Figure(figsize=(7.2, 7.6), layout="constrained")
     deflection, speed, omega, measure = picture.subplots(4, 1, sharex=True)
-    s = 1e3 * log.telemetry["s_torch"]
+    touching = log.telemetry["phase"] == list(Phase).index(Phase.TOUCH)  # the search has no place along the seam
+    s = np.where(touching, np.nan, 1e3 * log.telemetry["s_torch"])
     for k, (name, colour) in enumerate((("tangential", PLANNED), ("normal", OURS), ("axial", ROBOT))):
         deflection.plot(s, 1e3 * log.deflection_T[:, k], color=colour, lw=1.0, label=name)
     deflection.legend(frameon=False, fontsize=8, ncols=3)
