@@ -15,7 +15,6 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from weldcal.calibration.pose_planning import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.models.scanners import get_scanner
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner
 from weldcal.systems.cell_visualizer import add_visualizer
@@ -141,7 +140,7 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
     scanner = scenario.scanner
     if isinstance(scanner, NoDevice):
         raise InputError("A calibration needs a scanner: write scanner: !RenderedScanner {} in the scenario.")
-    preset = get_scanner(scanner.preset, width=scanner.width, height=scanner.height)
+    preset = scanner.scanner()
     config = PlannerConfig(
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),

@@ -12,7 +12,6 @@ from weldcal.calibration.dataset import save_dataset
 from weldcal.calibration.dataset_header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.result import CalibrationResult, PoseRecord, export_all, save_result
 from weldcal.calibration.solve import CalibrationEstimate
-from weldcal.models.scanners import get_scanner
 from weldcal.systems.cell import Cell, feature_standard
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus
@@ -85,7 +84,7 @@ def write_scans(run: Run, status: CalibrationStatus, folder: Path) -> Path | Non
     observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
     if not observed or not isinstance(scanner, RenderedScanner):
         return None
-    preset = get_scanner(scanner.preset, width=scanner.width, height=scanner.height)
+    preset = scanner.scanner()
     c, X_RF = cell.scenario.calibration, cell.X_FR.inverse()
     guess = c.mounting_guess.pose()
     header = DatasetHeader(

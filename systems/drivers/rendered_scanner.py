@@ -4,11 +4,13 @@ import dataclasses as dc
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import (
     Box,
     ClippingRange,
+    ColorRenderCamera,
     DepthRange,
     DepthRenderCamera,
     GeometryInstance,
@@ -17,7 +19,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, LeafSystem, State
-from pydrake.systems.sensors import CameraInfo, ImageDepth32F, RgbdSensor
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
 from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER, SimulatedWorld
@@ -39,6 +41,15 @@ class RenderedScanner:
     )
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
+    field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
+
+    def scanner(self) -> ScannerPreset:
+        """The scanner with the resolution and the field of view that are asked for; pixels stay as square as they were."""
+        preset = get_scanner(self.preset, width=self.width, height=self.height)
+        if self.field_of_view_deg is None:
+            return preset
+        fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * self.field_of_view_deg))
+        return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
 
 
 def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
@@ -47,6 +58,15 @@ def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_r
     axis /= np.linalg.norm(axis)
     direction /= np.linalg.norm(direction)
     return RigidTransform(RotationMatrix(AngleAxis(rotation_rad, axis)), translation_m * direction)
+
+
+BRIGHT_GREY = 80.0  # of 255: what reflects this much light or more is measured as a bright surface
+
+
+def darkness(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+    """0 (bright) to 1 (black) for each pixel of an image (H, W, 3), 0 to 255."""
+    luminance = rgb @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
+    return np.asarray(np.clip(1.0 - luminance / BRIGHT_GREY, 0.0, 1.0), dtype=np.float32)
 
 
 class DepthSensor(LeafSystem):
@@ -58,6 +78,7 @@ class DepthSensor(LeafSystem):
         input_ports:
         - trigger
         - depth_image
+        - color_image
         output_ports:
         - scan
 
@@ -73,6 +94,9 @@ class DepthSensor(LeafSystem):
         self._trigger = self.DeclareVectorInputPort("trigger", 1)
         self._depth = self.DeclareAbstractInputPort(
             "depth_image", AbstractValue.Make(ImageDepth32F(preset.width, preset.height))
+        )
+        self._color = self.DeclareAbstractInputPort(
+            "color_image", AbstractValue.Make(ImageRgba8U(preset.width, preset.height))
         )
         self._shown = self.DeclareAbstractState(AbstractValue.Make(Scan()))
         self._pending = self.DeclareAbstractState(AbstractValue.Make(Scan()))
@@ -91,11 +115,18 @@ class DepthSensor(LeafSystem):
         if wanted > pending.sequence:
             depth = np.array(self._depth.Eval(context).data[:, :, 0])
             rng = np.random.default_rng([self._seed, wanted])
-            noisy = apply_noise(np.where(np.isfinite(depth), depth, 0.0), self._preset, rng)
+            noisy = apply_noise(np.where(np.isfinite(depth), depth, 0.0), self._preset, rng, self._darkness(context))
             p = self._preset
             points = depth_to_points(noisy, p.fx, p.fy, p.cx, p.cy).astype(np.float32)
             scan = Scan(sequence=wanted, capture_time=now, points_C=points)
             state.get_mutable_abstract_state(self._pending).set_value(scan)
+
+    def _darkness(self, context: Context) -> np.ndarray | None:
+        """How dark each pixel's surface is, 0 to 1, from the colour image; None where no colour image is connected."""
+        if not self._color.HasValue(context):
+            return None
+        rgb = np.asarray(self._color.Eval(context).data[:, :, :3], dtype=np.float32)
+        return darkness(rgb)
 
     def _output(self, context: Context, output: Any) -> None:
         output.set_value(context.get_abstract_state(self._shown).get_value())
@@ -113,7 +144,7 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform) -> None:
 def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
     """Stand a depth camera in the world at its true pose (known to `cheat.X_BC` alone) and add the scanner behind it."""
     world = build.simulated_world()
-    preset = get_scanner(config.preset, width=config.width, height=config.height)
+    preset = config.scanner()
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
     error = random_pose_error(
         build.rng, config.mounting_translation_mm * 1e-3, np.deg2rad(config.mounting_rotation_deg)
@@ -128,12 +159,14 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
         RigidTransform(),
     )
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
-    sensor = build.builder.AddSystem(RgbdSensor(world.scene_graph.world_frame_id(), X_BC, camera))
+    colour = ColorRenderCamera(core, False)
+    sensor = build.builder.AddSystem(RgbdSensor(world.scene_graph.world_frame_id(), X_BC, colour, camera))
     sensor.set_name("scanner_depth")
     scanner = build.builder.AddSystem(DepthSensor(preset, int(build.rng.integers(2**31)), config.exposure_s))
     scanner.set_name("scanner")
     build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.builder.Connect(sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))
+    build.builder.Connect(sensor.color_image_output_port(), scanner.GetInputPort("color_image"))
     build.inputs["scanner.trigger"] = scanner.GetInputPort("trigger")
     build.outputs["scanner.scan"] = scanner.GetOutputPort("scan")
     return X_BC

@@ -95,7 +95,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "sample_time": 1,
         "status": UrStatus,
     },
-    DepthSensor: {"trigger": 1, "depth_image": ImageDepth32F, "scan": Scan},
+    DepthSensor: {"trigger": 1, "depth_image": ImageDepth32F, "color_image": ImageRgba8U, "scan": Scan},
     StreamingColourCamera: {"streaming": 1, "color_image": ImageRgba8U, "image": Image, "capture_time": 1},
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {

@@ -23,17 +23,20 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F
 
-from weldcal.models.scanners import depth_to_points, get_scanner
+from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.rendered_scanner import (
     ApplyDriverConfig,
     DepthSensor,
     RenderedScanner,
+    darkness,
     random_pose_error,
 )
 from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
+from weldcal.systems.scenario import load_scenario
+from weldcal.systems.station import make_station
 
 from .cells import Q_HOME, the_arm
 
@@ -220,3 +223,32 @@ def test_a_random_pose_error_has_exactly_the_size_that_was_asked_for() -> None:
     directions = np.array([X.translation() for X in errors]) / 0.015
     assert np.linalg.norm(directions.mean(axis=0)) < 0.5  # every way, not one: 3 sigma of 50 unit vectors is 0.42
     assert random_pose_error(rng, 0.0, 0.0).IsNearlyEqualTo(RigidTransform(), 1e-15)
+
+
+def test_the_field_of_view_is_the_scenarios() -> None:
+    narrow = RenderedScanner(field_of_view_deg=20.0).scanner()
+    own = RenderedScanner().scanner()
+    assert 2.0 * np.degrees(np.arctan(0.5 * narrow.width / narrow.fx)) == pytest.approx(20.0)
+    assert narrow.fy / narrow.fx == pytest.approx(own.fy / own.fx)
+    assert (narrow.cx, narrow.cy) == (own.cx, own.cy)
+
+
+def test_black_is_dark_and_steel_is_not() -> None:
+    picture = np.stack([np.full((2, 2, 3), level, dtype=np.float32) for level in (0.0, 40.0, 160.0)])
+    assert darkness(picture).max(axis=(1, 2)) == pytest.approx([1.0, 0.5, 0.0], abs=1e-6)
+
+
+def test_a_dark_surface_is_measured_less_often_than_a_bright_one() -> None:
+    """The tool's dark plate against the steel ring that stands on it, as the scanner of the demo sees them."""
+    scenario = load_scenario("s_groove", "job: {calibrate: false, weld: false}")
+    station = make_station(scenario, seed=0)
+    context = station.diagram.CreateDefaultContext()
+    sensor = station.diagram.GetSubsystemByName("scanner_depth")
+    color = sensor.color_image_output_port().Eval(sensor.GetMyContextFromRoot(context)).data[:, :, :3]
+    dark = darkness(np.asarray(color, dtype=np.float32))
+    depth = np.array(sensor.depth_image_32F_output_port().Eval(sensor.GetMyContextFromRoot(context)).data[:, :, 0])
+    assert (dark > 0.5).any(), "something in the scene is dark"
+    preset = RenderedScanner().scanner()
+    seen = apply_noise(np.where(np.isfinite(depth), depth, 0.0), preset, np.random.default_rng(0), dark) > 0
+    ideal = np.isfinite(depth) & (depth > preset.near_m) & (depth < preset.far_m)
+    assert seen[ideal & (dark > 0.9)].mean() < seen[ideal & (dark < 0.1)].mean() - 0.01

@@ -32,6 +32,7 @@ scanner: !RenderedScanner
   preset: azure_kinect
   width: 320
   height: 288
+  field_of_view_deg: 70.0
   xyz_m: [0.6, 0.1, 1.0]
   rpy_deg: [175.0, 1.0, -80.0]
   mounting_translation_mm: 5.0
