@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arms.urdf import Capsule, link_capsules
 
 Array = NDArray[np.float64]
@@ -59,6 +59,18 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
             d = np.linalg.norm(pa[:, None] - pb[None], axis=2).min()
             gap = min(gap, float(d) - a.radius - b.radius)
     return float(gap)
+
+
+def path_clearance(
+    arm: ArmModel, bodies: list[Body], q_a: Array, q_b: Array, step_rad: float = 0.1
+) -> tuple[float, float]:
+    """Lowest z (m, in B) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
+
+    ``q_a``, ``q_b`` (6,) rad; the path is sampled so that no joint turns by more than ``step_rad`` between samples.
+    """
+    n = int(np.ceil(float(np.abs(q_b - q_a).max()) / step_rad)) + 1
+    placed = [link_frames(arm, q_a + u * (q_b - q_a)) for u in np.linspace(0.0, 1.0, max(n, 2))]
+    return min(lowest_point(bodies, f) for f in placed), min(self_distance(bodies, f) for f in placed)
 
 
 def occludes(

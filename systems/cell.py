@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses as dc
+from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, LogVectorOutput, VectorLogSink
 
+from weldcal.calibration.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.pose_planning import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
@@ -149,18 +153,45 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
         feature_radius_m=0.5 * feature_standard(scenario).outer_m,
         work_point_B=tuple(work_point(scenario)),
     )
-    return tuple(
-        plan_calibration_poses(
-            station.arm,
-            feature_on_flange(scenario, station),
-            c.mounting_guess.pose(),
-            preset,
-            c.maximum_scans + c.verification_scans + SPARE_POSES,
-            q_start=np.deg2rad(scenario.home_deg),
-            config=config,
-            tool=() if tool is None else tool.capsules(),
-        )
+    capsules = () if tool is None else tool.capsules()
+    poses = plan_calibration_poses(
+        station.arm,
+        feature_on_flange(scenario, station),
+        c.mounting_guess.pose(),
+        preset,
+        c.maximum_scans + c.verification_scans + SPARE_POSES,
+        q_start=np.deg2rad(scenario.home_deg),
+        config=config,
+        tool=capsules,
     )
+    return clear_poses(scenario, station, poses, arm_bodies(station.arm, capsules))
+
+
+def clear_poses(
+    scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[Body]
+) -> tuple[PlannedPose, ...]:
+    """The poses that the FlangeMover reaches, each from the one before and with a free way home, in their order.
+
+    Raises:
+        UnreachableScanner: too many moves would touch the table or the arm itself.
+    """
+    c, home = scenario.calibration, np.deg2rad(scenario.home_deg)
+
+    def clear(q_a: NDArray[np.float64], q_b: NDArray[np.float64]) -> bool:
+        lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
+        return lowest > c.table_z_m and gap > 0.0
+
+    kept: list[PlannedPose] = []
+    for pose in poses:
+        if clear(kept[-1].q if kept else home, pose.q) and clear(pose.q, home):
+            kept.append(pose)
+    needed = 1 + c.maximum_scans + c.verification_scans
+    if len(kept) < needed:
+        raise UnreachableScanner(
+            f"Only {len(kept)} of {needed} calibration poses can be reached without the arm coming into the table or itself; "
+            "choose another home_deg or fewer maximum_scans."
+        )
+    return tuple(kept)
 
 
 def work_point(scenario: Scenario) -> np.ndarray:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.conftest import run_weldcal
+from weldcal.calibration.clearance import arm_bodies, path_clearance
+from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.pose_planning import PlannedPose
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.cell import make_cell
+from weldcal.systems.cell import clear_poses, make_cell
 from weldcal.systems.scenario import Scenario, load_scenario
 from weldcal.tools.calibrate import calibrate_dataset
 from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario, run_weld
@@ -172,6 +175,18 @@ def test_planned_poses_are_what_the_issue_asks_of_them() -> None:
         centres.append(pose.X_BR.translation())
     spread = np.linalg.svd(np.array(centres) - np.mean(centres, axis=0), compute_uv=False) / np.sqrt(len(centres))
     assert spread[2] > 0.01
+
+
+def test_a_pose_behind_the_table_is_left_out_and_too_few_are_refused() -> None:
+    cell = make_cell(load_scenario("calibrate_only"), seed=1)
+    arm, bodies = cell.station.arm, arm_bodies(cell.station.arm)
+    first, *rest = cell.poses
+    through_the_table = replace(first, q=first.q + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0]))
+    assert path_clearance(arm, bodies, first.q, through_the_table.q)[0] < 0.0
+    kept = clear_poses(cell.scenario, cell.station, [first, through_the_table, *rest], bodies)
+    assert kept == cell.poses
+    with pytest.raises(UnreachableScanner, match="Only 1 of 12 calibration poses"):
+        clear_poses(cell.scenario, cell.station, [first, through_the_table], bodies)
 
 
 def test_a_weld_needs_a_workpiece(tmp_path: Path) -> None:
