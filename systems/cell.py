@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import dataclasses as dc
-from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, LogVectorOutput, VectorLogSink
 
-from weldcal.calibration.clearance import Body, arm_bodies, path_clearance
-from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.pose_planning import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator
 from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner
 from weldcal.systems.cell_visualizer import add_visualizer
+from weldcal.systems.clear_moves import check_way_home, clear_poses, station_bodies
 from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
@@ -43,6 +41,8 @@ from weldcal.welding.servo_state import ServoConfig, ToolGeometry
 AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 LOG_PERIOD_S = 0.016
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two against refused scans
+MOVE_TIMEOUT_S = 20.0  # at speed_factor 1
+MOVE_SPEED, MOVE_ACCELERATION = 1.0, 2.5  # rad/s and rad/s^2 of the fastest joint, at speed_factor 1
 JERK_LIMIT = 150.0  # rad/s^3: 100 ms to the acceleration limit of the large joints
 TORCH_ABOVE_ROOT_M = 0.002  # where the wire point runs: this far above the root of the groove
 
@@ -153,7 +153,6 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
         feature_radius_m=0.5 * feature_standard(scenario).outer_m,
         work_point_B=tuple(work_point(scenario)),
     )
-    capsules = () if tool is None else tool.capsules()
     poses = plan_calibration_poses(
         station.arm,
         feature_on_flange(scenario, station),
@@ -162,36 +161,9 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
         c.maximum_scans + c.verification_scans + SPARE_POSES,
         q_start=np.deg2rad(scenario.home_deg),
         config=config,
-        tool=capsules,
+        tool=() if tool is None else tool.capsules(),
     )
-    return clear_poses(scenario, station, poses, arm_bodies(station.arm, capsules))
-
-
-def clear_poses(
-    scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[Body]
-) -> tuple[PlannedPose, ...]:
-    """The poses that the FlangeMover reaches, each from the one before and with a free way home, in their order.
-
-    Raises:
-        UnreachableScanner: too many moves would touch the table or the arm itself.
-    """
-    c, home = scenario.calibration, np.deg2rad(scenario.home_deg)
-
-    def clear(q_a: NDArray[np.float64], q_b: NDArray[np.float64]) -> bool:
-        lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
-        return lowest > c.table_z_m and gap > 0.0
-
-    kept: list[PlannedPose] = []
-    for pose in poses:
-        if clear(kept[-1].q if kept else home, pose.q) and clear(pose.q, home):
-            kept.append(pose)
-    needed = 1 + c.maximum_scans + c.verification_scans
-    if len(kept) < needed:
-        raise UnreachableScanner(
-            f"Only {len(kept)} of {needed} calibration poses can be reached without the arm coming into the table or itself; "
-            "choose another home_deg or fewer maximum_scans."
-        )
-    return tuple(kept)
+    return clear_poses(scenario, station, poses, station_bodies(station))
 
 
 def work_point(scenario: Scenario) -> np.ndarray:
@@ -201,15 +173,27 @@ def work_point(scenario: Scenario) -> np.ndarray:
     return np.array(scenario.calibration.work_point_m)
 
 
-def make_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None) -> Cell:
-    """Build the whole cell for a scenario.
+def make_cell(
+    scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None, robot: PreparedRobot | None = None
+) -> Cell:
+    """Build the whole cell for a scenario; whoever makes one closes its station.
 
     The same systems run against simulated plants and against hardware: only the drivers inside `make_station` differ.
+    `robot`: see make_station.
 
     Raises:
         InputError, UnreachableScanner: the scenario cannot be done; nothing has been written or moved.
     """
-    station = make_station(scenario, seed)
+    station = make_station(scenario, seed, robot)
+    try:
+        check_way_home(scenario, station)
+        return _make_cell(scenario, station, seed, meshcat)
+    except BaseException:
+        station.close()
+        raise
+
+
+def _make_cell(scenario: Scenario, station: Station, seed: int, meshcat: Meshcat | None) -> Cell:
     builder = DiagramBuilder()
     builder.AddSystem(station.diagram)
     config = servo_config(scenario, station)
@@ -242,7 +226,7 @@ def make_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None)
     wiring.connect(chooser, calibration_status=status)
 
     welding = _add_welding(wiring, sequencer, status, history)
-    mover = wiring.add("flange_mover", FlangeMover())
+    mover = wiring.add("flange_mover", FlangeMover(MOVE_SPEED * job.speed_factor, MOVE_ACCELERATION * job.speed_factor))
     wiring.connect(mover, job=command, position_measured=q_measured, velocity_measured=v_measured)
     arbiter = wiring.add("command_arbiter", CommandArbiter())
     wiring.connect(
@@ -291,8 +275,9 @@ def panel(wiring: Wiring, meshcat: Meshcat) -> OutputPort:
 
 
 def job_plan(scenario: Scenario) -> JobPlan:
-    """The job's numbers in SI units."""
+    """The job's numbers in SI units; slower moves may take longer."""
     c, job = scenario.calibration, scenario.job
+    slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
         weld=job.weld,
@@ -301,7 +286,8 @@ def job_plan(scenario: Scenario) -> JobPlan:
         verification_scans=c.verification_scans,
         verification_limit_m=c.verification_limit_mm * 1e-3,
         required_error_m=c.required_error_mm * 1e-3,
-        maximum_time_s=job.maximum_time_s,
+        move_timeout_s=MOVE_TIMEOUT_S * slower,
+        maximum_time_s=job.maximum_time_s * slower,
     )
 
 

@@ -1,4 +1,4 @@
-"""JobSequencer: calibrate, verify, scan, plan, approach, weld, retract; or hold, and say why."""
+"""JobSequencer: go home, calibrate, verify, scan, plan, approach, weld, retract; or hold, and say why."""
 
 from __future__ import annotations
 
@@ -14,6 +14,13 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.systems.calibration_pose_planner import NextPose
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus
 from weldcal.systems.welding_velocity_servo import ServoReport
+
+AT_HOME_RAD = 0.01  # an arm that stands this near to home begins the job from where it is
+
+
+def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
+    """Whether each joint (6,) rad is where it should be."""
+    return bool(np.max(np.abs(q - q_home)) <= AT_HOME_RAD)
 
 
 @dc.dataclass(frozen=True)
@@ -97,6 +104,17 @@ def _arrived(state: JobState, seen: Seen, plan: JobPlan) -> tuple[JobState, bool
 
 
 def _start(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    if not stands_at(seen.q, plan.q_home):
+        return _move(state, seen, "move_home", plan.q_home)
+    return _begin(state, seen, plan)
+
+
+def _at_home(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
+    state, there = _arrived(state, seen, plan)
+    return _begin(state, seen, plan) if there else state
+
+
+def _begin(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if plan.calibrate:
         return _to_next_pose(state, seen, "move_to_verification_cloud")
     return _move(state, seen, "park", plan.q_home)
@@ -225,6 +243,7 @@ def _home(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
 
 PHASES: dict[str, Callable[[JobState, Seen, JobPlan], JobState]] = {
     "start": _start,
+    "move_home": _at_home,
     "move_to_verification_cloud": _arrive_and_scan("verification_cloud", "scan_verification_cloud"),
     "scan_verification_cloud": _digested,
     "move_to_pose": _arrive_and_scan("calibrate", "scan_pose"),
@@ -246,7 +265,7 @@ def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if state.command.finished:
         return state
     if not seen.robot.ready:
-        return hold(state, seen, f"The robot stopped: {seen.robot.fault or seen.robot.safety_mode}.")
+        return hold(state, seen, seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}.")
     if seen.hold_requested:
         return hold(state, seen, f"A person held the job, in the phase '{state.command.phase}'.")
     if seen.time > plan.maximum_time_s:

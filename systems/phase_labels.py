@@ -15,6 +15,7 @@ WIDTH_M, HEIGHT_M = 0.72, 0.09
 X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.deg2rad(65.0)), [-0.25, -0.38, 1.0])
 TEXT = {
     "start": "ready",
+    "move_home": "to home",
     "move_to_verification_cloud": "calibrate: to the verification pose",
     "scan_verification_cloud": "calibrate: scan for verification",
     "move_to_pose": "calibrate: to the next pose",

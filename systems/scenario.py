@@ -13,8 +13,10 @@ from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario_numbers import check_numbers
 
+SLOWEST_FACTOR = 0.05
 SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
 
 
@@ -89,7 +91,8 @@ class JobConfig:
     calibrate: bool = True
     weld: bool = True
     X_BC: PoseConfig | None = None  # a known calibration, where `calibrate` is off
-    maximum_time_s: float = 240.0
+    speed_factor: float = 1.0  # of the arm's moves, 0.05 to 1; the weld keeps its own speed
+    maximum_time_s: float = 240.0  # at speed_factor 1
 
 
 @dc.dataclass
@@ -109,7 +112,7 @@ class Scenario:
     kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
     flange: str = "iso9409-1-50-4-m6"  # of the arm
     tool: str = "welding"  # welding or none
-    robot: SimulatedUr | NoDevice = dc.field(default_factory=SimulatedUr)
+    robot: SimulatedUr | UrRtde | NoDevice = dc.field(default_factory=SimulatedUr)
     scanner: RenderedScanner | NoDevice = dc.field(default_factory=RenderedScanner)
     finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
@@ -173,6 +176,10 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     check_numbers(scenario)
+    if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
+        raise InputError(
+            f"job.speed_factor must be from {SLOWEST_FACTOR:g} to 1, and it is {scenario.job.speed_factor:g}."
+        )
     calibration = scenario.calibration
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")

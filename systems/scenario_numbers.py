@@ -11,14 +11,15 @@ from weldcal.models.errors import InputError
 POSITIVE = {
     *("required_error_mm", "theta_max_deg", "guess_radius_mm", "verification_limit_mm", "clearance_m", "clearance_mm"),
     *("speed_mm_s", "deflection_mm", "axial_deflection_mm", "seam_length_mm", "length_mm", "hole_from_mm"),
-    *("maximum_time_s", "control_period_s", "following_error_rad", "stiffness", "damping"),
+    *("maximum_time_s", "control_period_s", "following_error_rad"),
+    *("pace", "velocity_share"),
     *("rate_hz", "focal_px", "field_of_view_deg", "width", "height", "recording_fps", "cloud_points"),
 }
 NOT_NEGATIVE = {
-    *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "verification_scans"),
+    *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "verification_scans", "payload_kg"),
     *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
 }
-LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "home_deg": 6, "stiffness": 6, "damping": 6}
+LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "home_deg": 6, "payload_cog_m": 3}
 
 
 def check_numbers(config: Any, place: str = "") -> None:

@@ -17,10 +17,10 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
+from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
-from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario import Scenario
 
@@ -36,21 +36,51 @@ class Truth(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class Station:
-    """The station's Diagram and the handles that the cell needs to build around it."""
+    """The station's Diagram and the handles that the cell needs to build around it. Whoever makes one closes it."""
 
     diagram: Diagram
-    arm: ArmModel
+    robot: PreparedRobot
     tool: WeldingTool | None
     cad: Workpiece | None  # the part as drawn
     truth: Truth
     world: SimulatedWorld
 
+    @property
+    def arm(self) -> ArmModel:
+        """The robot's own arm."""
+        return self.robot.arm
+
+    @property
+    def q_start(self) -> np.ndarray:
+        """Where the arm stood when the station was built (6,), rad."""
+        return self.robot.q_start
+
+    @property
+    def pace(self) -> float | None:
+        """How many seconds of the Diagram a second of the wall clock must be worth; None: as fast as it goes."""
+        return self.robot.pace
+
+    def close(self) -> None:
+        """Stop the arm and let go of the hardware; a second call does nothing."""
+        self.robot.close()
+
 
 def apply_driver_config(config: Any, build: StationBuild) -> Any:
     """Call the ApplyDriverConfig that stands in the module of the config's class, as pydrake.manipulation does."""
-    module = inspect.getmodule(type(config))
-    apply = getattr(module, "ApplyDriverConfig", None)
+    apply = getattr(inspect.getmodule(type(config)), "ApplyDriverConfig", None)
     return None if apply is None else apply(config, build)
+
+
+def prepare_robot(config: Any, nominal: ArmModel, q_home: np.ndarray) -> PreparedRobot:
+    """Ask the PrepareRobot in the module of the config's class, where there is one, which arm this is and where it stands.
+
+    A driver without one has the nominal arm, and it stands at home.
+    """
+    prepare = getattr(inspect.getmodule(type(config)), "PrepareRobot", None)
+    if prepare is None:
+        return PreparedRobot(nominal, q_home)
+    found: PreparedRobot = prepare(config, nominal)
+    return found
 
 
 class CheatPoses(LeafSystem):
@@ -88,35 +118,47 @@ class CheatPoses(LeafSystem):
         output.SetFromVector(self._poses.Eval(context)[self._flange] @ self._tool.X_FT @ self._tool.p_TW)
 
 
-def make_station(scenario: Scenario, seed: int) -> Station:
+def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = None) -> Station:
     """Build the station that the scenario describes; every random difference between world and drawing comes from `seed`.
+
+    `robot` is the robot as somebody else has found it; None: the driver in the scenario is asked.
 
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
     `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
     `query_object`.
+
+    Raises:
+        InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the job.
     """
+    if isinstance(scenario.robot, NoDevice):
+        raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
+    if robot is None:
+        nominal = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+        robot = prepare_robot(scenario.robot, nominal, np.deg2rad(scenario.home_deg))
+    try:
+        return _make_station(scenario, seed, robot)
+    except BaseException:
+        robot.close()
+        raise
+
+
+def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Station:
     rng = np.random.default_rng(seed)
-    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
     tool = WeldingTool() if scenario.tool == "welding" else None
     cad, real, X_BP = _workpieces(scenario, rng)
-    q_home = np.deg2rad(scenario.home_deg)
-    robot = scenario.robot
-    if not isinstance(robot, SimulatedUr):
-        raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     builder = DiagramBuilder()
     world = build_world(
         builder,
-        arm,
+        robot.arm,
         tool,
-        robot,
-        q_home,
+        robot.q_start,
         flange=scenario.flange,
         table_z_m=scenario.calibration.table_z_m,
         workpiece=real,
         X_BP=X_BP,
     )
-    build = StationBuild(builder, arm, tool, q_home, rng, world)
+    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot)
     apply_driver_config(scenario.robot, build)
     X_BC = apply_driver_config(scenario.scanner, build)
     apply_driver_config(scenario.finger_camera, build)
@@ -124,7 +166,7 @@ def make_station(scenario: Scenario, seed: int) -> Station:
     _export(build, truth)
     diagram = builder.Build()
     diagram.set_name("station")
-    return Station(diagram, arm, tool, cad, truth, world)
+    return Station(diagram, robot, tool, cad, truth, world)
 
 
 def _workpieces(

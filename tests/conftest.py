@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 
 from tests.browser import browser
+from tests.short_job import short_jobs
 
-__all__ = ["browser"]
+__all__ = ["browser", "short_jobs"]
 
 
 @pytest.fixture(scope="session")

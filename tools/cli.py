@@ -36,6 +36,36 @@ BrowserOption = Annotated[
         "--browser/--no-browser", help="Open the live 3D view in the web browser, or not.", show_default="open it"
     ),
 ]
+RobotOption = Annotated[
+    str | None,
+    typer.Option(
+        "--robot",
+        metavar="ROBOT",
+        help="simulated, emulated (a controller on loopback), or the address of a controller.",
+        show_default="the scenario's",
+    ),
+]
+DryRunOption = Annotated[
+    bool,
+    typer.Option(
+        "--dry-run", help="Only look at the robot, then run on a simulated arm like it: nothing is sent to it."
+    ),
+]
+PaceOption = Annotated[
+    float | None,
+    typer.Option(
+        "--pace", metavar="P", help="Emulated controller only: its seconds per second of the clock, 0.05 to 1."
+    ),
+]
+SpeedFactorOption = Annotated[
+    float | None,
+    typer.Option(
+        "--speed-factor", metavar="X", help="Make the arm's moves slower: 0.05 to 1. The weld keeps its speed."
+    ),
+]
+AddressOption = Annotated[
+    str, typer.Option("--address", metavar="ADDRESS", help="Loopback address 127.x.y.z of the emulated controller.")
+]
 RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
 ScenarioOption = Annotated[
     str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
@@ -72,7 +102,10 @@ def demo(
     seed: SeedOption = 0,
     browser: BrowserOption = True,
     realtime: RealtimeOption = False,
-    robot: Annotated[str, typer.Option("--robot", metavar="NAME", help="Which robot: simulated.")] = "simulated",
+    robot: RobotOption = None,
+    dry_run: DryRunOption = False,
+    pace: PaceOption = None,
+    speed_factor: SpeedFactorOption = None,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -87,6 +120,9 @@ def demo(
             browser=browser and not json,
             realtime=realtime,
             robot=robot,
+            dry_run=dry_run,
+            pace=pace,
+            speed_factor=speed_factor,
         )
         with console.progress_bar("demo") as progress:
             result = run_demo(options, progress)
@@ -101,7 +137,12 @@ def calibrate(
     ] = None,
     out: OutOption = None,
     robot: Annotated[
-        str | None, typer.Option("--robot", metavar="NAME", help="Arm, where the dataset does not say it.")
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="NAME",
+            help="Of a dataset: the arm, where it does not say it. Live: simulated, emulated or a controller's address.",
+        ),
     ] = None,
     flange: Annotated[
         str | None,
@@ -113,6 +154,9 @@ def calibrate(
         bool,
         typer.Option("--centres", help="Also write centres.csv: the flange centre found in each scan of a dataset."),
     ] = False,
+    dry_run: DryRunOption = False,
+    pace: PaceOption = None,
+    speed_factor: SpeedFactorOption = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
@@ -137,7 +181,15 @@ def calibrate(
 
             assert scenario is not None
             folder = out or fresh_folder("calibrate", scenario, seed)
-            options = DemoOptions(scenario=scenario, out=folder, seed=seed, browser=False)
+            options = DemoOptions(
+                scenario=scenario,
+                out=folder,
+                seed=seed,
+                robot=robot,
+                dry_run=dry_run,
+                pace=pace,
+                speed_factor=speed_factor,
+            )
             summary = run_calibration_live(options, progress).calibration_summary()
     finish("calibrate", summary, folder, json_wanted=json, rows=rows)
 
@@ -149,6 +201,10 @@ def weld(
     seed: SeedOption = 0,
     browser: BrowserOption = True,
     realtime: RealtimeOption = False,
+    robot: RobotOption = None,
+    dry_run: DryRunOption = False,
+    pace: PaceOption = None,
+    speed_factor: SpeedFactorOption = None,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -157,7 +213,17 @@ def weld(
         from weldcal.tools.demo import DemoOptions, run_weld
 
         folder = out or fresh_folder("weld", scenario, seed)
-        options = DemoOptions(scenario=scenario, out=folder, seed=seed, browser=browser and not json, realtime=realtime)
+        options = DemoOptions(
+            scenario=scenario,
+            out=folder,
+            seed=seed,
+            browser=browser and not json,
+            realtime=realtime,
+            robot=robot,
+            dry_run=dry_run,
+            pace=pace,
+            speed_factor=speed_factor,
+        )
         with console.progress_bar("weld") as progress:
             result = run_weld(options, progress)
     finish("weld", result.summary(), result.folder, json_wanted=json)
@@ -194,6 +260,28 @@ def benchmark_seeds(
     finish("benchmark seeds", summary, folder, json_wanted=json)
 
 
+@benchmarks.command("robot-faults")
+def benchmark_robot_faults(
+    sequences: Annotated[int, typer.Option("--sequences", metavar="N", min=0, help="Random fault sequences.")] = 20,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Length of each.")] = 60.0,
+    address: AddressOption = "127.0.0.1",
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Every fault of the robot link at 0.05 m/s on an emulated controller: does the arm stop, stay, and say why."""
+    folder = out or fresh_folder("benchmark", "robot-faults", seed)
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark robot-faults") as progress:
+        from weldcal.tools.benchmarks.robot_faults import run_fault_benchmark
+
+        report = run_fault_benchmark(
+            folder, address=address, sequences=sequences, seconds=seconds, seed=seed, progress=progress
+        )
+    rows = {outcome.name: outcome.line for outcome in report.outcomes}
+    finish("benchmark robot-faults", report.summary(), folder, json_wanted=json, rows=rows)
+
+
 @app.command("emulate-ur", short_help="A UR controller on loopback.")
 def emulate_ur(
     polyscope: Annotated[
@@ -206,6 +294,9 @@ def emulate_ur(
     control_port: Annotated[
         int, typer.Option("--control-port", metavar="PORT", help="Where faults are injected, as JSON lines.")
     ] = 30090,
+    pace: Annotated[
+        float, typer.Option("--pace", metavar="P", help="Controller seconds per host second, 0.05 to 1.")
+    ] = 1.0,
     seed: SeedOption = 0,
     debug: DebugOption = False,
 ) -> None:
@@ -218,9 +309,31 @@ def emulate_ur(
             control_port=control_port,
             polyscope=polyscope,
             kinematics=kinematics,
+            pace=pace,
             seed=seed,
             ready=typer.echo,
         )
+
+
+@app.command("check-robot", short_help="Is this robot ready? Looks, moves nothing.")
+def check_robot(
+    host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """Is this robot ready? A table of what is right and what to change; nothing moves and nothing is written."""
+    with console.boundary(json_wanted=json, debug=debug):
+        from weldcal.systems.drivers.ur.preflight import preflight
+        from weldcal.tools.check_robot import as_json, emit_table
+
+        report = preflight(host)
+        if json:
+            console.emit_json(as_json(report))
+        else:
+            emit_table(report)
+    if report.first_problem is not None:
+        console.emit_warning(report.first_problem.remedy)
+        raise typer.Exit(1)
 
 
 @app.command(short_help="Show a finished run again.")

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 import webbrowser
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from pydrake.geometry import Meshcat, MeshcatParams
 
-from weldcal.models.errors import InputError
 from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus
@@ -24,20 +24,25 @@ from weldcal.tools.outcome import (
 )
 from weldcal.tools.report.demo_report import demo_pictures, demo_report
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.robots import chosen_robot
 from weldcal.tools.run_files import error_summary, write_calibration, write_scans, write_weld_csv
 from weldcal.tools.simulation import Progress, Run, no_progress, run_cell
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What a person may choose: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast as it goes."""
+    """What a person may choose: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast
+    as it goes; the robot (see chosen_robot; None: the scenario's), and how fast the arm's moves are (None: the scenario's)."""
 
     scenario: str
     out: Path
     seed: int = 0
     browser: bool = False
     realtime: bool = False
-    robot: str = "simulated"
+    robot: str | None = None
+    dry_run: bool = False
+    pace: float | None = None
+    speed_factor: float | None = None
     recording: bool = True
 
 
@@ -50,6 +55,7 @@ class DemoResult:
     status: CalibrationStatus
     calibration: CalibrationError | None
     weld: WeldOutcome | None
+    robot: str = "simulated"
 
     @property
     def folder(self) -> Path:
@@ -59,7 +65,7 @@ class DemoResult:
     @property
     def state(self) -> str:
         """`done`, or `held` with a reason."""
-        return "held" if self.run.job.command.held else "done"
+        return "held" if self.run.held else "done"
 
     @property
     def n_scans(self) -> int:
@@ -69,8 +75,9 @@ class DemoResult:
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
         found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
-        if self.run.job.command.reason:
-            found["reason"] = self.run.job.command.reason
+        found["robot"] = self.robot
+        if self.run.reason:
+            found["reason"] = self.run.reason
         if self.calibration is not None:
             found["X_BC_error_mm"] = 1e3 * self.calibration.translation_m
             found["X_BC_error_deg"] = float(np.degrees(self.calibration.rotation_rad))
@@ -97,6 +104,9 @@ class DemoResult:
         found["simulated_seconds"] = float(self.run.root.get_time())
         found["wall_seconds"] = self.run.wall_seconds
         found["real_time_factor"] = self.run.real_time_factor()
+        if self.run.clock is not None:
+            found["late_ms"], found["thinking_ms"] = 1e3 * self.run.clock.late_s, 1e3 * self.run.clock.thinking_s
+            found["reanchored"] = self.run.clock.reanchored
         return found
 
     def calibration_summary(self) -> dict[str, object]:
@@ -148,35 +158,38 @@ def run_scenario(scenario: Scenario, options: DemoOptions, progress: Progress = 
     """Build, run, measure, write.
 
     Raises:
-        InputError, UnreachableScanner: see make_cell; nothing has been written.
+        InputError, UnreachableScanner, RobotRefused: see chosen_robot and make_cell; nothing has been written or moved.
     """
-    if options.robot != "simulated":
-        raise InputError(f"There is no robot '{options.robot}' here: use --robot simulated.")
+    if options.speed_factor is not None:
+        scenario.job.speed_factor = options.speed_factor
+        check_scenario(scenario)
     progress("build the cell", 0.0)
     meshcat = None
-    if options.recording or options.browser:
-        meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
-    cell = make_cell(scenario, options.seed, meshcat)
-    if meshcat is not None:
-        _set_the_scene(meshcat)
-        if options.browser:
-            webbrowser.open(meshcat.web_url())
-            time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
-    run = run_cell(cell, progress, meshcat, options.realtime)
+    with chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot:
+        if options.recording or options.browser:
+            meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
+        cell = make_cell(scenario, options.seed, meshcat, robot.prepared)
+        with closing(cell.station):
+            if meshcat is not None:
+                _set_the_scene(meshcat)
+                if options.browser:
+                    webbrowser.open(meshcat.web_url())
+                    time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
+            run = run_cell(cell, progress, meshcat, options.realtime)
     progress("measure and write", 0.985)
-    result = measure(run, options)
+    result = measure(run, options, robot.title)
     write_result(result, meshcat)
     return result
 
 
-def measure(run: Run, options: DemoOptions) -> DemoResult:
+def measure(run: Run, options: DemoOptions, robot: str = "simulated") -> DemoResult:
     """Hold the run against the truth of its simulation."""
     cell, status = run.cell, calibration_status(run.cell, run.root)
     error = None
     truth = cell.station.truth.X_BC
     if status.estimate is not None and truth is not None:
         error = calibration_error(status.estimate.X_BC, truth, work_point(cell.scenario))
-    return DemoResult(options, run, status, error, weld_outcome(cell, run.root))
+    return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
 
 
 def write_result(result: DemoResult, meshcat: Meshcat | None) -> None:
@@ -184,7 +197,7 @@ def write_result(result: DemoResult, meshcat: Meshcat | None) -> None:
     folder, run = result.folder, result.run
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(run.cell, result.status, result.options.seed, folder)
-    write_scans(run, result.status, folder / "scans")
+    write_scans(run, result.status, folder / "scans", result.robot)
     if result.weld is not None:
         write_weld_csv(result.weld.log, folder)
     if meshcat is not None:

@@ -78,8 +78,11 @@ def write_calibration(cell: Cell, status: CalibrationStatus, seed: int, folder: 
     return save_result(result, folder)
 
 
-def write_scans(run: Run, status: CalibrationStatus, folder: Path) -> Path | None:
-    """Write the calibration scans as a dataset folder that `weldcal calibrate` reads again; None where there are none."""
+def write_scans(run: Run, status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:
+    """Write the calibration scans as a dataset folder that `weldcal calibrate` reads again; None where there are none.
+
+    `robot` is what moved the feature, for the dataset's note.
+    """
     cell, scanner = run.cell, run.cell.scenario.scanner
     observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
     if not observed or not isinstance(scanner, RenderedScanner):
@@ -92,7 +95,7 @@ def write_scans(run: Run, status: CalibrationStatus, folder: Path) -> Path | Non
         flange=feature_standard(cell.scenario).designation,
         scanner=scanner.preset,
         configuration="eye_on_base",
-        note="scans of a simulated run",
+        note=f"rendered scans of a run; robot: {robot}",
         feature_in_flange=Feature(
             _numbers(cell.X_FR.translation()), _numbers(cell.X_FR.rotation().ToQuaternion().wxyz())
         ),

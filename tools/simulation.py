@@ -1,25 +1,30 @@
-"""Running a cell: advance the Diagram until its job ends, note the wall time of each phase, keep every scan that was taken."""
+"""Running a cell: advance the Diagram until its job ends, keep to the wall clock where the robot is real, keep every scan."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
+from pydrake.systems.sensors import RgbdSensor
 
-from weldcal.systems.cell import Cell
+from weldcal.systems.cell import Cell, job_plan
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import Scan
 from weldcal.systems.operator_panel import PACE_SLIDER
+from weldcal.tools.pacing import WallClock, no_long_garbage_collections
 
 Progress = Callable[[str, float], None]
 # How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
 SHARES = {
     "start": 0.0,
+    "move_home": 0.0,
     "move_to_pose": 0.05,
     "move_to_verify": 0.28,
     "park": 0.31,
@@ -33,19 +38,39 @@ SHARES = {
 }
 
 
+AT_REST_RAD_S = 1e-3
+COMMANDED_RAD_S = 1e-6
+COMES_TO_REST_S = 1.0  # how long a run goes on after its job has ended, at most, until the arm is at rest
+
+
 def no_progress(stage: str, fraction: float) -> None:
     """For callers who do not watch."""
 
 
 @dataclass
 class Run:
-    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began."""
+    """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
+
+    `interrupted`: why a person ended it before its job had. `clock`: what kept it to the wall clock, where something did.
+    """
 
     cell: Cell
     simulator: Simulator
     wall_seconds: float = 0.0
     phases: list[tuple[str, float, float]] = field(default_factory=list)
     scans: dict[str, tuple[Scan, str]] = field(default_factory=dict)
+    interrupted: str | None = None
+    clock: WallClock | None = None
+
+    @property
+    def held(self) -> bool:
+        """The job did not come to its end."""
+        return self.interrupted is not None or self.job.command.held
+
+    @property
+    def reason(self) -> str | None:
+        """Why it did not."""
+        return self.interrupted or self.job.command.reason
 
     @property
     def root(self) -> Context:
@@ -68,18 +93,24 @@ class Run:
 def run_cell(
     cell: Cell, progress: Progress = no_progress, meshcat: Meshcat | None = None, realtime: bool = False
 ) -> Run:
-    """Advance until the job is done or held (or its own time limit holds it). Records into `meshcat` where one is given."""
-    simulator = Simulator(cell.diagram)
-    if realtime:
+    """Advance until the job is done or held (or its own time limit holds it) and the arm is at rest.
+
+    Records into `meshcat` where one is given. A station with a pace is kept to the wall clock. Whatever happens, Ctrl-C
+    included, the station is closed: its arm stops.
+    """
+    simulator, station = Simulator(cell.diagram), cell.station
+    run = Run(cell, simulator, clock=None if station.pace is None else WallClock(station.pace))
+    if realtime and run.clock is None:
         simulator.set_target_realtime_rate(1.0)
         if meshcat is not None:
             meshcat.SetSliderValue(PACE_SLIDER, 1.0)
-    run = Run(cell, simulator)
     start = time.perf_counter()
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
+    finished_at = np.inf
 
     def watch(root: Context) -> EventStatus:
+        nonlocal finished_at
         command = cell.sequencer.job_state(cell.sequencer.GetMyContextFromRoot(root)).command
         if not run.phases or command.phase != run.phases[-1][0]:
             _keep_scan(run, root)
@@ -87,20 +118,54 @@ def run_cell(
             progress(command.phase.replace("_", " "), _share(run, root, command.phase))
         elif command.phase == "weld" and int(root.get_time() / 0.002) % 500 == 0:
             progress("weld", _share(run, root, "weld"))
-        if cell.diagram.HasSubsystemNamed("operator_panel") and int(root.get_time() / 0.002) % 50 == 0:
+        if run.clock is not None:
+            run.clock.wait_for(root.get_time(), _commanded(cell, root))
+        elif cell.diagram.HasSubsystemNamed("operator_panel") and int(root.get_time() / 0.002) % 50 == 0:
             _keep_pace(run, root)
         if command.finished:
-            return EventStatus.ReachedTermination(cell.sequencer, command.phase)
+            finished_at = min(finished_at, root.get_time())
+            if _at_rest(cell, root) or root.get_time() - finished_at > COMES_TO_REST_S:
+                return EventStatus.ReachedTermination(cell.sequencer, command.phase)
         return EventStatus.DidNothing()
 
     simulator.set_monitor(watch)
-    simulator.Initialize()
-    simulator.AdvanceTo(cell.scenario.job.maximum_time_s + 5.0)
+    try:
+        with nullcontext() if run.clock is None else no_long_garbage_collections():
+            if run.clock is not None:
+                _first_pictures(cell, run.root)
+            simulator.Initialize()
+            simulator.AdvanceTo(job_plan(cell.scenario).maximum_time_s + 5.0)
+    except KeyboardInterrupt:
+        run.interrupted = f"A person stopped the run with Ctrl-C, in the phase '{run.job.command.phase}'."
+    finally:
+        station.close()
     run.wall_seconds = time.perf_counter() - start
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
     return run
+
+
+def _commanded(cell: Cell, root: Context) -> bool:
+    """Whether the arm is told to move."""
+    station = cell.station.diagram
+    command = station.GetInputPort("ur10e.velocity_command").Eval(station.GetMyContextFromRoot(root))
+    return bool(np.max(np.abs(command)) > COMMANDED_RAD_S)
+
+
+def _at_rest(cell: Cell, root: Context) -> bool:
+    station = cell.station.diagram
+    measured = station.GetOutputPort("ur10e.velocity_measured").Eval(station.GetMyContextFromRoot(root))
+    return bool(np.max(np.abs(measured)) < AT_REST_RAD_S)
+
+
+def _first_pictures(cell: Cell, root: Context) -> None:
+    """A renderer's first picture takes a second: let it be taken while nothing moves."""
+    for system in cell.station.diagram.GetSystems():
+        if isinstance(system, RgbdSensor):
+            context = system.GetMyContextFromRoot(root)
+            for port in (system.color_image_output_port(), system.depth_image_32F_output_port()):
+                port.Eval(context)
 
 
 def _keep_pace(run: Run, root: Context) -> None:

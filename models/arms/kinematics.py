@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -113,7 +113,8 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
         nominal = stack
         stack, calibration = _read_kinematics(Path(kinematics))
         stack = _slide_to_nominal(stack, nominal)
-        _require_same_arm(stack, nominal, name, Path(kinematics))
+        advice = f"give the calibration of a {name}, in metres and radians"
+        _require_same_arm(stack, nominal, name, Path(kinematics).name, advice)
     limits = _read(folder / "joint_limits.yaml", "joint_limits")
     physical = folder / "physical_parameters.yaml"
     inertia = _read(physical, "inertia_parameters")
@@ -147,6 +148,21 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
         dh=DenavitHartenberg(**{k: _number(dh, k) for k in ("d1", "a2", "a3", "d4", "d5", "d6")}),
         calibration=calibration,
     )
+
+
+def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, source: str) -> ArmModel:
+    """The same arm with a robot's own link transforms: (6, 4, 4), X_{i-1,i}(0), rad and m.
+
+    As in `load_arm`, the link frames are slid along their own joint axes to where those of `arm` lie, which changes no
+    flange pose. `calibration` names the calibration (None: nominal), `source` says in an error whose kinematics these are.
+
+    Raises:
+        InputError: the transforms are another arm's.
+    """
+    stack = _slide_to_nominal(stack, arm.stack)
+    advice = f"connect a {arm.name}, or name this robot's arm in the scenario"
+    _require_same_arm(stack, arm.stack, arm.name, source, advice)
+    return replace(arm, stack=_frozen(stack), calibration=calibration)
 
 
 def forward_kinematics(arm: ArmModel, q: ArrayLike) -> RigidTransform:
@@ -227,15 +243,12 @@ def _slide_to_nominal(stack: Array, nominal: Array) -> Array:
     return out
 
 
-def _require_same_arm(stack: Array, nominal: Array, name: str, path: Path) -> None:
+def _require_same_arm(stack: Array, nominal: Array, name: str, source: str, advice: str) -> None:
     """Raise InputError where the calibrated flange strays far from the nominal one in some fixed set of postures."""
     postures = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, 6))
     shift = max(float(np.linalg.norm((_chain(stack, q) - _chain(nominal, q))[5, :3, 3])) for q in postures)
-    if shift > MAX_CALIBRATION_SHIFT_M:
-        raise InputError(
-            f"{path.name} moves the flange by {shift * 1e3:.0f} mm from a nominal {name}: "
-            f"give the calibration of a {name}, in metres and radians."
-        )
+    if not shift <= MAX_CALIBRATION_SHIFT_M:
+        raise InputError(f"{source} moves the flange by {shift * 1e3:.0f} mm from a nominal {name}: {advice}.")
 
 
 def _read_kinematics(path: Path) -> tuple[Array, str]:

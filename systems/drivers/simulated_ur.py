@@ -15,13 +15,9 @@ from weldcal.systems.messages import UrStatus
 
 @dc.dataclass
 class SimulatedUr:
-    """`!SimulatedUr`: the arm as a MultibodyPlant with gravity compensated."""
+    """`!SimulatedUr`: the controller's speedj over the arm of the simulated world."""
 
     control_period_s: float = 0.002  # 500 Hz, as the real controller
-    stiffness: list[float] = dc.field(
-        default_factory=lambda: [2e5, 2e5, 1e5, 2e4, 2e4, 1e4]
-    )  # N m / rad, of the joint servos
-    damping: list[float] = dc.field(default_factory=lambda: [4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2])  # N m s / rad
     following_error_rad: float = 0.05  # beyond this the controller stops the arm
 
 
@@ -47,14 +43,14 @@ class SpeedJointServo(LeafSystem):
     the arm by more than the following error latches a fault and the reference freezes.
     """
 
-    def __init__(self, arm: ArmModel, config: SimulatedUr, q_home: np.ndarray) -> None:
+    def __init__(self, arm: ArmModel, config: SimulatedUr, q_start: np.ndarray) -> None:
         super().__init__()
         self._arm = arm
         self._config = config
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._arm_state = self.DeclareVectorInputPort("arm_state", 12)
         # q_ref, v_ref, q, v, sample time, fault
-        state = self.DeclareDiscreteState(np.concatenate([q_home, np.zeros(6), q_home, np.zeros(6), [0.0, 0.0]]))
+        state = self.DeclareDiscreteState(np.concatenate([q_start, np.zeros(6), q_start, np.zeros(6), [0.0, 0.0]]))
         ticket = {self.discrete_state_ticket(state)}
         self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
         self.DeclareVectorOutputPort("position_measured", 6, self._position, ticket)
@@ -98,14 +94,18 @@ class SpeedJointServo(LeafSystem):
 
     def _status(self, context: Context, output: Any) -> None:
         fault = bool(context.get_discrete_state_vector().value()[25])
-        text = "the arm did not follow its command, or the command was not finite" if fault else None
+        text = (
+            "The simulated arm stopped: it did not follow its command, or the command was not finite."
+            if fault
+            else None
+        )
         output.set_value(UrStatus(safety_mode="PROTECTIVE_STOP" if fault else "NORMAL", fault=text))
 
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
     """Add the servo and wire it to the arm of the simulated world."""
     world = build.simulated_world()
-    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_home))
+    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start))
     servo.set_name("ur10e_servo")
     build.builder.Connect(world.plant.get_state_output_port(world.arm), servo.GetInputPort("arm_state"))
     build.builder.Connect(servo.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))

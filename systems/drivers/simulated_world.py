@@ -48,7 +48,6 @@ from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
 from weldcal.welding.deformation import TagModel, tag_cells
@@ -62,6 +61,8 @@ SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
 CELL_PX = 16  # texels of a tag cell: about those of the camera's picture of it, so that interpolation smooths the edges
 TIP_FRICTION = 0.2  # soft tip on steel
+JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of the arm's joint servos
+JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
 
 
 @dataclass(frozen=True)
@@ -216,8 +217,7 @@ def build_world(
     builder: DiagramBuilder,
     arm: ArmModel,
     tool: WeldingTool | None,
-    robot: SimulatedUr,
-    q_home: np.ndarray,
+    q_start: np.ndarray,
     *,
     flange: str,
     table_z_m: float,
@@ -225,8 +225,9 @@ def build_world(
     X_BP: RigidTransform | None,
     time_step_s: float = 0.002,
 ) -> SimulatedWorld:
-    """Build the plant with everything the station needs; the arm hangs in its implicit joint servos.
+    """Build the plant with everything the station needs; the arm stands at `q_start` and hangs in its implicit joint servos.
 
+    A robot's driver says where they pull it: the simulated controller, or a real arm whose shadow this one then is.
     Frame: the world is the robot base B. `workpiece` is the real part (it may differ from its CAD), placed at X_BP.
     """
     plant, scene_graph = AddMultibodyPlant(
@@ -255,12 +256,12 @@ def build_world(
         )
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
-        servo.set_controller_gains(PdControllerGains(p=robot.stiffness[k], d=robot.damping[k]))
+        servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
     plant.Finalize()
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):
         raise RuntimeError("the six joint servos of the arm are not in place")
-    plant.SetDefaultPositions(instance, q_home)
+    plant.SetDefaultPositions(instance, q_start)
     _compensate_gravity(builder, plant, [m for m in (instance, tool_instance) if m is not None])
     if tool_instance is not None:
         rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))

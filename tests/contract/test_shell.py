@@ -178,6 +178,14 @@ def test_test_runs_pytest_in_the_project(machine: Machine) -> None:
     assert "browser" not in finished.stderr
 
 
+def test_all_tests_run_side_by_side_but_those_of_the_emulated_robot_one_by_one(machine: Machine) -> None:
+    said = machine.run("test").stdout.splitlines()
+    assert said.count("<pytest>") == 2
+    first, second = said[: said.index("<pytest>", said.index("<pytest>") + 1)], said[-1]
+    assert ["<--ignore>", "<tests/hardware>"] == first[first.index("<--ignore>") : first.index("<--ignore>") + 2]
+    assert second == "<tests/hardware>"
+
+
 def test_without_a_browser_the_tests_still_run_and_the_line_to_type_is_shown(machine: Machine) -> None:
     finished = machine.run("test")
     assert finished.returncode == 0

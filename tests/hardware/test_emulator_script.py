@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import re
+import socket
+import struct
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
 
 from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arms.urdf import arm_urdf
 from weldcal.tools.ur_emulator.controller import Controller
 from weldcal.tools.ur_emulator.main import HOME
 from weldcal.tools.ur_emulator.modes import RuntimeState, SafetyMode
 from weldcal.tools.ur_emulator.program import Program
+from weldcal.tools.ur_emulator.script_dynamics import Dynamics, mass_matrix
 from weldcal.tools.ur_emulator.script_lexer import split_programs
 from weldcal.tools.ur_emulator.script_syntax import ScriptError
 from weldcal.tools.ur_emulator.versions import parse_version
@@ -260,3 +266,67 @@ def test_what_the_arm_cannot_do_is_a_protective_stop(line: str, why: str) -> Non
     assert re.search(why, "\n".join(made.log))
     assert not made.arm.qd.any()
     assert (np.abs(made.arm.q) <= made.arm.model.position_upper).all()
+
+
+def test_a_script_talks_to_a_server_and_waits_no_longer_than_it_says() -> None:
+    made = controller()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        made.submit(
+            f"""def talk():
+              textmsg("open ", socket_open("127.0.0.1", {port}, "s"))
+              socket_send_line("hello", "s")
+              socket_send_int(-2, "s")
+              textmsg("floats ", socket_read_ascii_float(2, "s"))
+              textmsg("ints ", socket_read_binary_integer(2, "s"))
+              textmsg("line ", socket_read_line("s"))
+              textmsg("late ", socket_read_line("s", 0.1))
+              textmsg("elsewhere ", socket_open("10.0.0.1", 80))
+            end
+            """
+        )
+        made.step()
+        with server.accept()[0] as peer:
+            assert peer.recv(64) == b"hello\n" + struct.pack(">i", -2)
+            peer.sendall(b"(1.5, -2e-1)" + struct.pack(">2i", 7, -8) + b"bye\n")
+            frames(made, 10)
+            assert made.runtime_state == RuntimeState.PLAYING
+            frames(made, 50)
+            assert peer.recv(64) == b""  # the program has ended, and its sockets with it
+    assert made.runtime_state == RuntimeState.STOPPED
+    said = [line.split("script: ")[1] for line in made.log if "script: " in line]
+    assert said == ["open True", "floats [2, 1.5, -0.2]", "ints [2, 7, -8]", "line bye", "late ", "elsewhere False"]
+
+
+def test_functions_come_with_their_version() -> None:
+    asked = "def q():\nj = get_jacobian()\ntextmsg(j[0, 1])\nend\n"
+    for version, known in (("5.21", False), ("5.23", True), ("10.7", False), ("10.12", True)):
+        made = Controller(load_arm(), np.array(HOME), parse_version(version))
+        assert made.start(asked) is known
+
+
+def test_coriolis_torques_are_those_of_the_mass_matrix() -> None:
+    # the power they take is half the change of the mass matrix: qd' c = qd' dM/dt qd / 2 (dM/dt - 2C is skew)
+    made = Controller(load_arm(), np.array(HOME), parse_version("5.23"))
+    functions = Dynamics(made, None)  # type: ignore[arg-type]
+    q, qd, step = np.array(HOME) + 0.3, np.array([0.5, -0.4, 0.3, 0.2, -0.6, 0.1]), 1e-6
+    torques = np.array(functions.get_coriolis_and_centrifugal_torques(q.tolist(), qd.tolist()))
+    rate = (mass_matrix(made.arm.model, q + step * qd) - mass_matrix(made.arm.model, q - step * qd)) / (2 * step)
+    assert qd @ torques == pytest.approx(0.5 * qd @ rate @ qd, rel=1e-6)
+    J_rate = np.array(functions.get_jacobian_time_derivative(q.tolist(), qd.tolist()))
+    ahead, behind = (np.array(functions.get_jacobian((q + s * qd).tolist())) for s in (1e-4, -1e-4))
+    # the two steps of the difference, 1e-4 s of a smooth function: second order
+    assert np.abs(J_rate - (ahead - behind) / 2e-4).max() < 1e-7
+
+
+def test_the_mass_matrix_is_that_of_drakes_plant() -> None:
+    model = load_arm()
+    plant = MultibodyPlant(0.0)
+    parser = Parser(plant)
+    (robot,) = parser.AddModelsFromString(arm_urdf(model), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", robot))
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    q = np.array(HOME) + 0.3
+    plant.SetPositions(context, q)
+    assert np.abs(plant.CalcMassMatrix(context) - mass_matrix(model, q)).max() < 1e-9

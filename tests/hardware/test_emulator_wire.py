@@ -11,52 +11,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.hardware.emulator_process import HOST, Emulator, running_emulator
+from tests.hardware.bare_rtde import Rtde
+from tests.hardware.emulator_process import HOST, Emulator, emulator_process
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.models.errors import InputError
 from weldcal.tools.ur_emulator.dh import dh_parameters
 from weldcal.tools.ur_emulator.rtde_fields import inputs, outputs
 
 
 @pytest.fixture(scope="module")
 def shared() -> Iterator[Emulator]:
-    with running_emulator() as made:
+    with emulator_process() as made:
         yield made
-
-
-class Rtde:
-    """A bare RTDE client."""
-
-    def __init__(self, version: int = 2) -> None:
-        self.socket = socket.create_connection((HOST, 30004), timeout=5.0)
-        assert self.send(b"V", struct.pack(">H", version)) == b"\x01"
-
-    def exactly(self, count: int) -> bytes:
-        data = b""
-        while len(data) < count:
-            piece = self.socket.recv(count - len(data))
-            assert piece, "the controller closed the connection"
-            data += piece
-        return data
-
-    def receive(self, kind: bytes) -> bytes:
-        while True:
-            size, found = struct.unpack(">HB", self.exactly(3))
-            payload = self.exactly(size - 3)
-            if bytes([found]) == kind:
-                return payload
-
-    def send(self, kind: bytes, payload: bytes = b"") -> bytes:
-        self.put(kind, payload)
-        return self.receive(kind)
-
-    def put(self, kind: bytes, payload: bytes = b"") -> None:
-        self.socket.sendall(struct.pack(">H", len(payload) + 3) + kind + payload)
-
-    def __enter__(self) -> Rtde:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.socket.close()
 
 
 def test_the_first_words_are_those_of_the_guide(shared: Emulator) -> None:
@@ -69,16 +35,71 @@ def test_the_first_words_are_those_of_the_guide(shared: Emulator) -> None:
     assert struct.unpack(">4I", answer[3:]) == (5, 21, 1, 0)
 
 
+# Universal Robots' RTDE guide and the exhaustive recipe of its client library, by type; registers are counted below.
+TABLE = {
+    "DOUBLE": """timestamp actual_execution_time target_execution_time speed_scaling target_speed_fraction
+        actual_momentum actual_main_voltage actual_robot_voltage actual_robot_current standard_analog_input0
+        standard_analog_input1 standard_analog_output0 standard_analog_output1 io_current actual_robot_energy_consumed
+        actual_robot_braking_energy_dissipated euromap67_24V_voltage euromap67_24V_current tool_analog_input0
+        tool_analog_input1 tool_output_current tool_temperature tcp_force_scalar joint_position_deviation_ratio
+        collision_detection_ratio payload""",
+    "VECTOR6D": """target_q target_qd target_qdd target_current target_moment actual_q actual_qd actual_current
+        actual_current_window actual_current_as_torque joint_control_output actual_TCP_pose actual_TCP_speed
+        actual_TCP_force target_TCP_pose target_TCP_speed tcp_offset actual_TCP_acceleration target_TCP_acceleration
+        joint_temperatures actual_joint_voltage ft_raw_wrench wrench_calc_from_currents payload_inertia
+        target_base_acceleration target_base_wrench""",
+    "VECTOR3D": "actual_tool_accelerometer elbow_position elbow_velocity payload_cog target_gravity",
+    "VECTOR6INT32": "joint_mode",
+    "INT32": """robot_mode safety_mode safety_status encoder0_raw encoder1_raw tool_output_voltage
+        time_scale_source""",
+    "UINT32": """runtime_state robot_status_bits safety_status_bits analog_io_types euromap67_input_bits
+        euromap67_output_bits tool_mode tool_analog_input_types script_control_line""",
+    "UINT64": """actual_digital_input_bits actual_configurable_digital_input_bits actual_digital_output_bits
+        actual_configurable_digital_output_bits control_step""",
+    "UINT8": "tool_output_mode tool_digital_output0_mode tool_digital_output1_mode",
+}
+INPUT_TABLE = {
+    "DOUBLE": "speed_slider_fraction standard_analog_output_0 standard_analog_output_1",
+    "UINT32": "speed_slider_mask",
+    "UINT8": """standard_digital_output_mask standard_digital_output configurable_digital_output_mask
+        configurable_digital_output tool_digital_output_mask tool_digital_output standard_analog_output_mask
+        standard_analog_output_type""",
+    "VECTOR6D": "external_force_torque",
+}
+
+
+def by_name(table: dict[str, str], *banks: str) -> dict[str, str]:
+    """Type by name, with the general purpose registers of these banks."""
+    types = {name: kind for kind, names in table.items() for name in names.split()}
+    for bank in banks:
+        types |= {f"{bank}_bit_registers0_to_31": "UINT32", f"{bank}_bit_registers32_to_63": "UINT32"}
+        types |= {f"{bank}_bit_register_{i}": "BOOL" for i in range(64, 128)}
+        types |= {f"{bank}_{kind}_register_{i}": code for kind, code in REGISTERS.items() for i in range(48)}
+    return types
+
+
+REGISTERS = {"int": "INT32", "double": "DOUBLE"}
+
+
+def answered(client: Rtde, kind: bytes, names: list[str], head: bytes = b"") -> dict[str, str]:
+    """The controller's types of these names, asked for 40 at a time."""
+    types: list[str] = []
+    for i in range(0, len(names), 40):
+        types += client.send(kind, head + ",".join(names[i : i + 40]).encode())[1:].decode().split(",")
+    return dict(zip(names, types, strict=True))
+
+
 def test_the_whole_public_table_is_served(shared: Emulator) -> None:
-    # 82 values and 2 x 162 registers out, 162 registers and 13 others in, as the guide's newest edition lists them
-    assert (len(outputs()), len(inputs())) == (82 + 2 * 162, 162 + 13)
+    out, into = by_name(TABLE, "input", "output"), by_name(INPUT_TABLE, "input")
+    assert (len(out), len(into)) == (82 + 2 * 162, 162 + 13)
+    assert {name: field.type for name, field in outputs().items()} == out
+    assert {name: field.type for name, field in inputs().items()} == into
     with Rtde() as client:
-        for name, field in outputs().items():
-            answer = client.send(b"O", struct.pack(">d", 125.0) + name.encode())
-            newer = name == "actual_current_as_torque"  # 5.23
-            assert answer[1:].decode() == ("NOT_FOUND" if newer else field.type)
-        for name, entry in inputs().items():
-            assert client.send(b"I", name.encode())[1:].decode() == entry.type
+        # 5.23 brought one more
+        assert answered(client, b"O", list(out), struct.pack(">d", 125.0)) == out | {
+            "actual_current_as_torque": "NOT_FOUND"
+        }
+        assert answered(client, b"I", list(into)) == into
 
 
 def test_recipes_take_a_trailing_comma_and_refuse_unknown_names(shared: Emulator) -> None:
@@ -226,9 +247,19 @@ def test_the_real_time_port_streams_1220_bytes(shared: Emulator) -> None:
 def calibrated(folder: Path) -> Path:
     """A factory calibration of the kind a robot has: tenths of a millimetre and of a milliradian, axes not parallel."""
     text = (Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml").read_text()
-    forearm = "x: {}\n    y: 0.0\n    z: 0.0\n    roll: {}"
-    text = text.replace(forearm.format("-0.6127", "0.0"), forearm.format("-0.6131", "3e-4"))
-    text = text.replace("z: 0.1807", "z: 0.1810")
+    changes = {
+        "z: 0.1807": "z: 0.1810",
+        "x: -0.6127\n    y: 0.0\n    z: 0.0\n    roll: 0.0\n    pitch: 0.0\n    yaw: 0.0": (
+            "x: -0.6131\n    y: 2e-4\n    z: 1e-4\n    roll: 3e-4\n    pitch: -1.2e-3\n    yaw: 4e-4"
+        ),
+        "z: 0.17415\n    roll: 0.0\n    pitch: 0.0": "z: 0.1743\n    roll: -5e-4\n    pitch: 2e-4",
+        "y: -0.11985\n    z: 0.0\n    roll: 1.5707963267948966\n    pitch: 0.0": (
+            "y: -0.1199\n    z: 1e-4\n    roll: 1.5712\n    pitch: 3e-4"
+        ),
+    }
+    for nominal, robots in changes.items():
+        assert text.count(nominal) == 1
+        text = text.replace(nominal, robots)
     path = folder / "calibration.yaml"
     path.write_text(text.replace("kinematics:", "kinematics:\n  hash: calib_1", 1))
     return path
@@ -238,7 +269,30 @@ def test_a_calibrated_chain_is_written_as_a_robot_writes_it(tmp_path: Path) -> N
     arm = load_arm("ur10e", calibrated(tmp_path))
     dh = dh_parameters(arm)
     numbers = np.array([dh.theta, dh.a, dh.d, dh.alpha])
+    assert np.abs(numbers[2, 1:4]).max() > 100.0
     for q in np.random.default_rng(0).uniform(-3, 3, (20, 6)):
         # rounding of lengths that cancel: 1e-16 of up to 1 km
         assert np.abs(chain(numbers, q) - forward_kinematics(arm, q).GetAsMatrix4()).max() < 1e-9
     assert arm.calibration == "calib_1"
+
+
+def test_nominal_numbers_come_out_as_they_are_published() -> None:
+    dh, half = dh_parameters(load_arm()), np.pi / 2.0
+    assert np.array([dh.theta, dh.a, dh.d, dh.alpha]) == pytest.approx(
+        np.array(
+            [
+                [0.0] * 6,
+                [0.0, -0.6127, -0.57155, 0.0, 0.0, 0.0],
+                [0.1807, 0.0, 0.0, 0.17415, 0.11985, 0.11655],
+                [half, 0.0, 0.0, half, -half, 0.0],
+            ]
+        ),
+        abs=1e-12,
+    )
+
+
+def test_a_first_axis_that_is_not_the_bases_cannot_be_said(tmp_path: Path) -> None:
+    tilted = calibrated(tmp_path)
+    tilted.write_text(tilted.read_text().replace("z: 0.1810\n    roll: 0.0", "z: 0.1810\n    roll: 1e-4"))
+    with pytest.raises(InputError, match="first joint"):
+        dh_parameters(load_arm("ur10e", tilted))

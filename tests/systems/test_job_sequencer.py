@@ -130,8 +130,19 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert world.arrive() == "done"
     assert (world.command.mode, world.command.finished, world.command.held) == ("hold", True, False)
     passed = [phase for _, phase in world.state.log]
-    assert {*PHASES, "done"} == set(passed)
+    assert {*PHASES, "done"} == {*passed, "move_home"}, "it stood at home already"
     assert [t for t, _ in world.state.log] == sorted(t for t, _ in world.state.log)
+
+
+@pytest.mark.parametrize("calibrate", [True, False])
+def test_an_arm_that_stands_elsewhere_goes_home_first(calibrate: bool) -> None:
+    world = World(dc.replace(PLAN, calibrate=calibrate))
+    assert world.look(q=Q_HOME + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.02])) == "move_home"
+    assert (world.command.mode, world.command.process_on) == ("move", False)
+    assert world.command.q_goal is Q_HOME
+    before = world.command.goal_id
+    assert world.arrive() == ("move_to_verification_cloud" if calibrate else "park")
+    assert world.command.goal_id == before + 1
 
 
 def test_a_job_that_only_calibrates_ends_at_home() -> None:
@@ -194,7 +205,7 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         {"robot": UrStatus(safety_mode="PROTECTIVE_STOP")},
         "The robot stopped: PROTECTIVE",
     ),
-    "robot fault": ("park", 0.1, {"robot": UrStatus(fault="it hit a wall")}, "The robot stopped: it hit a wall"),
+    "robot fault": ("park", 0.1, {"robot": UrStatus(fault="WALL: it hit a wall.")}, "^WALL: it hit a wall.$"),
     "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person held the job, in the phase 'weld'"),
     "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
     "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),

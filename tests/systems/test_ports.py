@@ -17,6 +17,7 @@ from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDat
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 import weldcal.systems
+from tests.systems.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
@@ -27,6 +28,7 @@ from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.drivers.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
+from weldcal.systems.drivers.ur_rtde import UrRtdeArm
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
@@ -60,6 +62,7 @@ JOB = JobPlan(True, True, Q_HOME, 10, 1, 5e-4, 1e-4)
 
 MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
+    UrRtdeArm: lambda: UrRtdeArm(the_arm(), StillLink(Q_HOME), 1.0),
     DepthSensor: lambda: DepthSensor(IDEAL, 0, 0.1),
     StreamingColourCamera: lambda: StreamingColourCamera(RenderedFingerCamera(), 0, 0.002),
     PoseRecorder: PoseRecorder,
@@ -88,6 +91,15 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     SpeedJointServo: {
         "velocity_command": 6,
         "arm_state": 12,
+        "desired_state": 12,
+        "position_measured": 6,
+        "velocity_measured": 6,
+        "X_BF": RigidTransform,
+        "sample_time": 1,
+        "status": UrStatus,
+    },
+    UrRtdeArm: {
+        "velocity_command": 6,
         "desired_state": 12,
         "position_measured": 6,
         "velocity_measured": 6,

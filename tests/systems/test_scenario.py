@@ -14,6 +14,8 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load
 
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
 from weldcal.systems.scenario_numbers import check_numbers
 
@@ -25,8 +27,6 @@ flange: iso9409-1-80-6-m8
 tool: none
 robot: !SimulatedUr
   control_period_s: 0.004
-  stiffness: [1.0e+5, 1.1e+5, 1.2e+5, 1.3e+4, 1.4e+4, 1.5e+4]
-  damping: [1.0e+3, 1.1e+3, 1.2e+3, 130.0, 140.0, 150.0]
   following_error_rad: 0.1
 scanner: !RenderedScanner
   preset: azure_kinect
@@ -78,6 +78,7 @@ job:
   calibrate: false
   weld: false
   X_BC: {xyz_m: [0.61, 0.11, 1.01], rpy_deg: [171.0, 3.0, -84.0]}
+  speed_factor: 0.5
   maximum_time_s: 100.0
 visualization:
   recording_fps: 20.0
@@ -146,6 +147,27 @@ def test_overrides_change_what_they_name_and_nothing_else() -> None:
     assert changed == plain
 
 
+ROBOT_OF_ITS_OWN = """
+robot: !UrRtde
+  host: 192.168.1.10
+  rate_hz: 500.0
+  pace: 0.5
+  velocity_share: 0.3
+  upper_registers: false
+  payload_kg: 2.0
+  payload_cog_m: [0.01, 0.02, 0.06]
+"""
+
+
+def test_one_word_changes_the_robot_and_none_of_its_options_is_lost() -> None:
+    loaded = load_scenario("s_groove", ROBOT_OF_ITS_OWN)
+    assert isinstance(loaded.robot, UrRtde)
+    text = {k: v for k, v in yaml_load(data=ROBOT_OF_ITS_OWN)["robot"].items() if k != "_tag"}
+    assert compare(UrRtde, text, loaded.robot, UrRtde()) == []
+    loaded.robot = SimulatedUr()
+    assert loaded == load_scenario("s_groove")
+
+
 def test_a_device_can_be_said_to_be_absent() -> None:
     loaded = load_scenario("s_groove", "finger_camera: !NoDevice {}\njob: {weld: false}")
     assert isinstance(loaded.finger_camera, NoDevice)
@@ -170,7 +192,14 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
     ("overrides", "named"),
     [
         ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
-        ("robot: !SimulatedUr {stiffness: [1, 2]}", "robot.stiffness must hold 6 numbers, not 2"),
+        ("calibration: {work_point_m: [1, 2]}", "calibration.work_point_m must hold 3 numbers, not 2"),
+        ("robot: !UrRtde {payload_cog_m: [1, 2]}", "robot.payload_cog_m must hold 3 numbers, not 2"),
+        ("robot: !UrRtde {payload_kg: -1}", "robot.payload_kg must not be negative"),
+        ("robot: !UrRtde {rate_hz: 0}", "robot.rate_hz must be a positive number"),
+        ("robot: !UrRtde {pace: 0}", "robot.pace must be a positive number"),
+        ("robot: !UrRtde {velocity_share: 0}", "robot.velocity_share must be a positive number"),
+        ("job: {speed_factor: 0.01}", "job.speed_factor must be from 0.05 to 1, and it is 0.01"),
+        ("job: {speed_factor: 1.5}", "job.speed_factor must be from 0.05 to 1, and it is 1.5"),
         ("finger_camera: !RenderedFingerCamera {rate_hz: 0}", "finger_camera.rate_hz must be a positive number"),
         ("calibration: {verification_limit_mm: .nan}", "calibration.verification_limit_mm must be finite"),
         ("calibration: {verification_scans: -1}", "calibration.verification_scans must not be negative"),
@@ -189,7 +218,7 @@ def test_a_number_that_no_cell_can_work_with_is_named(overrides: str, named: str
     [
         ("speeling: 1", "'speeling'"),
         ("welding: {speed_mm_per_s: 3}", "'speed_mm_per_s'"),
-        ("robot: !SimulatedUr {stifness: []}", "'stifness'"),
+        ("robot: !SimulatedUr {following_eror_rad: 1}", "'following_eror_rad'"),
         ("robot: !RealUr {}", "'RealUr'.*'robot'"),
         ("scanner: !RenderedFingerCamera {}", "'RenderedFingerCamera'.*'scanner'"),
         ("job: {calibrate: maybe}", "'calibrate'.*maybe"),

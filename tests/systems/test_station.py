@@ -11,13 +11,15 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import VectorLogSink
 
 from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.errors import InputError
 from weldcal.systems.drivers import rendered_finger_camera, rendered_scanner, simulated_ur
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
-from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Image, JobCommand, Scan
+from weldcal.systems.scenario import Scenario
 from weldcal.systems.station import Station, apply_driver_config, make_station
 
 from .cells import EXACT_PLATE, Q_HOME, TOOL, Drive, plain_station, scenario, the_arm, weld_only_cell
@@ -66,6 +68,71 @@ def test_an_absent_device_adds_nothing() -> None:
     build = StationBuild(DiagramBuilder(), the_arm(), TOOL, Q_HOME, np.random.default_rng(0))
     assert apply_driver_config(NoDevice(), build) is None
     assert (build.inputs, build.outputs) == ({}, {})
+
+
+class OpenLine:
+    """Something that a driver holds open."""
+
+    def __init__(self) -> None:
+        self.closed = 0
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+def found_robot() -> PreparedRobot:
+    return PreparedRobot(dc.replace(the_arm(), calibration="its own"), Q_HOME + 0.05, OpenLine(), 0.5)
+
+
+def test_a_driver_may_say_which_arm_there_is_and_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, asked = found_robot(), []
+    monkeypatch.setattr(
+        simulated_ur, "PrepareRobot", lambda *arguments: asked.append(arguments) or robot, raising=False
+    )
+    bare = Scenario(scanner=NoDevice(), finger_camera=NoDevice(), home_deg=np.rad2deg(Q_HOME).tolist())
+    station = make_station(bare, 0)
+    assert [type(a) for a in asked[0]] == [SimulatedUr, type(the_arm())]
+    assert (station.arm, station.q_start is robot.q_start, station.pace) == (robot.arm, True, 0.5)
+    drive = Drive(station)
+    assert drive.get("ur10e.position_measured") == pytest.approx(robot.q_start)
+    assert station.world.plant.GetPositions(drive.plant, station.world.arm) == pytest.approx(robot.q_start)
+    station.close()
+    assert isinstance(robot.handle, OpenLine)
+    assert robot.handle.closed == 1
+
+
+def test_a_driver_that_says_nothing_has_the_scenarios_arm_at_home() -> None:
+    station = plain_station()
+    assert station.q_start == pytest.approx(np.deg2rad(scenario().home_deg))
+    assert station.pace is None
+    station.close()
+
+
+def test_a_robot_that_was_found_already_is_not_looked_for() -> None:
+    robot = found_robot()
+    assert make_station(scenario(), 0, robot).arm is robot.arm
+
+
+def test_a_station_that_cannot_be_built_lets_go_of_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise InputError("The scanner is broken.")
+
+    monkeypatch.setattr(rendered_scanner, "ApplyDriverConfig", broken)
+    robot = found_robot()
+    with pytest.raises(InputError, match="broken"):
+        make_station(scenario(), 0, robot)
+    assert isinstance(robot.handle, OpenLine)
+    assert robot.handle.closed == 1
+
+
+def test_the_seed_draws_the_same_world_wherever_the_arm_stands() -> None:
+    one, other = make_station(scenario(), 3).truth, make_station(scenario(), 3, found_robot()).truth
+    assert one.X_BC is not None
+    assert other.X_BC is not None
+    assert one.X_BP is not None
+    assert other.X_BP is not None
+    assert one.X_BC.IsExactlyEqualTo(other.X_BC)
+    assert one.X_BP.IsExactlyEqualTo(other.X_BP)
 
 
 def test_a_simulated_driver_without_a_world_says_so() -> None:

@@ -1,6 +1,6 @@
 """URScript's own functions, as far as the client's script and a guard script call them, bound to one program.
 
-Those of script_motions.py are generators that take frames; all other functions answer at once. What the emulator has no
+Motions and the reads of sockets are generators that take frames; all other functions answer at once. What the emulator has no
 physics for (force mode, freedrive ...) is accepted and noted in the log.
 """
 
@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from weldcal.tools.ur_emulator.script_answers import Answers
+from weldcal.tools.ur_emulator.script_dynamics import Dynamics
 from weldcal.tools.ur_emulator.script_motions import Motions
+from weldcal.tools.ur_emulator.script_sockets import Sockets
 
 if TYPE_CHECKING:
     from weldcal.tools.ur_emulator.controller import Controller
@@ -21,8 +23,17 @@ BLOCKING = frozenset(
     {
         *("movej", "movel", "movep", "speedj", "speedl", "servoj", "servoc", "stopj", "stopl"),
         *("sync", "sleep", "protective_stop"),
+        *(f"socket_read_{what}" for what in ("line", "string", "ascii_float", "binary_integer", "byte_list")),
     }
 )
+# The first 5.x and 10.x that know a function, where that is later than any version emulated here.
+FIRST = ((0, 0), (10, 0))
+SINCE = {
+    **dict.fromkeys(
+        ("set_target_payload", "get_inverse_kin_has_solution", "get_target_payload_inertia"), ((5, 10), FIRST[1])
+    ),
+    **dict.fromkeys((name for name in vars(Dynamics) if not name.startswith("_")), ((5, 23), (10, 9))),
+}
 NO_EFFECT = {
     "force_mode": None,
     "end_force_mode": None,
@@ -53,7 +64,10 @@ def script_functions(
     functions = Motions(controller, program)
     named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name, v) for name, v in NO_EFFECT.items()}
     named |= {
-        name: getattr(functions, name) for kind in (Motions, Answers) for name in vars(kind) if not name.startswith("_")
+        name: getattr(functions, name)
+        for kind in (Motions, Sockets, Dynamics, Answers)
+        for name in vars(kind)
+        if not name.startswith("_") and controller.version.at_least(*SINCE.get(name, FIRST))
     }
     named |= {name: _real(getattr(math, name)) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")}
     named |= {name: _real(getattr(math, name)) for name in ("sqrt", "floor", "ceil", "log")}

@@ -16,10 +16,12 @@ TIME, SPEED, TOOL, SILENCE, STREAMED = range(5)
 
 
 class Checker:
-    """Times are the host's monotonic clock, which processes on one machine share."""
+    """Points in time are on the host's monotonic clock, which processes on one machine share; durations are the
+    controller's own (host seconds times the pace)."""
 
-    def __init__(self, controller: Controller) -> None:
+    def __init__(self, controller: Controller, pace: float = 1.0) -> None:
         self._controller = controller
+        self._pace = pace
         self._record = np.zeros((RECORD_FRAMES, 5))
         self._count = 0
         self._heard = float("-inf")
@@ -51,7 +53,7 @@ class Checker:
         qd = arm.qd
         moving_any = qd.any()
         speed = float(np.abs(qd).max()) if moving_any else 0.0
-        silence = now - self._heard
+        silence = (now - self._heard) * self._pace
         motion = arm.motion
         streamed = motion is not None and motion.streamed
         tool = float(np.linalg.norm(arm.tool_speed()[:3])) if moving_any else 0.0
@@ -76,7 +78,7 @@ class Checker:
         """Whether the arm was at rest `within` seconds after the fault and has not moved since.
 
         rest_after_s is None where it never came to rest, moved_again_s where it never moved again; travel_m is the
-        tool's path from the fault to the first rest.
+        tool's path from the fault to the first rest (m).
         """
         rows = self._rows()
         rows = rows[rows[:, TIME] >= fault_time]
@@ -92,15 +94,15 @@ class Checker:
             }
         first = int(np.argmax(still))
         again = ~still[first:]
-        moved = float(rows[first + int(np.argmax(again)), TIME] - fault_time) if again.any() else None
-        rest = float(rows[first, TIME] - fault_time)
+        moved = float(rows[first + int(np.argmax(again)), TIME] - fault_time) * self._pace if again.any() else None
+        rest = float(rows[first, TIME] - fault_time) * self._pace
         return {
             "ok": rest <= within and moved is None,
             "rest_after_s": rest,
             "moved_again_s": moved,
             "travel_m": float(rows[:first, TOOL].sum() * 0.002),
             "peak_tool_speed_after_m_s": float(rows[first:, TOOL].max()),
-            "recorded_s": float(rows[-1, TIME] - fault_time),
+            "recorded_s": float(rows[-1, TIME] - fault_time) * self._pace,
         }
 
     def summary(self) -> dict[str, Any]:

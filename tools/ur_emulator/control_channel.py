@@ -13,6 +13,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.ur_emulator.checker import Checker
 from weldcal.tools.ur_emulator.controller import Controller
 from weldcal.tools.ur_emulator.dashboard import IDLE_PROGRAM
+from weldcal.tools.ur_emulator.external_control import CLIENT_PORT, ExternalControl
 from weldcal.tools.ur_emulator.modes import RobotMode, SafetyMode
 from weldcal.tools.ur_emulator.motions import STEP_S
 from weldcal.tools.ur_emulator.net import Connection, Network, Server
@@ -30,7 +31,6 @@ class World:
         self.jitter_s = 0.0
         self.quit = False
         self.overruns = 0
-        self.frames_late_s = 0.0
 
 
 class ControlServer(Server):
@@ -39,9 +39,15 @@ class ControlServer(Server):
     kind = "control"
 
     def __init__(
-        self, controller: Controller, network: Network, rtde: RtdeServer, checker: Checker, world: World
+        self,
+        controller: Controller,
+        network: Network,
+        rtde: RtdeServer,
+        external: ExternalControl,
+        checker: Checker,
+        world: World,
     ) -> None:
-        self._controller, self._network = controller, network
+        self._controller, self._network, self._external = controller, network, external
         self._rtde, self._checker, self._world = rtde, checker, world
         c = controller
         self._faults: dict[str, Callable[[Request, float], None]] = {
@@ -71,7 +77,7 @@ class ControlServer(Server):
             "local_mode": lambda r, now: setattr(c, "remote", False),
             "registers_in_use": lambda r, now: rtde.claim_elsewhere([str(n) for n in r.get("names", ())]),
             "speed_scaling": self._slider,
-            "timestamp_jump": lambda r, now: setattr(c, "timestamp", c.timestamp + _number(r, "seconds")),
+            "timestamp_jump": lambda r, now: setattr(c, "timestamp", max(0.0, c.timestamp + _number(r, "seconds"))),
             "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
             "jitter": lambda r, now: setattr(self._world, "jitter_s", _number(r, "seconds")),
             "reboot": self._reboot,
@@ -92,9 +98,11 @@ class ControlServer(Server):
             "clear_pstop_timer": lambda r, now: setattr(c, "protective_since", -(10**9)),
             "unlock": lambda r, now: _required(c.unlock_protective_stop(), "the protective stop is younger than 5 s"),
             "power_on": lambda r, now: c.release_brakes(),
+            "external_control": self._external_control,
             "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
             "clear_links": self._clear_links,
+            "recover": self._recover,
             "reset_checker": lambda r, now: checker.reset(),
             "quit": lambda r, now: setattr(self._world, "quit", True),
         }
@@ -188,9 +196,28 @@ class ControlServer(Server):
             half_open=False,
         )
 
+    def _recover(self, request: Request, now: float) -> None:
+        """Everything right again at once, the program stopped and the arm where it is; the checker keeps its latch."""
+        c = self._controller
+        self._clear_links({}, now)
+        self._rtde.release_elsewhere()
+        c.stop_program()
+        c.set_safety_mode(SafetyMode.NORMAL)
+        c.robot_mode, c.remote, c.refuse_upload = RobotMode.RUNNING, True, False
+        c.start_delay_s, c.clock_rate, c.tool_contact_steps = 0.0, 1.0, 0
+        c.terminals.speed_slider, c.arm.lag_s = 1.0, 0.0
+        c.set_tcp([0.0] * 6)
+
     def _close(self, request: Request, *, reset: bool) -> None:
         for connection in self._links(request):
             connection.close(reset=reset)
+
+    def _external_control(self, request: Request, now: float) -> None:
+        address = (str(request.get("host", "127.0.0.1")), int(_number(request, "port", CLIENT_PORT)))
+        try:
+            self._network.dial(self._external, address, now)
+        except OSError as error:
+            raise InputError(f"No script sender listens on {address[0]}:{address[1]} ({error}).") from error
 
     def _robot_mode(self, mode: RobotMode) -> None:
         self._controller.robot_mode = mode

@@ -78,10 +78,19 @@ class Controller:
         """Text of one program from a script port: runs it where the state allows, or drops it without a word."""
         line = source.strip()
         words = line.rstrip("()").strip()
-        if words in ("stop program", "power on", "power off", "set robotmode run", "set unlock protective stop"):
+        if self.version.takes_scripts and words in (
+            "stop program",
+            "power on",
+            "power off",
+            "set robotmode run",
+            "set unlock protective stop",
+        ):
             self._word(words)
             return
         if not line or line.startswith("#"):
+            return
+        if not self.version.takes_scripts:
+            self.note("program ignored: PolyScope X takes scripts on its ports from 10.10 on; use External Control")
             return
         if not self.remote or self.refuse_upload:
             self.note("program ignored: " + ("uploads are refused" if self.remote else "local mode"))

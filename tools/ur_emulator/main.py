@@ -19,19 +19,21 @@ from weldcal.tools.ur_emulator.checker import Checker
 from weldcal.tools.ur_emulator.control_channel import ControlServer, World
 from weldcal.tools.ur_emulator.controller import Controller
 from weldcal.tools.ur_emulator.dashboard import DashboardServer
+from weldcal.tools.ur_emulator.external_control import ExternalControl
 from weldcal.tools.ur_emulator.motions import STEP_S
 from weldcal.tools.ur_emulator.net import Network
+from weldcal.tools.ur_emulator.process import CONTROL_PORT, READY
 from weldcal.tools.ur_emulator.rtde_server import RtdeServer
 from weldcal.tools.ur_emulator.script_ports import PrimaryServer, RealTimeServer
 from weldcal.tools.ur_emulator.versions import parse_version
 
-CONTROL_PORT = 30090
 PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, DASHBOARD_PORT = 30001, 30002, 30003, 30004, 29999
-READY = "ready"
 # the elbow up, the tool down, away from every singularity
 HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)
-# beyond this the loop gives up on catching up and skips frames, and says so in its state
+# beyond this (of the controller's time) the loop gives up on catching up and skips frames, and says so in its state
 LATE_S = 0.05
+SLOWEST, FASTEST = 0.05, 1.0
+PARENT_CHECK_S = 0.2
 
 
 def run_emulator(
@@ -42,6 +44,7 @@ def run_emulator(
     robot: str = "ur10e",
     kinematics: Path | None = None,
     q: tuple[float, ...] = HOME,
+    pace: float = 1.0,
     seed: int = 0,
     parent: int | None = None,
     ready: Callable[[str], None] | None = None,
@@ -55,25 +58,29 @@ def run_emulator(
         robot: name of the arm.
         kinematics: a robot's factory calibration; nominal where None.
         q: joint angles at the start (rad).
+        pace: controller seconds per host second, 0.05 to 1; below 1 every frame of 2 ms takes longer.
         seed: everything random follows from it.
         parent: process whose end ends the emulator.
         ready: called once with a sentence when every port listens.
 
     Raises:
-        InputError: unknown arm or version, an address that is not loopback, or a port that is taken.
+        InputError: unknown arm or version, a pace or address that is not allowed, or a port that is taken.
     """
     if not host.startswith("127."):
         raise InputError(f"The emulator listens on loopback only; give an address 127.x.y.z, not {host}.")
     if len(q) != 6:
         raise InputError("Give six joint angles, in radians.")
+    if not SLOWEST <= pace <= FASTEST:
+        raise InputError(f"Give a pace from {SLOWEST} to {FASTEST:.0f}, not {pace}.")
     controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
-    _Emulator(controller, host, control_port, seed).run(parent, ready)
+    _Emulator(controller, host, control_port, pace, seed).run(parent, ready)
 
 
 class _Emulator:
-    def __init__(self, controller: Controller, host: str, control_port: int, seed: int) -> None:
+    def __init__(self, controller: Controller, host: str, control_port: int, pace: float, seed: int) -> None:
         self._controller = controller
-        self._checker = Checker(controller)
+        self._pace = pace
+        self._checker = Checker(controller, pace)
         self._world = World()
         self._network = Network(host, seed)
         self._rng = np.random.default_rng([seed, 1])
@@ -82,8 +89,9 @@ class _Emulator:
         self._primary = PrimaryServer(controller, heard, primary=True)
         secondary = PrimaryServer(controller, heard, primary=False)
         real_time = RealTimeServer(controller, heard)
-        control = ControlServer(controller, self._network, self._rtde, self._checker, self._world)
-        self._servers = (self._rtde, self._primary, secondary, real_time)
+        external = ExternalControl(controller)
+        control = ControlServer(controller, self._network, self._rtde, external, self._checker, self._world)
+        self._servers = (self._rtde, self._primary, secondary, real_time, external)
         ports = [(self._rtde, RTDE_PORT), (self._primary, PRIMARY_PORT), (secondary, SECONDARY_PORT)]
         ports += [(real_time, REAL_TIME_PORT), (control, control_port)]
         if controller.version.has_dashboard:
@@ -115,9 +123,14 @@ class _Emulator:
     def _loop(self, parent: int | None) -> None:
         clock = time.monotonic
         world, network = self._world, self._network
-        deadline = clock() + STEP_S
+        period, late = STEP_S / self._pace, LATE_S / self._pace
+        deadline, parent_check = clock() + period, 0.0
         while not world.quit:
             now = clock()
+            if parent is not None and now >= parent_check:
+                parent_check = now + PARENT_CHECK_S
+                if not _alive(parent):
+                    return
             if now < deadline:
                 network.poll(deadline - now, clock)
                 continue
@@ -125,18 +138,16 @@ class _Emulator:
                 time.sleep(min(world.frozen_until - now, 0.01))
                 deadline = clock()
                 continue
-            if now - deadline > LATE_S:
+            if now - deadline > late:
                 world.overruns += 1
                 deadline = now
             self._frame(now)
-            deadline += STEP_S
-            if world.jitter_s > 0.0:
-                # frames come late by a random time, and the count of frames catches up
-                time.sleep(float(self._rng.uniform(0.0, world.jitter_s)))
+            deadline += period
+            if world.jitter_s > 0.0 and now - deadline < 0.0:
+                # a frame that is on time is followed by one that comes late; those after it catch up in a burst
+                time.sleep(period + float(self._rng.uniform(0.0, world.jitter_s)))
             elif now - deadline > 0.0:
                 network.poll(0.0, clock)
-            if parent is not None and self._controller.frame % 100 == 0 and not _alive(parent):
-                return
 
     def _frame(self, now: float) -> None:
         world, network, controller = self._world, self._network, self._controller
@@ -171,6 +182,7 @@ def main() -> None:
     parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
     parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
     parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
+    parser.add_argument("--pace", type=float, default=1.0, help="controller seconds per host second, 0.05 to 1")
     parser.add_argument("--seed", type=int, default=0, help="everything random follows from this number")
     parser.add_argument("--parent", type=int, help="end when this process ends")
     options = parser.parse_args()
@@ -186,6 +198,7 @@ def main() -> None:
             polyscope=options.polyscope,
             kinematics=options.kinematics,
             q=tuple(options.q),
+            pace=options.pace,
             seed=options.seed,
             parent=options.parent,
             ready=ready,

@@ -15,6 +15,8 @@ import numpy as np
 # A client that does not read is dropped after this long, as the controller does.
 UNREAD_LIMIT_S = 10.0
 MAX_QUEUED = 1 << 20
+DIAL_LIMIT_S = 0.02
+TORN_S = 0.001
 
 
 @dataclass
@@ -48,6 +50,7 @@ class Connection:
         self._waiting: deque[tuple[float, bytes]] = deque()
         self._outbox = bytearray()
         self._stuck_since: float | None = None
+        self._held, self._held_until = 0, 0.0
 
     def send(self, package: bytes, now: float, *, droppable: bool = False) -> None:
         """Queues a package; one that is droppable is left out where the client does not read, and by the faults."""
@@ -87,16 +90,23 @@ class Connection:
             self._outbox += self._waiting.popleft()[1]
         if not self._outbox or self.closed or self.faults.half_open or now < self.faults.freeze_until:
             return
-        piece = self.faults.piece
+        ready = len(self._outbox)
+        if self.faults.piece and (ready != self._held or now < self._held_until):
+            # torn packages: the last bytes of what is due come a frame later, as the start of the next piece
+            self._held = min(ready, self.faults.piece)
+            ready -= self._held
+            self._held_until = now + TORN_S
+            if not ready:
+                return
         try:
-            sent = self.sock.send(self._outbox[:piece] if piece else self._outbox)
+            sent = self.sock.send(self._outbox[:ready])
         except (BlockingIOError, InterruptedError):
             sent = 0
         except OSError:
             self.closed = True
             return
         del self._outbox[:sent]
-        if not self._outbox or piece:
+        if not self._outbox or sent == ready:
             self._stuck_since = None
         elif self._stuck_since is None:
             self._stuck_since = now
@@ -171,6 +181,11 @@ class Network:
         sock.setblocking(False)
         self._listeners[sock] = (server, port)
 
+    def dial(self, server: Server, address: tuple[str, int], now: float) -> None:
+        """Connects as a client; raises OSError where nobody listens."""
+        sock = socket.create_connection(address, timeout=DIAL_LIMIT_S)
+        self._adopt(sock, server, now)
+
     def unplug(self, *kept: Server) -> None:
         """Closes every listener and resets every connection but those of the servers named, as a reboot does."""
         for sock, (server, port) in list(self._listeners.items()):
@@ -213,6 +228,9 @@ class Network:
             sock, _ = listener.accept()
         except OSError:
             return
+        self._adopt(sock, server, now)
+
+    def _adopt(self, sock: socket.socket, server: Server, now: float) -> None:
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection = Connection(server.kind, sock, self._rng)
@@ -233,7 +251,8 @@ class Network:
 
     def of_kind(self, kind: str) -> list[Connection]:
         """Connections of one protocol, or all but the control channel's for "all"."""
-        return [c for c in self.connections if c.kind == kind or (kind == "all" and c.kind != "control")]
+        alive = [c for c in self.connections if not c.closed]
+        return [c for c in alive if c.kind == kind or (kind == "all" and c.kind != "control")]
 
     def close(self) -> None:
         """Closes everything."""

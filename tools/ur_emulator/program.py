@@ -41,6 +41,7 @@ class Program:
         self.source = source
         self.current: Thread | None = None
         self.owner: Thread | None = None
+        self.sockets: dict[str, Any] = {}
         self._threads: dict[int, Thread] = {}
         self._critical: Thread | None = None
         self._loops = 0
@@ -79,9 +80,11 @@ class Program:
                 break
 
     def close(self) -> None:
-        """Ends every thread, which gives the arm back."""
+        """Ends every thread, which gives the arm back, and closes the program's sockets."""
         for thread in list(self._threads.values()):
             self._end(thread)
+        while self.sockets:
+            self.sockets.popitem()[1].close()
 
     def claim(self) -> Thread:
         """The current thread takes the arm.

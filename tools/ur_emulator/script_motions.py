@@ -17,11 +17,12 @@ from weldcal.tools.ur_emulator.motions import (
     joint_path,
     tool_path,
 )
-from weldcal.tools.ur_emulator.script_answers import Answers, positive, six
+from weldcal.tools.ur_emulator.script_answers import positive, six
 from weldcal.tools.ur_emulator.script_compiler import Pose, Slices
+from weldcal.tools.ur_emulator.script_sockets import Sockets
 
 
-class Motions(Answers):
+class Motions(Sockets):
     """Functions that take frames."""
 
     def sync(self) -> Slices:

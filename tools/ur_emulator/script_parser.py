@@ -210,9 +210,12 @@ class _Parser:
         value = self.primary()
         while self.at("["):
             self.take()
-            index = self.expression()
+            value = Index(value, self.expression())
+            while self.at(","):
+                # a matrix: m[row, column]
+                self.take()
+                value = Index(value, self.expression())
             self.expect("]")
-            value = Index(value, index)
         return value
 
     def primary(self) -> Expression:

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 
 from weldcal.models.errors import InputError
 
-KNOWN = {"5.12": (5, 12, 6, 1102099), "5.21": (5, 21, 1, 0), "5.23": (5, 23, 0, 0), "10.7": (10, 7, 0, 0)}
+KNOWN = {
+    "5.12": (5, 12, 6, 1102099),
+    "5.21": (5, 21, 1, 0),
+    "5.23": (5, 23, 0, 0),
+    "10.7": (10, 7, 0, 0),
+    "10.12": (10, 12, 0, 0),
+}
 
 
 @dataclass(frozen=True)
@@ -22,6 +28,11 @@ class Version:
     def has_dashboard(self) -> bool:
         """PolyScope X (10.x) has no dashboard server on 29999."""
         return self.major < 10
+
+    @property
+    def takes_scripts(self) -> bool:
+        """Whether the script ports run programs [M]: before 10.10 ur_rtde does not try, and there is no remote mode."""
+        return self.at_least((0, 0), (10, 10))
 
     def at_least(self, five: tuple[int, int], ten: tuple[int, int] = (10, 0)) -> bool:
         """Whether this is at least the given 5.x, or the given 10.x."""

@@ -1,0 +1,46 @@
+"""The dashboard of PolyScope 5: one line in, one line out, on a fresh connection each time."""
+
+from __future__ import annotations
+
+from weldcal.systems.drivers.ur.errors import RobotUnreachable
+from weldcal.systems.drivers.ur.line import Line
+
+DASHBOARD_PORT = 29999
+SCRIPT_PORT = 30003
+
+
+def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_PORT) -> str:
+    """The controller's answer to one dashboard command, such as `is in remote control`.
+
+    Args:
+        host: name or address of the controller.
+        command: one line, without its newline.
+        timeout_s: connecting takes at most this long, and so does the exchange.
+        port: where the dashboard listens.
+
+    Raises:
+        RobotUnreachable: no dashboard answers there in time (PolyScope X has none).
+    """
+    with Line(host, port, "Dashboard Server", timeout_s) as line:
+        until = line.deadline()
+        if not line.read_line(until).startswith("Connected"):
+            raise line.nonsense()
+        line.send(f"{command}\n".encode())
+        return line.read_line(until)
+
+
+def stop_program(host: str, timeout_s: float = 2.0) -> str:
+    """Ends the running or paused program; "Stopped" where that was done, else the controller's refusal, or nothing.
+
+    After a fault this is the only word to say: `play` would go on with the velocity that the registers still hold. Where
+    there is no dashboard (PolyScope X) the word goes to the script port, which does not answer.
+
+    Raises:
+        RobotUnreachable: neither port answers there in time.
+    """
+    try:
+        return ask(host, "stop", timeout_s)
+    except RobotUnreachable:
+        with Line(host, SCRIPT_PORT, "Script", timeout_s) as line:
+            line.send(b"stop program\n")
+        return ""

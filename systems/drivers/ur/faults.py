@@ -1,0 +1,85 @@
+"""Every reason for which the hardware interface stops the arm, each with what a person does about it."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Fault(IntEnum):
+    """Latched by the first that occurs; only a new start clears it."""
+
+    NONE = 0
+    LINK_STALE = 1
+    LINK_CLOSED = 2
+    WORKER_DIED = 3
+    CONTROLLER_DEAF = 4
+    CLOCK_JUMPED = 5
+    STATE_IMPLAUSIBLE = 6
+    COMMAND_LATE = 10
+    COMMAND_NOT_FINITE = 11
+    COMMAND_TOO_FAST = 12
+    COMMAND_JUMPED = 13
+    JOINT_LIMIT = 14
+    TRACKING = 15
+    POSE_MISMATCH = 16
+    SPEED_SLIDER = 17
+    GUARD_LATCHED = 18
+    PROTECTIVE_STOP = 20
+    SAFEGUARD_STOP = 21
+    EMERGENCY_STOP = 22
+    SAFETY_VIOLATION = 23
+    RECOVERY_MODE = 24
+    ROBOT_NOT_RUNNING = 25
+    PROGRAM_STOPPED = 26
+    PROGRAM_PAUSED = 27
+    GUARD_REFUSED = 30
+    UPLOAD_REFUSED = 31
+    CONTROL_REFUSED = 32
+    START_FAILED = 33
+    TCP_NOT_ZERO = 34
+
+
+SENTENCES = {
+    Fault.LINK_STALE: "LINK: no new state from the robot for {detail:.0f} ms; check the network cable and the load of this computer, then start again.",
+    Fault.LINK_CLOSED: "LINK: the controller closed the connection; check the network cable and that the controller is on, then start again.",
+    Fault.WORKER_DIED: "LINK: the connection broke down, and our process at it ended; check that the controller is on, and the cable, then start again.",
+    Fault.CONTROLLER_DEAF: "LINK: the controller has not taken a command for {detail:.0f} ms; "
+    "check the cable, and that nobody started another program or writes its registers; start again.",
+    Fault.CLOCK_JUMPED: "LINK: the controller's clock jumped by {detail:.3f} s; if it was restarted, start again when it is ready.",
+    Fault.STATE_IMPLAUSIBLE: "LINK: a joint was reported {detail:.3f} rad from where it was 4 ms before; check the network and start again.",
+    Fault.COMMAND_LATE: "COMMAND LATE: the cell gave no new velocity for {detail:.0f} ms while the arm moved; close other programs here and start again.",
+    Fault.COMMAND_NOT_FINITE: "COMMAND: a velocity that is not a number was refused; this is a mistake of the program, report it.",
+    Fault.COMMAND_TOO_FAST: "COMMAND: a joint velocity of {detail:.2f} rad/s was refused; this is a mistake of the program, report it.",
+    Fault.COMMAND_JUMPED: "COMMAND: a jump of {detail:.2f} rad/s in joint velocity was refused; this is a mistake of the program, report it.",
+    Fault.JOINT_LIMIT: "JOINT LIMIT: joint {detail:.0f} would have reached its limit; start the job from another arm configuration.",
+    Fault.TRACKING: "TRACKING: a joint is {detail:.3f} rad from where its commands lead; check payload, speed slider and that nothing holds the arm.",
+    Fault.POSE_MISMATCH: "POSE: the controller's pose is {detail:.2f} mm off that of the joints; set the TCP to zero in Installation > General > TCP.",
+    Fault.SPEED_SLIDER: "SPEED SLIDER: the speed slider stands at {detail:.0f} %; move it to 100 % on the pendant and start again.",
+    Fault.GUARD_LATCHED: "GUARD: the script on the controller stopped the arm, {reason}; check the cable and the load of this computer, then start again.",
+    Fault.PROTECTIVE_STOP: "PROTECTIVE STOP: look for the cause, press Enable Robot on the pendant after 5 s, and start again.",
+    Fault.SAFEGUARD_STOP: "SAFEGUARD STOP: close the safeguard, press its reset, and start again.",
+    Fault.EMERGENCY_STOP: "EMERGENCY STOP: release the button, switch the arm on and release its brakes on the pendant, and start again.",
+    Fault.SAFETY_VIOLATION: "SAFETY FAULT: the safety system reports mode {detail:.0f}; restart the safety system on the pendant, then start again.",
+    Fault.RECOVERY_MODE: "RECOVERY MODE: the arm is outside its safety limits; move it back by hand in recovery mode, then start again.",
+    Fault.ROBOT_NOT_RUNNING: "ROBOT NOT RUNNING: the arm is in mode {detail:.0f}; switch it on and release its brakes on the pendant, then start again.",
+    Fault.PROGRAM_STOPPED: "PROGRAM STOPPED: somebody or something stopped the program on the controller; start again.",
+    Fault.PROGRAM_PAUSED: "PROGRAM PAUSED: the program on the controller was paused; press Stop, not Play, on the pendant, and start again.",
+    Fault.GUARD_REFUSED: "An old command stands in the controller's registers and would not go: close whatever else writes them and start again.",
+    Fault.UPLOAD_REFUSED: "The controller did not start our program: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
+    Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",
+    Fault.TCP_NOT_ZERO: "The TCP could not be set to zero: set it to zero in Installation > General > TCP on the pendant and start again.",
+    Fault.START_FAILED: "The process that talks to the robot could not start; run `weldcal check-robot` and try again.",
+}
+
+
+# what the guard script writes into its output register when it latches
+GUARD_REASONS = {
+    3: "because no new command came for 40 ms",
+    4: "because a joint velocity was too high",
+    5: "because a velocity came in the middle of a move",
+}
+
+
+def sentence(fault: Fault, detail: float = 0.0) -> str:
+    """The fault in words, with what to press."""
+    return SENTENCES[fault].format(detail=detail, reason=GUARD_REASONS.get(int(detail), "for no known reason"))

@@ -1,0 +1,140 @@
+"""A robot's factory kinematics, read from its primary port, and the check that it is what the controller computes with."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
+
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.ur.errors import RobotRefused
+from weldcal.systems.drivers.ur.line import Line
+
+Array = NDArray[np.float64]
+
+PRIMARY_PORT = 30001
+# With the right calibration FK agrees with the controller to 10-20 um; without it, to millimetres.
+KINEMATICS_TOLERANCE_M = 5e-5
+KINEMATICS_TOLERANCE_RAD = float(np.deg2rad(0.02))
+
+_ROBOT_STATE, _KINEMATICS_INFO = 16, 5
+_HEADER, _PART = struct.Struct(">iB"), struct.Struct(">IB")
+_BODY = struct.Struct(">6I24dI")
+_LONGEST_PACKAGE = 1 << 20
+# Nominal kinematics has joint axes that are exactly parallel or square; a calibration has none.
+_EXACT = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicsInfo:
+    """Denavit-Hartenberg numbers (6,) rad and m: link i is RotZ(q_i + theta_i) Tz(d_i) Tx(a_i) RotX(alpha_i).
+
+    calibrated says that they are one robot's own; checksum names them. Nearly parallel axes make d_2 and d_3 hundreds
+    of metres that cancel: multiply the plain chain, or use `calibrated_arm`, whose link frames stay where the links are.
+    """
+
+    theta: Array
+    a: Array
+    d: Array
+    alpha: Array
+    calibrated: bool
+    checksum: str
+
+
+def read_kinematics(host: str, timeout_s: float = 2.0, port: int = PRIMARY_PORT) -> KinematicsInfo:
+    """The kinematics that the controller at `host` computes with (package KinematicsInfo of its primary port).
+
+    Raises:
+        RobotUnreachable: nothing answers in time, or what answers is not the primary interface.
+        RobotRefused: the controller does not know its arm yet, because the arm has no power.
+    """
+    with Line(host, port, "Primary Client Interface", timeout_s) as line:
+        until = line.deadline()
+        while True:
+            size, kind = _HEADER.unpack(line.read(_HEADER.size, until))
+            if not _HEADER.size <= size <= _LONGEST_PACKAGE:
+                raise line.nonsense()
+            package = line.read(size - _HEADER.size, until)
+            if kind == _ROBOT_STATE and (body := _part(package, _KINEMATICS_INFO, line)) is not None:
+                if len(body) < _BODY.size:
+                    raise line.nonsense()
+                return _parse(body)
+
+
+def _part(package: bytes, wanted: int, line: Line) -> bytes | None:
+    """The body of one sub-package of a robot state; None where this state comes without it."""
+    at = 0
+    while at + _PART.size <= len(package):
+        size, kind = _PART.unpack_from(package, at)
+        if size < _PART.size:
+            raise line.nonsense()
+        if kind == wanted:
+            return package[at + _PART.size : at + size]
+        at += size
+    return None
+
+
+def _parse(body: bytes) -> KinematicsInfo:
+    # The status word at the end is not published; what is calibrated is told by the numbers themselves.
+    numbers = _BODY.unpack_from(body)
+    theta, a, d, alpha = (np.array(numbers[i : i + 6]) for i in range(6, 30, 6))
+    for values in (theta, a, d, alpha):
+        values.setflags(write=False)
+    if not np.isfinite([theta, a, d, alpha]).all() or not (np.any(a) and np.any(d)):
+        raise RobotRefused(
+            "The controller does not tell the arm's kinematics yet: switch the arm on (Initialize at the lower left of "
+            "the pendant, ON) and try again."
+        )
+    square = alpha / (np.pi / 2.0)
+    exact = max(np.abs(theta).max(), np.abs(square - np.round(square)).max(), abs(d[1]), abs(d[2]), abs(a[0])) < _EXACT
+    checksum = "calib_" + "".join(f"{number:08x}" for number in numbers[:6])
+    return KinematicsInfo(theta, a, d, alpha, calibrated=not exact, checksum=checksum)
+
+
+def calibrated_arm(nominal: ArmModel, info: KinematicsInfo) -> ArmModel:
+    """The arm with the robot's own kinematics; its flange is the plain DH chain's, its link frames lie in the links.
+
+    Raises:
+        InputError: the kinematics are another arm's, not finite, or end in a bent link, which no UR arm has.
+    """
+    if not np.isfinite([info.theta, info.a, info.d, info.alpha]).all():
+        raise InputError("The controller's kinematics holds numbers that are not finite: restart the control box.")
+    if max(abs(info.a[5]), abs(info.alpha[5])) > _EXACT:
+        raise InputError(
+            "The controller's kinematics has an offset after its last joint: this arm is not supported; "
+            f"connect a {nominal.name}."
+        )
+    stack = np.tile(np.eye(4), (6, 1, 1))
+    for i in range(6):
+        # Tx(a) RotX(alpha) of the link before, then Tz(d) RotZ(theta) of this one, which commutes with the joint angle
+        a, alpha = (info.a[i - 1], info.alpha[i - 1]) if i else (0.0, 0.0)
+        before = RigidTransform(RotationMatrix.MakeXRotation(alpha), [a, 0.0, 0.0])
+        turn = RigidTransform(RotationMatrix.MakeZRotation(info.theta[i]), [0.0, 0.0, info.d[i]])
+        stack[i] = (before @ turn).GetAsMatrix4()
+    calibration = info.checksum if info.calibrated else None
+    return with_link_transforms(nominal, stack, calibration, "The robot's kinematics")
+
+
+def cross_check(arm: ArmModel, q: ArrayLike, tcp_pose: ArrayLike, tcp_offset: ArrayLike) -> tuple[float, float]:
+    """How far our flange pose at q (6,) rad is from the controller's own: (m, rad).
+
+    Args:
+        arm: the arm in use.
+        q: the controller's actual_q.
+        tcp_pose: its actual_TCP_pose of the same control step, in B: x, y, z (m) and a rotation vector (rad).
+        tcp_offset: its tcp_offset, the TCP in F, likewise.
+    """
+    X_BF = _pose(tcp_pose) @ _pose(tcp_offset).inverse()
+    error = forward_kinematics(arm, q).inverse() @ X_BF
+    angle = float(Rotation.from_matrix(error.rotation().matrix()).magnitude())
+    return float(np.linalg.norm(error.translation())), angle
+
+
+def _pose(six: ArrayLike) -> RigidTransform:
+    values = np.asarray(six, dtype=np.float64)
+    return RigidTransform(RotationMatrix(Rotation.from_rotvec(values[3:]).as_matrix()), values[:3])

@@ -1,0 +1,243 @@
+"""The cell's side of the link: starts the worker, shares memory with it, never blocks, and sees to it that the program ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import weakref
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.systems.drivers.ur.dashboard import stop_program
+from weldcal.systems.drivers.ur.errors import RobotRefused
+from weldcal.systems.drivers.ur.faults import Fault, sentence
+from weldcal.systems.drivers.ur.shared import STATE, Memory, TornRead
+from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
+from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
+from weldcal.systems.messages import UrStatus
+
+START_LIMIT_S = 20.0
+CLOSE_LIMIT_S = 5.0
+HEARTBEAT_LIMIT_S = 0.15
+ROBOT_MODES = {
+    -1: "NO_CONTROLLER",
+    0: "DISCONNECTED",
+    1: "CONFIRM_SAFETY",
+    2: "BOOTING",
+    3: "POWER_OFF",
+    4: "POWER_ON",
+    5: "IDLE",
+    6: "BACKDRIVE",
+    7: "RUNNING",
+    8: "UPDATING_FIRMWARE",
+}
+SAFETY_MODES = {
+    1: "NORMAL",
+    2: "REDUCED",
+    3: "PROTECTIVE_STOP",
+    4: "RECOVERY",
+    5: "SAFEGUARD_STOP",
+    6: "SYSTEM_EMERGENCY_STOP",
+    7: "ROBOT_EMERGENCY_STOP",
+    8: "VIOLATION",
+    9: "FAULT",
+}
+_AT = {name: i for i, name in enumerate(STATE)}
+PLAYING = 2
+
+
+@dataclass(frozen=True, eq=False)
+class LinkState:
+    """What the worker last knew. Times in s of the host's monotonic clock, except `robot_time` (the controller's own)."""
+
+    q: NDArray[np.float64]
+    qd: NDArray[np.float64]
+    robot_time: float
+    sampled_at: float
+    age_s: float
+    status: UrStatus
+    fault: Fault
+    fault_time: float
+    sent: int
+    heard: int
+    echo_latency_s: float
+    worst_period_s: float
+    late_periods: int
+    clock_residual_s: float
+    clock_drift: float
+
+
+class UrLink:
+    """A running worker. Made by `start`; `close` ends program and worker in order."""
+
+    def __init__(self, config: WorkerConfig) -> None:
+        self._config = config
+        descriptor = os.memfd_create("weldcal-ur")
+        os.ftruncate(descriptor, Memory.size())
+        self._memory = Memory(descriptor)
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the link)
+        command = [sys.executable, "-m", "weldcal.systems.drivers.ur.worker", str(descriptor)]
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=self._errors,
+            stderr=self._errors,
+            pass_fds=(descriptor,),
+            env=environment,
+        )
+        os.close(descriptor)
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(pickle.dumps(config))
+            self._process.stdin.close()
+        self._number = 0
+        self._died: tuple[Fault, float] | None = None
+        self._last: tuple[float, ...] | None = None
+        self._stopper: threading.Thread | None = None
+        self._finalizer = weakref.finalize(self, _kill, self._process)
+
+    @classmethod
+    def start(
+        cls,
+        host: str,
+        arm: ArmModel,
+        limits: Limits,
+        *,
+        rate_hz: float = 250.0,
+        upper_registers: bool = True,
+        payload_kg: float = 0.0,
+        payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> UrLink:
+        """Start the worker, upload the guard, and wait until it obeys. The arm does not move.
+
+        Raises:
+            RobotRefused: one sentence that says what to press; nothing is left behind.
+        """
+        config = WorkerConfig(host, arm, limits, rate_hz, upper_registers, payload_kg, payload_cog_m, os.getpid())
+        link = cls(config)
+        until = time.monotonic() + START_LIMIT_S / limits.pace
+        while time.monotonic() < until:
+            found = link._memory.state.read()
+            if found is not None:
+                if found[_AT["phase"]] == Phase.OBEYING:
+                    return link
+                if found[_AT["fault"]]:
+                    fault = Fault(int(found[_AT["fault"]]))
+                    link._end()
+                    raise RobotRefused(sentence(fault, found[_AT["detail"]]))
+            if link._process.poll() is not None:
+                break
+            time.sleep(0.01)
+        said = link._said()
+        link._end()
+        raise RobotRefused(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
+
+    def command(self, qd: NDArray[np.float64]) -> int:
+        """Hand the newest joint velocity (6,) rad/s to the worker; its number. Never blocks."""
+        self._number += 1
+        self._memory.command.write([float(self._number), time.monotonic(), 0.0, *map(float, qd)])
+        return self._number
+
+    def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
+        """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no sample."""
+        return self._memory.ring.at(host_time)
+
+    def state(self) -> LinkState:
+        """The newest state. Never blocks.
+
+        Raises:
+            RuntimeError: the worker has not obeyed yet.
+        """
+        with contextlib.suppress(TornRead):
+            self._last = self._memory.state.read() or self._last
+        found = self._last
+        if found is None:
+            raise RuntimeError("the link has not started")
+        now = time.monotonic()
+        fault, detail, fault_time = Fault(int(found[_AT["fault"]])), found[_AT["detail"]], found[_AT["fault_time"]]
+        if fault is Fault.NONE and self._died is None and found[_AT["phase"]] != Phase.ENDED:
+            quiet = now - found[_AT["heartbeat"]] > HEARTBEAT_LIMIT_S / self._config.limits.pace
+            if quiet or self._process.poll() is not None:
+                self._died = (Fault.WORKER_DIED, now)
+                _kill(self._process)
+        if fault is Fault.NONE and self._died is not None:
+            fault, fault_time = self._died
+        if fault is not Fault.NONE:
+            self._see_to_the_stop(fault)
+        status = UrStatus(
+            robot_mode=ROBOT_MODES.get(int(found[_AT["robot_mode"]]), "UNKNOWN"),
+            safety_mode=SAFETY_MODES.get(int(found[_AT["safety_mode"]]), "UNKNOWN"),
+            program_running=found[_AT["runtime_state"]] == PLAYING and fault is Fault.NONE,
+            speed_scaling=found[_AT["speed_scaling"]],
+            fault=None if fault is Fault.NONE else sentence(fault, detail),
+        )
+        q, qd = (np.array(found[_AT[name] : _AT[name] + 6]) for name in ("q0", "qd0"))
+        sampled_at = found[_AT["host_time"]]
+        return LinkState(
+            q,
+            qd,
+            found[_AT["robot_time"]],
+            sampled_at,
+            now - sampled_at,
+            status,
+            fault,
+            fault_time,
+            int(found[_AT["number"]]),
+            int(found[_AT["echo"]]),
+            found[_AT["echo_latency"]],
+            found[_AT["worst_period"]],
+            int(found[_AT["late_periods"]]),
+            found[_AT["residual"]],
+            found[_AT["drift"]],
+        )
+
+    def close(self) -> None:
+        """Brake, end the program in order, end the worker; then make sure through the dashboard. May be called twice."""
+        if not self._finalizer.alive:
+            return
+        if self._process.poll() is None:
+            self._number += 1
+            self._memory.command.write([float(self._number), time.monotonic(), 1.0, *[0.0] * 6])
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(CLOSE_LIMIT_S / self._config.limits.pace)
+        if self._process.returncode != 0:
+            self._stop_program()
+        if self._stopper is not None:
+            self._stopper.join()
+        self._end()
+
+    def _see_to_the_stop(self, fault: Fault) -> None:
+        """After a stop that is not our own, the program is stopped for good: a paused one could be played again."""
+        if self._stopper is None and ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE):
+            self._stopper = threading.Thread(target=self._stop_program, daemon=True)
+            self._stopper.start()
+
+    def _stop_program(self) -> None:
+        # PolyScope X has no dashboard, and a dead network has none either: the guard's watchdog has stopped the arm
+        with contextlib.suppress(RobotRefused):
+            stop_program(self._config.host)
+
+    def _said(self) -> str:
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""
+
+    def _end(self) -> None:
+        self._finalizer()
+        self._errors.close()
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    if process.poll() is None:
+        process.kill()
+    process.wait()

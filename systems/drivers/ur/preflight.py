@@ -1,0 +1,401 @@
+"""Is this robot ready? Every check before the first motion, in the order in which a person at the pendant mends them.
+
+Nothing moves, nothing is written, nothing is uploaded: outputs are read, and input registers are asked for and given
+back. The remedies use the words of PolyScope 5's menus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.ur import remedies
+from weldcal.systems.drivers.ur.dashboard import ask
+from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.kinematics_info import (
+    KINEMATICS_TOLERANCE_M,
+    KINEMATICS_TOLERANCE_RAD,
+    KinematicsInfo,
+    calibrated_arm,
+    cross_check,
+    read_kinematics,
+)
+from weldcal.systems.drivers.ur.releases import POLYSCOPE_X, is_supported, upper_range_works
+from weldcal.systems.drivers.ur.rtde_wire import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
+
+Array = NDArray[np.float64]
+
+RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
+FULL_SPEED = 0.99
+TCP_ZERO = 1e-6
+LOCAL = "LOCAL"
+LIMIT_MARGIN_RAD = float(np.deg2rad(5.0))
+REST_RAD_S = 0.005
+# What ur_rtde's RTDEControlInterface claims: 8 integers and 18 doubles, from 0 or (upper registers) from 24.
+INTEGERS, DOUBLES, UPPER_OFFSET = 8, 18, 24
+
+OUTPUTS = (
+    "runtime_state",
+    "robot_mode",
+    "safety_mode",
+    "speed_scaling",
+    "target_speed_fraction",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "tcp_offset",
+)
+CHECKS = (
+    "answer",
+    "version",
+    "safety",
+    "power",
+    "program",
+    "standstill",
+    "joint limits",
+    "TCP",
+    "speed slider",
+    "registers",
+    "kinematics",
+    "flange pose",
+    "remote control",
+)
+
+# Without power the arm's encoders and its kinematics say nothing; without a dashboard nobody knows about remote control.
+WAITS_FOR = {
+    "standstill": ("power",),
+    "joint limits": ("power",),
+    "kinematics": ("power",),
+    "flange pose": ("power", "kinematics"),
+    "remote control": ("program",),
+}
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing looked at: what was found, and what to press where it is not right.
+
+    checked is False where an earlier problem kept it from being made; then ok is False too and there is no remedy.
+    """
+
+    name: str
+    ok: bool
+    found: str
+    remedy: str = ""
+    checked: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Preflight:
+    """All checks, and what was read on the way (None where it was not): arm_q (6,) rad, tcp_pose and tcp_offset (6,) as
+    x, y, z (m) and a rotation vector (rad), the controller's version, the robot's own kinematics and the arm with them,
+    how far our flange pose is from the controller's, and which register range the driver is to use.
+    """
+
+    host: str
+    checks: tuple[Check, ...]
+    arm_q: Array | None = None
+    tcp_pose: Array | None = None
+    tcp_offset: Array | None = None
+    version: tuple[int, ...] | None = None
+    kinematics: KinematicsInfo | None = None
+    arm: ArmModel | None = None
+    pose_error_m: float | None = None
+    pose_error_rad: float | None = None
+    upper_registers: bool = True
+
+    @property
+    def ok(self) -> bool:
+        """The robot is ready."""
+        return all(check.ok for check in self.checks)
+
+    @property
+    def first_problem(self) -> Check | None:
+        """The check to mend first."""
+        return next((check for check in self.checks if check.checked and not check.ok), None)
+
+
+def preflight(
+    host: str, *, upper_registers: bool | None = None, timeout_s: float = 2.0, nominal: ArmModel | None = None
+) -> Preflight:
+    """Looks at the robot at `host` without touching it.
+
+    Args:
+        host: name or address of the controller.
+        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses leave alone; None: where
+            the client can.
+        timeout_s: each question to the controller takes at most this long.
+        nominal: the arm that is expected there; a UR10e where None.
+
+    Raises:
+        InputError: the host name is empty. Everything else is a check that is not ok.
+    """
+    look = _Look(host, timeout_s, nominal or load_arm("ur10e"))
+    look.run(upper_registers)
+    return look.report()
+
+
+def require_ready(report: Preflight) -> None:
+    """Refuses a robot that is not ready.
+
+    Raises:
+        RobotUnreachable: nothing answers there.
+        RobotRefused: the first check that is not ok; the text is its remedy.
+    """
+    problem = report.first_problem
+    if problem is not None:
+        raise (RobotUnreachable if problem.name == "answer" else RobotRefused)(problem.remedy)
+
+
+class _Look:
+    """The checks as they are made, one method each; each leaves its finding in `_done`."""
+
+    def __init__(self, host: str, timeout_s: float, nominal: ArmModel) -> None:
+        self._host, self._timeout_s, self._nominal = host, timeout_s, nominal
+        self._done: dict[str, Check] = {}
+        self._seen: Mapping[str, Value] = {}
+        self._version: tuple[int, ...] | None = None
+        self._kinematics: KinematicsInfo | None = None
+        self._arm: ArmModel | None = None
+        self._error: tuple[float, float] | None = None
+        self._dashboard = True
+        self._upper: bool | None = None
+
+    def report(self) -> Preflight:
+        """Every check in its place, those not made included."""
+        checks = tuple(self._done.get(name) or self._waiting(name) for name in CHECKS)
+        error_m, error_rad = self._error or (None, None)
+        return Preflight(
+            host=self._host,
+            checks=checks,
+            arm_q=self._six("actual_q"),
+            tcp_pose=self._six("actual_TCP_pose"),
+            tcp_offset=self._six("tcp_offset"),
+            version=self._version,
+            kinematics=self._kinematics,
+            arm=self._arm,
+            pose_error_m=error_m,
+            pose_error_rad=error_rad,
+            upper_registers=bool(self._upper),
+        )
+
+    def _waiting(self, name: str) -> Check:
+        """A check that could not be made, and which one has to be right first."""
+        blockers = ("answer", "version", *WAITS_FOR.get(name, ()))
+        first = next(blocker for blocker in blockers if blocker in self._done and not self._done[blocker].ok)
+        return Check(name, False, f"needs {first}", checked=False)
+
+    def run(self, upper: bool | None) -> None:
+        """All checks that can be made."""
+        self._upper = upper
+        try:
+            claims = self._ask_rtde()
+        except RobotUnreachable as problem:
+            # whatever broke down on the way, the robot does not answer as it should
+            self._done.clear()
+            self._bad("answer", f"none on port {RTDE_PORT}", str(problem))
+            return
+        self._ok("answer", f"RTDE on port {RTDE_PORT}")
+        if not self._done["version"].ok:
+            return
+        self._check_registers(claims, self._seen.get(f"input_int_register_{self._offset}"))
+        self._check_safety()
+        self._check_power()
+        self._check_program()
+        self._check_tcp()
+        self._check_speed()
+        if self._done["power"].ok:
+            self._check_standstill()
+            self._check_limits()
+            self._check_kinematics()
+        self._check_remote()
+
+    @property
+    def _offset(self) -> int:
+        return UPPER_OFFSET if self._upper else 0
+
+    def _ask_rtde(self) -> dict[str, str]:
+        """Reads what all checks look at, and what became of asking for the driver's registers; gives them back at once."""
+        with RtdeProbe(self._host, self._timeout_s) as rtde:
+            self._version = rtde.version
+            if not self._check_version(rtde.version):
+                return {}
+            if self._upper is None:
+                self._upper = upper_range_works(rtde.version)
+            claims = rtde.claim(_registers(self._offset))
+            self._seen = rtde.read((*OUTPUTS, f"input_int_register_{self._offset}"))
+        if missing := [name for name in OUTPUTS if name not in self._seen]:
+            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", remedies.VERSION)
+        return claims
+
+    def _ok(self, name: str, found: str) -> None:
+        self._done[name] = Check(name, True, found)
+
+    def _bad(self, name: str, found: str, remedy: str) -> None:
+        self._done[name] = Check(name, False, found, remedy)
+
+    def _state(self, name: str, ok: bool, found: str, remedy: str) -> None:
+        self._done[name] = Check(name, ok, found, "" if ok else remedy)
+
+    def _number(self, name: str) -> float:
+        return float(cast(float, self._seen[name]))
+
+    def _six(self, name: str) -> Array | None:
+        return np.array(self._seen[name], dtype=np.float64) if name in self._seen else None
+
+    @property
+    def _version_text(self) -> str:
+        return "PolyScope " + ".".join(str(number) for number in (self._version or ())[:3])
+
+    def _is_x(self) -> bool:
+        return self._version is not None and self._version[0] >= POLYSCOPE_X
+
+    def _check_version(self, version: tuple[int, ...]) -> bool:
+        good = is_supported(version)
+        self._state("version", good, self._version_text, remedies.VERSION)
+        return good
+
+    def _check_safety(self) -> None:
+        mode = int(self._number("safety_mode"))
+        found = remedies.SAFETY_MODES.get(mode, f"mode {mode}")
+        if mode == REDUCED:
+            found += " (the robot itself limits speed and force)"
+        self._state("safety", mode in (NORMAL, REDUCED), found, remedies.safety(mode))
+
+    def _check_power(self) -> None:
+        mode = int(self._number("robot_mode"))
+        self._state("power", mode == RUNNING, remedies.ROBOT_MODES.get(mode, f"mode {mode}"), remedies.power(mode))
+
+    def _check_program(self) -> None:
+        state = int(self._number("runtime_state"))
+        found = remedies.RUNTIME_STATES.get(state, f"state {state}")
+        name = ""
+        if not self._is_x():
+            try:
+                told, _, name = self._ask("programState").partition(" ")
+            except RobotUnreachable as problem:
+                self._dashboard = False
+                self._bad("program", f"{found}; the dashboard does not answer", str(problem))
+                return
+            if told in ("PLAYING", "PAUSED", "STOPPED"):
+                found = told if state == STOPPED else found
+            elif told != LOCAL:
+                self._bad("program", f"the dashboard says {told} {name}".strip(), remedies.DASHBOARD)
+                return
+        ready = found == "STOPPED"
+        label = f"{found} {name}".strip() if not ready else "none runs"
+        self._state("program", ready, label, remedies.program(found, name))
+
+    def _check_standstill(self) -> None:
+        speed = float(np.abs(self._vector("actual_qd")).max())
+        found = "at rest" if speed <= REST_RAD_S else f"a joint turns at {np.rad2deg(speed):.1f} deg/s"
+        self._state("standstill", speed <= REST_RAD_S, found, remedies.STANDSTILL)
+
+    def _check_limits(self) -> None:
+        q, arm = self._vector("actual_q"), self._nominal
+        room = np.minimum(q - arm.position_lower, arm.position_upper - q)
+        worst = int(np.argmin(room))
+        joint = arm.joint_names[worst].removesuffix("_joint").replace("_", " ")
+        degrees = np.rad2deg(room[worst])
+        found = f"{degrees:.0f} deg of room ({joint})" if degrees >= 0.0 else f"{joint} {-degrees:.0f} deg beyond"
+        self._state("joint limits", bool(room[worst] >= LIMIT_MARGIN_RAD), found, remedies.limits(joint))
+
+    def _check_tcp(self) -> None:
+        offset = self._vector("tcp_offset")
+        zero = bool(np.abs(offset).max() <= TCP_ZERO)
+        found = "zero" if zero else f"{_triple(1e3 * offset[:3])} mm, {_triple(np.rad2deg(offset[3:]))} deg"
+        self._state("TCP", zero, found, remedies.TCP)
+
+    def _check_speed(self) -> None:
+        slider, scaling = self._number("target_speed_fraction"), self._number("speed_scaling")
+        # what the trajectory limiter says while no program runs is not published: it is shown, and judged once we move
+        found = f"{100 * slider:.0f} %" + (f" (scaling {100 * scaling:.0f} %)" if scaling < FULL_SPEED else "")
+        self._state("speed slider", slider >= FULL_SPEED, found, remedies.SLIDER)
+
+    def _check_registers(self, claims: Mapping[str, str], command: Value | None) -> None:
+        for answer, word, remedy in (
+            (IN_USE, "in use", remedies.REGISTERS),
+            (NOT_FOUND, "unknown", remedies.NO_REGISTERS),
+        ):
+            if names := [name for name, kind in claims.items() if kind == answer]:
+                self._bad("registers", f"{_ranges(names)} {word}", remedy)
+                return
+        # A command register that still holds an old command is no reason to refuse: nobody can clear it at the pendant,
+        # the driver does, and the guard script obeys nothing until it has read zero there.
+        stale = f"; command {command} is left over, the driver clears it" if command else ""
+        self._ok("registers", f"{_ranges(list(claims))} free{stale}")
+
+    def _check_kinematics(self) -> None:
+        try:
+            self._kinematics = read_kinematics(self._host, self._timeout_s)
+        except RobotRefused as problem:
+            self._bad("kinematics", "not readable on port 30001", str(problem))
+            return
+        try:
+            self._arm = calibrated_arm(self._nominal, self._kinematics)
+        except InputError as problem:
+            self._bad("kinematics", f"not a {self._nominal.name}'s", str(problem))
+            return
+        found = "factory calibration" if self._kinematics.calibrated else "nominal, as URSim or an emulator has it"
+        self._ok("kinematics", found)
+        pose, offset = self._vector("actual_TCP_pose"), self._vector("tcp_offset")
+        error_m, error_rad = self._error = cross_check(self._arm, self._vector("actual_q"), pose, offset)
+        agrees = error_m <= KINEMATICS_TOLERANCE_M and error_rad <= KINEMATICS_TOLERANCE_RAD
+        found = f"{1e3 * error_m:.3f} mm, {np.rad2deg(error_rad):.4f} deg from the controller's"
+        self._state("flange pose", agrees, found, remedies.POSE)
+
+    def _check_remote(self) -> None:
+        if self._is_x():
+            # PolyScope X has no dashboard to ask; in local control it ignores scripts, and the driver refuses a guard
+            # script that does not come up
+            self._ok("remote control", "cannot be asked on PolyScope X; seen when the guard script starts")
+            return
+        if not self._dashboard:
+            return
+        try:
+            told = self._ask("is in remote control")
+        except RobotUnreachable as problem:
+            self._bad("remote control", "the dashboard does not answer", str(problem))
+            return
+        if told not in ("true", "false", LOCAL):
+            self._bad("remote control", f"the dashboard says {told}", remedies.DASHBOARD)
+            return
+        self._state("remote control", told == "true", "on" if told == "true" else "local control", remedies.LOCAL)
+
+    def _ask(self, command: str) -> str:
+        """The dashboard's answer, or LOCAL where it refuses because the robot is in local control."""
+        answer = ask(self._host, command, self._timeout_s)
+        return LOCAL if "remote control mode" in answer.lower() else answer
+
+    def _vector(self, name: str) -> Array:
+        return np.array(self._seen[name], dtype=np.float64)
+
+
+def _registers(offset: int) -> list[str]:
+    integers = [f"input_int_register_{i}" for i in range(offset, offset + INTEGERS)]
+    return integers + [f"input_double_register_{i}" for i in range(offset, offset + DOUBLES)]
+
+
+def _ranges(names: list[str]) -> str:
+    """Registers as a person writes them: int 24-31, double 24-41."""
+    parts = []
+    for kind in ("int", "double"):
+        numbers = sorted(int(name.rpartition("_")[2]) for name in names if name.startswith(f"input_{kind}_"))
+        runs: list[list[int]] = []
+        for number in numbers:
+            if runs and number == runs[-1][-1] + 1:
+                runs[-1].append(number)
+            else:
+                runs.append([number])
+        parts += [f"{kind} {run[0]}" + (f"-{run[-1]}" if len(run) > 1 else "") for run in runs]
+    return ", ".join(parts)
+
+
+def _triple(values: Array) -> str:
+    return "(" + ", ".join(f"{value:.1f}" for value in values) + ")"

@@ -1,0 +1,117 @@
+"""What to press: one sentence for each thing that keeps a robot from starting, in the words of PolyScope 5's menus."""
+
+from __future__ import annotations
+
+ROBOT_MODES = {
+    -1: "NO_CONTROLLER",
+    0: "DISCONNECTED",
+    1: "CONFIRM_SAFETY",
+    2: "BOOTING",
+    3: "POWER_OFF",
+    4: "POWER_ON",
+    5: "IDLE",
+    6: "BACKDRIVE",
+    7: "RUNNING",
+    8: "UPDATING_FIRMWARE",
+}
+SAFETY_MODES = {
+    1: "NORMAL",
+    2: "REDUCED",
+    3: "PROTECTIVE_STOP",
+    4: "RECOVERY",
+    5: "SAFEGUARD_STOP",
+    6: "SYSTEM_EMERGENCY_STOP",
+    7: "ROBOT_EMERGENCY_STOP",
+    8: "VIOLATION",
+    9: "FAULT",
+    10: "VALIDATE_JOINT_ID",
+    11: "UNDEFINED_SAFETY_MODE",
+}
+RUNTIME_STATES = {0: "STOPPING", 1: "STOPPED", 2: "PLAYING", 3: "PAUSING", 4: "PAUSED", 5: "RESUMING"}
+
+VERSION = "The controller's software is not supported: install PolyScope 5.12 or newer, or PolyScope X 10.10 or newer."
+DASHBOARD = "The dashboard gives an answer that no PolyScope 5 gives: restart the control box."
+LOCAL = (
+    "The robot is in local control: tap the Local icon at the upper right of the pendant and choose Remote Control "
+    "(where there is none, enable it first under Settings > System > Remote Control)."
+)
+STANDSTILL = "The arm is moving: let go of Freedrive and of the Move tab's arrows, and wait until it stands still."
+TCP = (
+    "The TCP is not zero: open Installation > General > TCP on the pendant, set X, Y, Z, RX, RY and RZ of the default "
+    "TCP to 0, and save the installation."
+)
+SLIDER = (
+    "The speed slider is not at 100 %: drag the slider at the bottom of the pendant's screen all the way to the right."
+)
+REGISTERS = (
+    "Input registers are in use by EtherNet/IP, PROFINET or another client: press Disable under Installation > Fieldbus "
+    "> EtherNet/IP and > PROFINET on the pendant, and close every other program that controls this robot."
+)
+NO_REGISTERS = "The controller lacks the input registers that the driver needs: update PolyScope to 5.12 or newer."
+POSE = (
+    "The flange pose computed here is not the controller's: set the TCP to zero under Installation > General > TCP, "
+    "restart the control box so that it reads the arm's calibration again, and do not run this robot until they agree."
+)
+
+_INITIALIZE = "press Initialize at the lower left of the pendant"
+_ON_START = f"{_INITIALIZE}, then ON, then START"
+
+
+def power(robot_mode: int) -> str:
+    """What to do where the arm is not RUNNING."""
+    match robot_mode:
+        case 1:
+            return "The safety configuration waits for you: confirm it in the pop-up on the pendant."
+        case 4 | 5:
+            return f"The brakes are on: {_INITIALIZE}, then START."
+        case 6:
+            return "The arm is in backdrive: leave it with the button on the Initialize screen, then press START there."
+        case 8:
+            return "The controller updates its firmware: wait until the pendant says that it is done."
+        case 3:
+            return f"The arm has no power: {_ON_START}."
+    return f"The controller is not connected to its arm: wait until PolyScope has started, then {_ON_START}."
+
+
+def safety(safety_mode: int) -> str:
+    """What to do where the safety system has stopped the arm."""
+    match safety_mode:
+        case 3:
+            return (
+                "The robot is in a protective stop: find out what stopped it, clear the way, and press Enable Robot in "
+                "the pop-up on the pendant, which works 5 s after the stop."
+            )
+        case 4:
+            return (
+                "The robot is in recovery mode because a safety limit is violated: move the arm back within its limits "
+                "with Freedrive or the Move tab."
+            )
+        case 5:
+            return (
+                "A safeguard stop is active: close the safety gate (or press the enabling device), and press the "
+                "safeguard's reset button where it has one."
+            )
+        case 6 | 7:
+            where = "in the cell (system emergency stop)" if safety_mode == 6 else "on the pendant"
+            return (
+                f"An emergency stop is pressed {where}: make sure that nobody is in danger, turn the red button to "
+                f"release it, and {_ON_START}."
+            )
+    return (
+        f"The safety system reports {SAFETY_MODES.get(safety_mode, safety_mode)}: read the Log tab of the pendant, mend "
+        "what it names, and press Restart Safety in the pop-up."
+    )
+
+
+def limits(joint: str) -> str:
+    """What to do where a joint is too near its limit."""
+    return f"The {joint} joint is less than 5 degrees from its limit: turn it back with the Move tab of the pendant."
+
+
+def program(state: str, name: str) -> str:
+    """What to do where a program that is not ours runs or waits."""
+    which = f"the program {name}" if name and not name.startswith("<") else "a program"
+    return (
+        f"The robot is busy with {which} ({state}): press Stop at the bottom of the pendant's screen, for nothing is "
+        "stopped from here that somebody else may need."
+    )

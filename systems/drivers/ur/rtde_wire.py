@@ -1,0 +1,149 @@
+"""A small RTDE client for the pre-flight: reads chosen outputs once, and asks whether inputs are free; it writes nothing.
+
+Packages of protocol version 2 are big endian: uint16 size (header included), uint8 type, payload. The driver's stream
+goes through ur_rtde; this client exists because ur_rtde cannot read `tcp_offset` and claims registers only for good.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from types import TracebackType
+
+from weldcal.systems.drivers.ur.line import Line
+
+RTDE_PORT = 30004
+IN_USE, NOT_FOUND = "IN_USE", "NOT_FOUND"
+FREQUENCY_HZ = 125.0
+PROTOCOL_VERSION = 2
+MAX_NAMES_BYTES = 2048
+
+_PROTOCOL, _VERSION, _DATA, _OUTPUTS, _INPUTS, _START, _PAUSE = (ord(letter) for letter in "VvUOISP")
+_CODES = {
+    "DOUBLE": "d",
+    "INT32": "i",
+    "UINT32": "I",
+    "UINT64": "Q",
+    "UINT8": "B",
+    "BOOL": "?",
+    "VECTOR3D": "3d",
+    "VECTOR6D": "6d",
+    "VECTOR6INT32": "6i",
+    "VECTOR6UINT32": "6I",
+}
+
+Value = float | int | bool | tuple[float, ...] | tuple[int, ...]
+
+
+class RtdeProbe:
+    """One connection to a controller's RTDE port; a context manager, whose end gives back every input it was granted.
+
+    Raises (all methods):
+        RobotUnreachable: nothing answers in time, or what answers is not RTDE.
+    """
+
+    def __init__(self, host: str, timeout_s: float = 2.0, port: int = RTDE_PORT) -> None:
+        self._line = Line(host, port, "RTDE", timeout_s)
+        try:
+            (accepted,) = self._unpack(">?", self._request(_PROTOCOL, struct.pack(">H", PROTOCOL_VERSION)))
+            if not accepted:
+                raise self._line.nonsense()
+            major, minor, bugfix, build = self._unpack(">4I", self._request(_VERSION, b""))
+        except BaseException:
+            self._line.close()
+            raise
+        self.version: tuple[int, int, int, int] = (major, minor, bugfix, build)
+
+    def __enter__(self) -> RtdeProbe:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Hangs up."""
+        self._line.close()
+
+    def read(self, names: Sequence[str]) -> dict[str, Value]:
+        """The next values of these outputs, all of one control step; a name that the controller lacks is left out.
+
+        Vectors come as tuples; poses are x, y, z (m) and a rotation vector (rad), joints rad and rad/s.
+        """
+        types = self._set_outputs(names)
+        wanted = [name for name, kind in zip(names, types, strict=True) if kind != NOT_FOUND]
+        if not wanted:
+            return {}
+        if len(wanted) < len(names):
+            types = self._set_outputs(wanted)
+        if not set(types) <= set(_CODES):
+            raise self._line.nonsense()
+        (started,) = self._unpack(">?", self._request(_START, b""))
+        if not started:
+            raise self._line.nonsense()
+        payload = self._next(_DATA)
+        self._request(_PAUSE, b"")
+        layout = struct.Struct(">B" + "".join(_CODES[kind] for kind in types))
+        if len(payload) != layout.size:
+            raise self._line.nonsense()
+        numbers = layout.unpack(payload)[1:]
+        values: dict[str, Value] = {}
+        at = 0
+        for name, kind in zip(wanted, types, strict=True):
+            width = int(_CODES[kind][0]) if kind.startswith("VECTOR") else 0
+            values[name] = numbers[at : at + width] if width else numbers[at]
+            at += width or 1
+        return values
+
+    def claim(self, names: Sequence[str]) -> dict[str, str]:
+        """Asks for these inputs: each one's type where it is free, else IN_USE or NOT_FOUND.
+
+        Nothing is written to them. Those granted stay this connection's until it is closed.
+        """
+        answer: dict[str, str] = {}
+        for group in _groups(names):
+            types = self._types(self._request(_INPUTS, ",".join(group).encode()), len(group))
+            answer |= dict(zip(group, types, strict=True))
+        return answer
+
+    def _set_outputs(self, names: Sequence[str]) -> list[str]:
+        request = struct.pack(">d", FREQUENCY_HZ) + ",".join(names).encode()
+        return self._types(self._request(_OUTPUTS, request), len(names))
+
+    def _types(self, payload: bytes, count: int) -> list[str]:
+        types = payload[1:].decode("ascii", "replace").split(",")
+        if len(types) != count:
+            raise self._line.nonsense()
+        return types
+
+    def _request(self, kind: int, payload: bytes) -> bytes:
+        self._line.send(struct.pack(">HB", len(payload) + 3, kind) + payload)
+        return self._next(kind)
+
+    def _next(self, kind: int) -> bytes:
+        """Payload of the next package of this type; others (text messages, late data) are passed over."""
+        until = self._line.deadline()
+        while True:
+            size, found = struct.unpack(">HB", self._line.read(3, until))
+            if size < 3:
+                raise self._line.nonsense()
+            payload = self._line.read(size - 3, until)
+            if found == kind:
+                return payload
+
+    def _unpack(self, code: str, payload: bytes) -> tuple[int, ...]:
+        if len(payload) != struct.calcsize(code):
+            raise self._line.nonsense()
+        return struct.unpack(code, payload)
+
+
+def _groups(names: Sequence[str]) -> list[list[str]]:
+    """The names in lists that fit into one recipe each."""
+    groups: list[list[str]] = [[]]
+    size = 0
+    for name in names:
+        size += len(name) + 1
+        if size > MAX_NAMES_BYTES:
+            groups.append([])
+            size = len(name) + 1
+        groups[-1].append(name)
+    return [group for group in groups if group]

@@ -1,0 +1,219 @@
+"""What the worker decides in each pass: send, brake, stop or leave; a plain function of what it sees, without any wire."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.systems.drivers.ur.faults import Fault
+
+Array = NDArray[np.float64]
+
+NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
+SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
+RUNNING = 7
+PLAYING, PAUSING, PAUSED = 2, 3, 4
+# what the guard script says of itself in its output register
+OBEYING, STALE_REGISTER = 1, 2
+
+
+class Action(IntEnum):
+    """What to do with the arm."""
+
+    SEND = 0  # the wanted velocity
+    BRAKE = 1  # zero velocity with the braking acceleration, through the same stream
+    STOP = 2  # send nothing more; the program is stopped through the dashboard
+    LEAVE = 3  # the link is not to be trusted: leave at once, the controller's own watchdogs stop the arm
+
+
+ACTIONS = {
+    **dict.fromkeys((Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF, Fault.CLOCK_JUMPED), Action.LEAVE),
+    Fault.STATE_IMPLAUSIBLE: Action.LEAVE,
+    **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault <= Fault.GUARD_LATCHED},
+    **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """What the worker holds commands and state against. (6,) in rad, rad/s, rad/s^2; times in s of the host."""
+
+    position_lower: Array
+    position_upper: Array
+    speed: Array
+    acceleration: Array
+    stale_s: float = 0.040
+    late_s: float = 0.050
+    deaf_s: float = 0.080
+    jump_s: float = 0.5
+    braking: float = 5.0
+    tracking_rad: float = 0.01
+    pace: float = 1.0
+    position_margin: float = 0.02
+
+    def slowed(self, pace: float) -> Limits:
+        """The same limits where the controller runs at `pace` seconds per host second."""
+        return replace(
+            self, stale_s=self.stale_s / pace, late_s=self.late_s / pace, deaf_s=self.deaf_s / pace, pace=pace
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSample:
+    """The newest package; `fresh_at` is the host time at which its timestamp was first seen."""
+
+    robot_time: float
+    fresh_at: float
+    q: Array
+    qd: Array
+    robot_mode: int
+    safety_mode: int
+    runtime_state: int
+    speed_scaling: float
+    guard: int
+    connected: bool
+    pose_error_m: float = 0.0
+    unheard_s: float = 0.0  # for how long the guard script has not seen a newer command
+
+
+@dataclass(frozen=True, eq=False)
+class Command:
+    """The newest velocity that the cell asked for; `given_at` is host time."""
+
+    number: int = 0
+    given_at: float = -np.inf
+    qd: Array = field(default_factory=lambda: np.zeros(6))
+    stop: bool = False
+    orphaned: bool = False  # the cell's process is gone
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What to do, and for which fault."""
+
+    action: Action
+    fault: Fault = Fault.NONE
+    detail: float = 0.0
+
+
+class Supervisor:
+    """Looks at every pass; the first fault latches for good."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._last: RobotSample | None = None
+        self._command = Command()
+        self._reference: Array | None = None
+        self._referred_at = 0.0
+        self._slow_since: float | None = None
+        self.latched = Decision(Action.SEND)
+
+    def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
+        """The decision of this pass. `now` is host time, s."""
+        if self.latched.fault is Fault.NONE:
+            fault, detail = self._look(now, robot, command)
+            if fault is not Fault.NONE:
+                self.latched = Decision(ACTIONS[fault], fault, detail)
+        elif self.latched.action is not Action.LEAVE:
+            # a link that breaks while the arm brakes is still a broken link
+            fault, detail = self._link(now, robot)
+            if fault is not Fault.NONE:
+                self.latched = Decision(Action.LEAVE, self.latched.fault, self.latched.detail)
+        self._last, self._command = robot, command
+        if self.latched.fault is Fault.NONE and (command.stop or command.orphaned):
+            return Decision(Action.BRAKE)
+        return self.latched
+
+    def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+        for look in (self._link(now, robot), self._safety(robot), self._program(robot)):
+            if look[0] is not Fault.NONE:
+                return look
+        return self._motion(now, robot, command)
+
+    def _link(self, now: float, robot: RobotSample) -> tuple[Fault, float]:
+        limits, last = self._limits, self._last
+        if not robot.connected:
+            return Fault.LINK_CLOSED, 0.0
+        if now - robot.fresh_at > limits.stale_s:
+            return Fault.LINK_STALE, 1e3 * (now - robot.fresh_at)
+        if last is not None and robot.robot_time != last.robot_time:
+            passed = robot.robot_time - last.robot_time
+            expected = limits.pace * (robot.fresh_at - last.fresh_at)
+            if passed < 0.0 or abs(passed - expected) > limits.jump_s:
+                return Fault.CLOCK_JUMPED, passed - expected
+            jump = float(np.abs(robot.q - last.q).max())
+            if not np.isfinite(robot.q).all() or jump > 4.0 * max(passed, 0.004):
+                return Fault.STATE_IMPLAUSIBLE, jump
+        return Fault.NONE, 0.0
+
+    @staticmethod
+    def _safety(robot: RobotSample) -> tuple[Fault, float]:
+        mode = robot.safety_mode
+        if mode in (NORMAL, REDUCED):
+            if robot.robot_mode != RUNNING:
+                return Fault.ROBOT_NOT_RUNNING, float(robot.robot_mode)
+            return Fault.NONE, 0.0
+        named = {
+            PROTECTIVE: Fault.PROTECTIVE_STOP,
+            RECOVERY: Fault.RECOVERY_MODE,
+            SAFEGUARD: Fault.SAFEGUARD_STOP,
+            SYSTEM_EMERGENCY: Fault.EMERGENCY_STOP,
+            ROBOT_EMERGENCY: Fault.EMERGENCY_STOP,
+        }
+        return named.get(mode, Fault.SAFETY_VIOLATION), float(mode)
+
+    @staticmethod
+    def _program(robot: RobotSample) -> tuple[Fault, float]:
+        if robot.runtime_state in (PAUSING, PAUSED):
+            return Fault.PROGRAM_PAUSED, 0.0
+        if robot.runtime_state != PLAYING:
+            return Fault.PROGRAM_STOPPED, float(robot.runtime_state)
+        if robot.guard != OBEYING:
+            return Fault.GUARD_LATCHED, float(robot.guard)
+        return Fault.NONE, 0.0
+
+    def _motion(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+        limits = self._limits
+        if robot.unheard_s > limits.deaf_s:
+            return Fault.CONTROLLER_DEAF, 1e3 * robot.unheard_s
+        self._slow_since = (self._slow_since or now) if robot.speed_scaling < 0.99 else None
+        if self._slow_since is not None and now - self._slow_since > limits.late_s:
+            return Fault.SPEED_SLIDER, 100.0 * robot.speed_scaling
+        if robot.pose_error_m > 5e-5:
+            return Fault.POSE_MISMATCH, 1e3 * robot.pose_error_m
+        if not np.isfinite(command.qd).all():
+            return Fault.COMMAND_NOT_FINITE, 0.0
+        share = np.abs(command.qd) / limits.speed
+        if share.max() > 1.0 + 1e-9:
+            return Fault.COMMAND_TOO_FAST, float(np.abs(command.qd)[int(np.argmax(share))])
+        late = now - command.given_at
+        if command.qd.any() and late > limits.late_s and not (command.stop or command.orphaned):
+            return Fault.COMMAND_LATE, 1e3 * late
+        if command.number != self._command.number:
+            # commands may be skipped between two passes, and come up to one deadline late
+            passed = limits.pace * min(max(command.given_at - self._command.given_at, 0.0), 1.0) + 0.02
+            jump = np.abs(command.qd - self._command.qd)
+            if (jump > limits.acceleration * passed).any():
+                return Fault.COMMAND_JUMPED, float(jump.max())
+        ahead = robot.q + command.qd * np.abs(command.qd) / (2.0 * limits.braking) + 0.05 * command.qd
+        outside = (ahead > limits.position_upper - limits.position_margin) & (command.qd > 0.0)
+        outside |= (ahead < limits.position_lower + limits.position_margin) & (command.qd < 0.0)
+        if outside.any():
+            return Fault.JOINT_LIMIT, float(np.argmax(outside) + 1)
+        return self._tracking(now, robot, command)
+
+    def _tracking(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
+        """Where the commands of the last moments lead, against where the arm is; the reference forgets in half a second."""
+        limits = self._limits
+        if self._reference is None:
+            self._reference, self._referred_at = robot.q.copy(), now
+        dt = limits.pace * min(now - self._referred_at, 0.1)
+        self._referred_at = now
+        self._reference = self._reference + dt * self._command.qd + (robot.q - self._reference) * min(dt / 0.5, 1.0)
+        apart = float(np.abs(self._reference - robot.q).max())
+        # commands and state together are up to 40 ms on their way
+        allowed = limits.tracking_rad + 0.04 * float(np.abs(command.qd).max())
+        return (Fault.TRACKING, apart) if apart > allowed else (Fault.NONE, 0.0)

@@ -1,0 +1,176 @@
+"""The worker process: reads the robot, asks the supervisor, sends, and leaves when the link is not sound.
+
+It alone holds ur_rtde, whose constructors hold the GIL, whose getters never say that they are old, whose send reconnects
+by itself, and which may crash; none of this reaches the cell, which shares only memory with this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.shared import Memory, TornRead
+from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
+
+if TYPE_CHECKING:
+    from weldcal.systems.drivers.ur.robot import Robot
+
+ACCELERATION = 40.0  # rad/s^2 of speedj: the stream is ramped by the cell, the controller is only to follow
+LATE_PASS_S = 0.020
+REST_RAD_S = 1e-3
+STOP_LIMIT_S = 2.0
+LEFT = 3  # exit code of a worker that left because of the link
+
+
+class Phase(IntEnum):
+    """Where the worker is in its life."""
+
+    STARTING = 0
+    OBEYING = 1
+    STOPPED = 2  # nothing is sent any more; the state is still read
+    ENDED = 3
+
+
+@dataclass(frozen=True, eq=False)
+class WorkerConfig:
+    """What the cell tells its worker. `arm` has the robot's own kinematics."""
+
+    host: str
+    arm: ArmModel
+    limits: Limits
+    rate_hz: float
+    upper_registers: bool
+    payload_kg: float
+    payload_cog_m: tuple[float, float, float]
+    parent: int
+
+
+class Worker:
+    """The loop, with what it counts."""
+
+    def __init__(self, config: WorkerConfig, memory: Memory) -> None:
+        self._config, self._memory = config, memory
+        self._supervisor = Supervisor(config.limits)
+        self._phase = Phase.STARTING
+        self._fault_time = 0.0
+        self._worst = 0.0
+        self._late = 0
+        self._ringed = -1.0
+        self._newest: tuple[float, ...] | None = None
+        self._rest_since: float | None = None
+        self._braking_since: float | None = None
+
+    def run(self, robot: Robot) -> int:
+        """Until the cell asks it to stop or the link breaks; the process's exit code."""
+        period = 1.0 / self._config.rate_hz
+        self._phase = Phase.OBEYING
+        deadline = last = time.monotonic()
+        while True:
+            now = time.monotonic()
+            if now < deadline:
+                time.sleep(deadline - now)
+                now = time.monotonic()
+            self._worst = max(self._worst, now - last)
+            self._late += now - last > period + LATE_PASS_S
+            last, deadline = now, max(deadline + period, now)
+            sample, command = robot.sample(now), self._command()
+            decision = self._supervisor.step(now, sample, command)
+            if decision.fault is not Fault.NONE and self._fault_time == 0.0:
+                self._fault_time = now
+            if decision.action is Action.LEAVE:
+                self._publish(now, robot, sample, decision)
+                return LEFT
+            if self._phase is Phase.OBEYING:
+                self._drive(now, robot, sample, command, decision)
+            self._publish(now, robot, sample, decision)
+            if (command.stop or command.orphaned) and self._phase is not Phase.OBEYING:
+                robot.disconnect()
+                self._phase = Phase.ENDED
+                self._publish(now, robot, sample, decision)
+                return 0
+
+    def _command(self) -> Command:
+        orphaned = os.getppid() != self._config.parent
+        with contextlib.suppress(TornRead):
+            self._newest = self._memory.command.read() or self._newest
+        found = self._newest
+        if found is None:
+            return Command(orphaned=orphaned)
+        number, given_at, stop, *qd = found
+        return Command(int(number), given_at, np.array(qd), bool(stop), orphaned)
+
+    def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
+        if decision.action is Action.SEND:
+            if not robot.send(command.qd, ACCELERATION):
+                self._phase = Phase.STOPPED  # the next sample says why
+        elif decision.action is Action.STOP:
+            robot.forget()
+            self._phase = Phase.STOPPED
+        else:
+            self._brake(now, robot, sample)
+
+    def _brake(self, now: float, robot: Robot, sample: RobotSample) -> None:
+        """Zero through the same stream until the arm rests, then the program is ended."""
+        self._braking_since = now if self._braking_since is None else self._braking_since
+        robot.send(np.zeros(6), self._config.limits.braking)
+        resting = np.abs(sample.qd).max() < REST_RAD_S
+        self._rest_since = (self._rest_since or now) if resting else None
+        rested = self._rest_since is not None and now - self._rest_since > 0.05 / self._config.limits.pace
+        if rested or now - self._braking_since > STOP_LIMIT_S / self._config.limits.pace:
+            robot.end_program()
+            self._phase = Phase.STOPPED
+
+    def _publish(self, now: float, robot: Robot, sample: RobotSample, decision: Decision) -> None:
+        host_time = robot.clock.to_host(sample.robot_time)
+        if sample.robot_time != self._ringed:
+            self._memory.ring.append(host_time, sample.q.tolist())
+            self._ringed = sample.robot_time
+        number, sent_at, echo = robot.numbers
+        values = [time.monotonic(), self._phase, host_time, sample.robot_time, *sample.q, *sample.qd]
+        values += [sample.robot_mode, sample.safety_mode, sample.runtime_state, sample.speed_scaling]
+        values += [decision.fault, decision.detail, self._fault_time, number, sent_at, echo, robot.echo_latency]
+        values += [self._worst, self._late, robot.clock.residual_s, robot.clock.drift]
+        self._memory.state.write([float(value) for value in values])
+
+    def refuse(self, fault: Fault) -> None:
+        """The start failed: say why."""
+        values = [0.0] * len(self._memory.state.names)
+        values[0], values[1] = time.monotonic(), Phase.ENDED
+        values[self._memory.state.names.index("fault")] = float(fault)
+        self._memory.state.write(values)
+
+
+def main() -> None:
+    """`python -m weldcal.systems.drivers.ur.worker FD`, with a pickled WorkerConfig on stdin."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupted cell asks its worker to stop, in order
+    memory = Memory(int(sys.argv[1]))
+    config: WorkerConfig = pickle.load(sys.stdin.buffer)
+    with contextlib.suppress(OSError):
+        os.nice(-10)
+    from weldcal.systems.drivers.ur.robot import Refused, Robot
+
+    worker = Worker(config, memory)
+    try:
+        robot = Robot(config.host, upper=config.upper_registers, pace=config.limits.pace, arm=config.arm)
+        robot.start_guard()
+        robot.set_load(config.payload_kg, list(config.payload_cog_m))
+    except Refused as refused:
+        worker.refuse(refused.fault)
+        os._exit(1)
+    # no destructor of ur_rtde runs: it would try to reconnect on a broken link
+    os._exit(worker.run(robot))
+
+
+if __name__ == "__main__":
+    main()

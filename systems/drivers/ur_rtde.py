@@ -1,0 +1,171 @@
+"""A real UR behind the station's ports: reads the link in an update event, sends in a publish event, computes nothing else."""
+
+import dataclasses as dc
+from typing import Any, Protocol
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
+from weldcal.systems.drivers.ur.link import LinkState, UrLink
+from weldcal.systems.drivers.ur.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.supervisor import Limits
+from weldcal.systems.messages import UrStatus
+
+FULL_PACE = 1.0
+STILL_RAD_S = 1e-9
+
+
+@dc.dataclass
+class UrRtde:
+    """`!UrRtde`: a Universal Robots e-Series arm, or its emulator, at an address."""
+
+    host: str = ""
+    rate_hz: float = 250.0  # of the worker's loop
+    pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
+    velocity_share: float = 0.6  # of the arm's own limits; a faster command is refused
+    upper_registers: bool | None = None  # 24 to 47 (the lower ones belong to fieldbuses); null: where ur_rtde can
+    payload_kg: float = 1.4  # of the welding tool
+    payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
+
+    def limits(self, arm: ArmModel) -> Limits:
+        """What the worker holds commands against."""
+        return Limits(
+            arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
+        ).slowed(self.pace)
+
+
+class ArmLink(Protocol):
+    """What the arm needs of its link; neither call blocks."""
+
+    def state(self) -> LinkState:
+        """The newest state."""
+
+    def command(self, qd: np.ndarray) -> int:
+        """Hand over the newest joint velocity (6,) rad/s."""
+
+
+class UrRtdeArm(LeafSystem):
+    """The station's arm over a link to the controller.
+
+    .. pydrake_system::
+
+        name: UrRtdeArm
+        input_ports:
+        - velocity_command
+        output_ports:
+        - desired_state
+        - position_measured
+        - velocity_measured
+        - X_BF
+        - sample_time
+        - status
+
+    Units as in the simulated arm. `sample_time` is when the robot took the sample, on the Diagram's clock: the moment of
+    the update less the sample's age, which robot time mapped to host time gives. `desired_state` (12) rad, rad/s is where the
+    real arm will be at the next tick, for a world that shadows it. Outputs depend on the state only: no feedthrough.
+    """
+
+    def __init__(
+        self, arm: ArmModel, link: UrLink, pace: float, period_s: float = 0.002, send_s: float = 0.004
+    ) -> None:
+        super().__init__()
+        self._arm, self._link, self._pace, self._period_s = arm, link, pace, period_s
+        found = link.state()
+        self._command = self.DeclareVectorInputPort("velocity_command", 6)
+        # q, qd, sample time, desired q, desired qd
+        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6)])
+        vector = self.DeclareDiscreteState(start)
+        self._said = self.DeclareAbstractState(AbstractValue.Make(found.status))
+        ticket = {self.discrete_state_ticket(vector)}
+        self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
+        self.DeclareVectorOutputPort("position_measured", 6, self._position, ticket)
+        self.DeclareVectorOutputPort("velocity_measured", 6, self._velocity, ticket)
+        self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
+        self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
+        said = {self.abstract_state_ticket(self._said)}
+        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(UrStatus()), self._status, said)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._read)
+        self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
+
+    def _read(self, context: Context, state: State) -> None:
+        found = self._link.state()
+        old = context.get_discrete_state_vector().value()
+        sampled = max(context.get_time() - self._pace * found.age_s, float(old[12]))
+        ahead = min(context.get_time() + self._period_s - sampled, 0.05)
+        desired = np.clip(found.q + ahead * found.qd, self._arm.position_lower, self._arm.position_upper)
+        new = np.concatenate([found.q, found.qd, [sampled], desired, found.qd])
+        state.get_mutable_discrete_state(0).set_value(new)
+        if found.status != context.get_abstract_state(self._said).get_value():
+            state.get_mutable_abstract_state(self._said).set_value(found.status)
+
+    def _send(self, context: Context) -> EventStatus:
+        wanted = np.array(self._command.Eval(context))
+        # an arm that is to stand still is told exactly so: only then may the cell think for as long as it likes
+        self._link.command(np.zeros(6) if np.abs(wanted).max() < STILL_RAD_S else wanted)
+        return EventStatus.Succeeded()
+
+    def _desired(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value()[13:])
+
+    def _position(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value()[:6])
+
+    def _velocity(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value()[6:12])
+
+    def _pose(self, context: Context, output: Any) -> None:
+        output.set_value(forward_kinematics(self._arm, context.get_discrete_state_vector().value()[:6]))
+
+    def _time(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
+
+    def _status(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._said).get_value())
+
+
+def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
+    """Pre-flight, the robot's own kinematics, then the link with its guard; the arm does not move.
+
+    Raises:
+        InputError: the scenario names no host, or a pace that no real robot has.
+        RobotRefused, RobotUnreachable: one sentence that says what to press.
+    """
+    if not config.host:
+        raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
+    if config.pace != FULL_PACE and not config.host.startswith("127."):
+        raise InputError("Only the emulator can run at another pace: leave pace at 1 for a robot.")
+    report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal)
+    require_ready(report)
+    arm = report.arm
+    if arm is None:
+        raise RuntimeError("the pre-flight passed without the robot's kinematics")
+    x, y, z = config.payload_cog_m
+    link = UrLink.start(
+        config.host,
+        arm,
+        config.limits(arm),
+        rate_hz=config.rate_hz,
+        upper_registers=report.upper_registers,
+        payload_kg=config.payload_kg,
+        payload_cog_m=(x, y, z),
+    )
+    return PreparedRobot(arm, link.state().q, link, config.pace)
+
+
+def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
+    """Add the arm over its link, and let the arm of the simulated world follow the real one, for the rendered sensors."""
+    if build.robot is None or not isinstance(build.robot.handle, UrLink):
+        raise RuntimeError("the robot was not prepared")
+    arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, config.pace))
+    arm.set_name("ur10e_link")
+    if build.world is not None:
+        world = build.world
+        build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
+    build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
+    for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
+        build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)

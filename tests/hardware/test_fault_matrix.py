@@ -1,0 +1,59 @@
+"""What the robot link does when something fails: the arm stops within 0.3 s, stays, says why, and starts again when asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from weldcal.tools.benchmarks.fault_bench import Bench
+from weldcal.tools.benchmarks.fault_cases import AT_START, GO, REFUSE, RUNNING, STOP, Case
+from weldcal.tools.benchmarks.fault_sequences import run_sequence
+from weldcal.tools.benchmarks.robot_faults import FaultReport, run_case
+from weldcal.tools.ur_emulator.process import emulator_process
+
+CASES = [case for case in RUNNING + AT_START if case.short]
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """One controller for all faults: that each one starts is what the one before must leave behind."""
+    with emulator_process() as emulator:
+        yield Bench(emulator)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_a_fault_is_answered(bench: Bench, case: Case) -> None:
+    outcome = run_case(bench, case, hasty=True)
+    assert outcome.problems == ()
+
+
+def test_the_last_fault_left_a_controller_that_can_be_started(bench: Bench) -> None:
+    bench.start(look=True)
+    bench.cruise()
+    bench.end()
+    bench.emulator.wait("runtime_state", "STOPPED")
+
+
+def test_random_faults_repairs_and_restarts_never_move_the_arm(bench: Bench) -> None:
+    sequence = run_sequence(bench, seed=7, seconds=10.0)
+    assert sequence.thrown.total() >= 2
+    assert sequence.verdict == "0 moves without a command, 0 after a fault, 0.000 s unattended, not reported: none"
+
+
+def test_every_way_of_failing_is_in_the_matrix() -> None:
+    names = [case.name for case in RUNNING + AT_START]
+    assert len(set(names)) == len(names)
+    assert {case.must for case in RUNNING} >= {GO, STOP}
+    assert {case.must for case in AT_START} == {REFUSE}
+    assert all(case.says for case in AT_START)
+    assert all(case.faults or case.elsewhere for case in RUNNING if case.must == STOP)
+
+
+def test_the_checker_would_see_an_arm_that_does_not_stop(bench: Bench) -> None:
+    # nothing is done to it, and it is said to have to stop
+    calm = Case("nothing", lambda b: b.emulator.ask(ask="state")["time"], STOP, RUNNING[-1].faults)
+    outcome = run_case(bench, calm, hasty=True)
+    assert not outcome.ok
+    assert any("not at rest" in problem for problem in outcome.problems)
+    assert FaultReport([outcome], [], None).summary()["state"] == "failed"  # type: ignore[arg-type]

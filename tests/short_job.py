@@ -1,0 +1,34 @@
+"""The demo's cell on a short seam, finished once a session for all tests that look at what it came to."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+
+from weldcal.systems.scenario import Scenario, load_scenario
+from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario
+
+SHORT_SEAM = "welding: {seam_length_mm: 30.0}"
+SHORT_JOB_SEED = 5
+
+
+def short_job_scenario(preset: str) -> Scenario:
+    """The S groove with another scanner; its first 30 mm are welded."""
+    scanner = f"scanner: !RenderedScanner {{preset: {preset}, width: 824, height: 616}}"
+    return load_scenario("s_groove", f"{SHORT_SEAM}\n{scanner}")
+
+
+@pytest.fixture(scope="session")
+def short_jobs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], DemoResult]:
+    """The job on the simulated arm, by the scanner's preset."""
+
+    @cache
+    def finished(preset: str) -> DemoResult:
+        folder = tmp_path_factory.mktemp(preset) / "run"
+        return run_scenario(
+            short_job_scenario(preset), DemoOptions("a test's own", folder, SHORT_JOB_SEED, recording=False)
+        )
+
+    return finished

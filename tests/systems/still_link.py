@@ -1,0 +1,44 @@
+"""A link to a robot that is not there: it shows what it was given and remembers what it was told."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from weldcal.systems.drivers.ur.faults import Fault, sentence
+from weldcal.systems.drivers.ur.link import LinkState
+from weldcal.systems.messages import UrStatus
+
+
+class StillLink:
+    """Position q (6,) rad, velocity qd (6,) rad/s, the age of the sample s, and a fault; commands in order."""
+
+    def __init__(self, q: np.ndarray) -> None:
+        self.q, self.qd = np.array(q), np.zeros(6)
+        self.age_s = 0.0
+        self.fault = Fault.NONE
+        self.commands: list[np.ndarray] = []
+
+    def state(self) -> LinkState:
+        """What a worker would have written."""
+        text = None if self.fault is Fault.NONE else sentence(self.fault)
+        status = UrStatus(program_running=self.fault is Fault.NONE, fault=text)
+        counts = {"sent": 0, "heard": 0, "late_periods": 0}
+        times = dict.fromkeys(
+            ("fault_time", "echo_latency_s", "worst_period_s", "clock_residual_s", "clock_drift"), 0.0
+        )
+        return LinkState(
+            q=self.q,
+            qd=self.qd,
+            robot_time=0.0,
+            sampled_at=0.0,
+            age_s=self.age_s,
+            status=status,
+            fault=self.fault,
+            **counts,
+            **times,
+        )
+
+    def command(self, qd: np.ndarray) -> int:
+        """Remember it."""
+        self.commands.append(np.array(qd))
+        return len(self.commands)

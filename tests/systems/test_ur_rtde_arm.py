@@ -1,0 +1,97 @@
+"""The arm behind a link: when its sample was taken, where it will be next, and what it is told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+
+from tests.systems.still_link import StillLink
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur_rtde import UrRtdeArm
+
+Q = np.array([0.0, -1.4, 1.9, -2.1, -1.6, 0.0])
+
+
+@pytest.fixture
+def link() -> StillLink:
+    return StillLink(Q)
+
+
+class Driven:
+    """The system alone in a simulator."""
+
+    def __init__(self, link: StillLink, pace: float = 1.0) -> None:
+        self.system = UrRtdeArm(load_arm(), link, pace)
+        self.simulator = Simulator(self.system)
+        self.tell(np.zeros(6))
+
+    @property
+    def context(self) -> Context:
+        return self.simulator.get_mutable_context()
+
+    def tell(self, qd: np.ndarray) -> None:
+        self.system.GetInputPort("velocity_command").FixValue(self.context, qd)
+
+    def get(self, port: str) -> np.ndarray:
+        return np.array(self.system.GetOutputPort(port).Eval(self.context))
+
+
+@pytest.mark.parametrize("pace", [1.0, 0.5])
+def test_a_sample_is_as_old_on_the_diagrams_clock_as_the_pace_makes_it(link: StillLink, pace: float) -> None:
+    link.age_s = 0.004
+    driven = Driven(link, pace)
+    driven.simulator.AdvanceTo(0.1)
+    # the newest update was at 0.1 s or one period before
+    assert driven.get("sample_time")[0] == pytest.approx(0.1 - pace * 0.004, abs=0.0021)
+
+
+def test_the_clock_of_the_samples_never_runs_backwards(link: StillLink) -> None:
+    driven = Driven(link)
+    times = []
+    for k in range(50):
+        link.age_s = 0.03 if k % 7 == 0 else 0.001
+        driven.simulator.AdvanceTo(0.01 * (k + 1))
+        times.append(driven.get("sample_time")[0])
+    assert np.all(np.diff(times) >= 0.0)
+
+
+def test_the_shadow_is_where_the_arm_will_be_at_the_next_tick(link: StillLink) -> None:
+    link.qd, link.age_s = np.array([0.1, 0, 0, 0, 0, -0.2]), 0.003
+    driven = Driven(link)
+    driven.simulator.AdvanceTo(0.1)
+    desired = driven.get("desired_state")
+    assert desired[:6] == pytest.approx(Q + link.qd * (0.003 + 0.002), abs=1e-12)
+    assert desired[6:] == pytest.approx(link.qd)
+
+
+def test_each_command_is_sent_and_next_to_nothing_is_sent_as_nothing(link: StillLink) -> None:
+    driven = Driven(link)
+    driven.tell(np.full(6, 1e-12))
+    driven.simulator.AdvanceTo(0.02)
+    assert link.commands
+    assert not np.any(link.commands)
+    sent = len(link.commands)
+    driven.tell(np.full(6, 0.1))
+    driven.simulator.AdvanceTo(0.04)
+    assert len(link.commands) == sent + 5  # every 4 ms
+    assert link.commands[-1] == pytest.approx(np.full(6, 0.1))
+
+
+def test_a_command_that_is_no_number_goes_to_the_worker_which_refuses_it(link: StillLink) -> None:
+    driven = Driven(link)
+    driven.tell(np.full(6, np.nan))
+    driven.simulator.AdvanceTo(0.02)
+    assert np.isnan(link.commands[-1]).all()
+
+
+def test_a_fault_of_the_link_is_the_status_of_the_arm(link: StillLink) -> None:
+    driven = Driven(link)
+    status = driven.system.GetOutputPort("status")
+    assert status.Eval(driven.context).ready
+    link.fault = Fault.PROTECTIVE_STOP
+    driven.simulator.AdvanceTo(0.02)
+    assert not status.Eval(driven.context).ready
+    assert status.Eval(driven.context).fault.startswith("PROTECTIVE STOP")

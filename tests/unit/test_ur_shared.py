@@ -1,0 +1,189 @@
+"""Memory shared by two processes: what is read was written, whole, whenever the writer is interrupted."""
+
+from __future__ import annotations
+
+import mmap
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from weldcal.systems.drivers.ur.shared import COMMAND, RING_ROWS, STATE, Block, JointRing, Memory
+
+NAMES = ("number", *(f"x{i}" for i in range(20)))
+
+# each write has all its numbers in one simple relation
+WRITER = """
+import mmap, sys
+from weldcal.systems.drivers.ur.shared import Block
+block = Block(mmap.mmap(int(sys.argv[1]), 0), 0, tuple(sys.argv[2].split(",")))
+k = 0.0
+while True:
+    k += 1.0
+    block.write([k * i for i in range(1, len(block.names) + 1)])
+"""
+RING_WRITER = """
+import mmap, sys
+from weldcal.systems.drivers.ur.shared import JointRing
+ring = JointRing(mmap.mmap(int(sys.argv[1]), 0), 0)
+k = 0.0
+while True:
+    k += 1.0
+    ring.append(k, [k * i for i in range(1, 7)])
+"""
+
+
+@pytest.fixture
+def descriptor() -> Iterator[int]:
+    """Of an anonymous file of 1 MB."""
+    made = os.memfd_create("test")
+    os.ftruncate(made, 1 << 20)
+    yield made
+    os.close(made)
+
+
+@pytest.fixture
+def block(descriptor: int) -> Block:
+    """A block of this process."""
+    return Block(mmap.mmap(descriptor, 0), 0, NAMES)
+
+
+def writing(text: str, descriptor: int) -> subprocess.Popen[bytes]:
+    """Another process that writes as fast as it can."""
+    return subprocess.Popen([sys.executable, "-c", text, str(descriptor), ",".join(NAMES)], pass_fds=(descriptor,))
+
+
+def test_nothing_is_read_before_something_is_written(block: Block) -> None:
+    assert block.read() is None
+
+
+def test_the_newest_write_is_read(block: Block) -> None:
+    for k in range(5):
+        block.write([float(k + i) for i in range(len(NAMES))])
+    assert block.read() == tuple(4.0 + i for i in range(len(NAMES)))
+
+
+def test_a_number_that_is_not_one_passes_through(block: Block) -> None:
+    block.write([float("nan")] * len(NAMES))
+    found = block.read()
+    assert found is not None
+    assert np.isnan(found).all()
+
+
+def test_no_read_is_ever_torn(descriptor: int, block: Block) -> None:
+    process = writing(WRITER, descriptor)
+    try:
+        while block.read() is None:
+            assert process.poll() is None
+            time.sleep(0.01)
+        seen, last = set(), 0.0
+        until = time.monotonic() + 1.0
+        while time.monotonic() < until:
+            found = block.read()
+            assert found is not None
+            assert found == tuple(found[0] * i for i in range(1, len(NAMES) + 1))
+            assert found[0] >= last, "time does not run backwards"
+            last = found[0]
+            seen.add(found[0])
+        assert len(seen) > 10, "the writer wrote meanwhile"
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_writer_that_is_killed_leaves_a_whole_value(descriptor: int, block: Block) -> None:
+    # killed at ten random moments of its loop, of which most is the write
+    for k in range(10):
+        process = writing(WRITER, descriptor)
+        try:
+            before = block.read()
+            while block.read() == before:
+                assert process.poll() is None
+            time.sleep(1e-4 * k)
+        finally:
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+        found = block.read()
+        assert found is not None
+        assert found == tuple(found[0] * i for i in range(1, len(NAMES) + 1))
+
+
+def test_a_write_that_ends_in_the_middle_is_not_seen(descriptor: int) -> None:
+    memory = mmap.mmap(descriptor, 0)
+    block = Block(memory, 0, NAMES)
+    for k in range(3):
+        block.write([float(k)] * len(NAMES))
+    # what the next write begins with, at every length
+    size = 8 * len(NAMES)
+    start = 8 + 0 * (size + 8)
+    for length in range(0, size + 1, 4):
+        memory[start : start + length] = b"\x55" * length
+        assert block.read() == (2.0,) * len(NAMES)
+
+
+def test_the_ring_interpolates_between_samples(descriptor: int) -> None:
+    ring = JointRing(mmap.mmap(descriptor, 0), 0)
+    for k in range(5):
+        ring.append(10.0 + 0.004 * k, [0.1 * k] * 6)
+    found = ring.at(10.009)
+    assert found is not None
+    np.testing.assert_allclose(found, [0.225] * 6, atol=1e-12)
+
+
+def test_the_ring_answers_only_for_what_it_holds(descriptor: int) -> None:
+    ring = JointRing(mmap.mmap(descriptor, 0), 0)
+    assert ring.at(10.0) is None
+    for k in range(5):
+        ring.append(10.0 + 0.004 * k, [float(k)] * 6)
+    assert ring.at(9.999) is None
+    assert ring.at(10.016) is not None
+    assert ring.at(10.03) is None
+
+
+def test_the_ring_forgets_the_oldest(descriptor: int) -> None:
+    ring = JointRing(mmap.mmap(descriptor, 0), 0)
+    for k in range(RING_ROWS + 300):
+        ring.append(0.002 * k, [float(k)] * 6)
+    rows = ring.samples()
+    assert RING_ROWS - 2 <= rows.shape[0] <= RING_ROWS
+    assert (np.diff(rows[:, 0]) > 0.0).all()
+    assert rows[-1, 1] == RING_ROWS + 299
+    assert ring.at(0.002 * 200) is None
+    found = ring.at(0.002 * 1000.5)
+    assert found is not None
+    np.testing.assert_allclose(found, [1000.5] * 6)
+
+
+def test_the_ring_is_never_torn(descriptor: int) -> None:
+    ring = JointRing(mmap.mmap(descriptor, 0), 0)
+    process = writing(RING_WRITER, descriptor)
+    try:
+        until = time.monotonic() + 10.0
+        while ring.samples().shape[0] < RING_ROWS - 1 and time.monotonic() < until:
+            assert process.poll() is None
+        until = time.monotonic() + 1.0
+        while time.monotonic() < until:
+            rows = ring.samples()
+            np.testing.assert_array_equal(rows[:, 1:], rows[:, :1] * np.arange(1.0, 7.0))
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_blocks_and_ring_do_not_overlap(tmp_path: Path) -> None:
+    with (tmp_path / "memory").open("w+b") as file:
+        file.truncate(Memory.size())
+        memory, other = Memory(file.fileno()), Memory(file.fileno())
+    for k in range(RING_ROWS + 1):
+        memory.command.write([1.0 + k] * len(COMMAND))
+        memory.state.write([2.0 + k] * len(STATE))
+        memory.ring.append(3.0 + k, [4.0] * 6)
+    assert other.command.read() == (1.0 + RING_ROWS,) * len(COMMAND)
+    assert other.state.read() == (2.0 + RING_ROWS,) * len(STATE)
+    assert other.ring.samples()[-1, 0] == 3.0 + RING_ROWS

@@ -1,0 +1,66 @@
+"""`weldcal check-robot`: the pre-flight as a table that a person at the pendant works through, or as JSON."""
+
+from __future__ import annotations
+
+import shutil
+import textwrap
+from collections.abc import Mapping
+
+import numpy as np
+import typer
+
+from weldcal.systems.drivers.ur.preflight import Check, Preflight
+
+WIDEST = 100
+MARKS = {"ok": typer.colors.GREEN, "to change": typer.colors.RED, "not checked": typer.colors.YELLOW}
+
+
+def state_of(check: Check) -> str:
+    """ok, to change, or not checked."""
+    if not check.checked:
+        return "not checked"
+    return "ok" if check.ok else "to change"
+
+
+def as_json(report: Preflight) -> Mapping[str, object]:
+    """The JSON object of the command; what was not read is null."""
+    problem = report.first_problem
+    return {
+        "state": "ready" if report.ok else "refused",
+        "reason": problem.remedy if problem else "",
+        "checks": [
+            {"name": check.name, "state": state_of(check), "found": check.found, "remedy": check.remedy}
+            for check in report.checks
+        ],
+        "version": ".".join(str(number) for number in report.version) if report.version else None,
+        "joints_deg": np.rad2deg(report.arm_q) if report.arm_q is not None else None,
+        "kinematics": report.kinematics and ("calibrated" if report.kinematics.calibrated else "nominal"),
+        "pose_error_mm": report.pose_error_m and 1e3 * report.pose_error_m,
+        "pose_error_deg": report.pose_error_rad and float(np.rad2deg(report.pose_error_rad)),
+    }
+
+
+def emit_table(report: Preflight) -> None:
+    """Writes one row a check on stdout, and under each that is not right what to do about it."""
+    width = min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
+    marks = max(map(len, MARKS))
+    names = max(len(check.name) for check in report.checks)
+    indent = " " * (2 + marks + 2)
+    problems = sum(check.checked and not check.ok for check in report.checks)
+    verdict = "ready" if report.ok else f"not ready, {problems} to change"
+    typer.secho(f"{report.host}: {verdict}", bold=True)
+    shown = [check for check in report.checks if check.checked]
+    if len(shown) > 1:
+        shown = list(report.checks)
+    for check in shown:
+        state = state_of(check)
+        found = _wrapped(check.found, width, f"  {state:<{marks}}  {check.name:<{names}}  ")
+        typer.echo("  " + typer.style(f"{state:<{marks}}", fg=MARKS[state]) + found[2 + marks :])
+        if check.remedy:
+            typer.echo(_wrapped(check.remedy, width, indent))
+    if waiting := len(report.checks) - len(shown):
+        typer.secho(f"  not checked  {waiting} more that need an answer", fg=MARKS["not checked"])
+
+
+def _wrapped(text: str, width: int, first: str) -> str:
+    return textwrap.fill(text, width, initial_indent=first, subsequent_indent=" " * len(first), break_on_hyphens=False)

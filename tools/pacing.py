@@ -1,0 +1,65 @@
+"""Keeping the Diagram to the wall clock: wait while it is ahead; where it is late, say so and never catch up in a rush."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+LATE_S = 0.020  # of the Diagram's time
+
+
+class WallClock:
+    """Lets the Diagram's time pass at `pace` seconds per second of the wall clock.
+
+    A robot obeys what it is told when it is told it: a Diagram that hurried after a delay would send the past. So a delay of
+    more than LATE_S moves the anchor, and the Diagram goes on from there at its pace. Lateness is in seconds of the Diagram's
+    time: `late_s` is the worst while the arm was commanded to move, `thinking_s` the worst while it stood still, where a cell
+    may compute as long as it likes; `reanchored` counts how often the anchor moved while the arm moved.
+    """
+
+    def __init__(
+        self,
+        pace: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._pace, self._clock, self._sleep = pace, clock, sleep
+        self._anchor: tuple[float, float] | None = None  # wall clock, Diagram
+        self.late_s = 0.0
+        self.thinking_s = 0.0
+        self.reanchored = 0
+
+    def wait_for(self, diagram_time: float, moving: bool) -> None:
+        """Return when the wall clock has come to this time of the Diagram. `moving`: the arm is commanded to move."""
+        now = self._clock()
+        if self._anchor is None:
+            self._anchor = (now, diagram_time)
+        due = self._anchor[0] + (diagram_time - self._anchor[1]) / self._pace
+        if now < due:
+            self._sleep(due - now)
+            return
+        late = (now - due) * self._pace
+        if moving:
+            self.late_s = max(self.late_s, late)
+        else:
+            self.thinking_s = max(self.thinking_s, late)
+        if late > LATE_S:
+            self._anchor = (now, diagram_time)
+            self.reanchored += int(moving)
+
+
+@contextmanager
+def no_long_garbage_collections() -> Iterator[None]:
+    """Take everything that exists now out of the garbage collector's sight for the duration of the block.
+
+    A full collection looks at every object of every imported library and stops the Diagram for a tenth of a second and more.
+    Frozen, those are not looked at; what the run itself makes is collected as always, so that nothing piles up.
+    """
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

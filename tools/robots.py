@@ -1,0 +1,113 @@
+"""From the word after --robot to the robot of a run: simulated, an emulated controller, or a controller at an address."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.drivers.ur.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.scenario import Scenario
+from weldcal.tools.ur_emulator.process import HOST as EMULATOR_HOST
+from weldcal.tools.ur_emulator.process import emulator_process
+
+SIMULATED, EMULATED = "simulated", "emulated"
+EMULATED_PACE = 0.4  # the weld, with its rendered finger camera, holds 0.5 on two quiet cores
+SLOWEST_PACE = 0.05
+
+
+@dc.dataclass(frozen=True, eq=False)
+class ChosenRobot:
+    """The robot of a run. `title` names it where a person reads; `prepared` is given where the driver need not look for it."""
+
+    title: str
+    prepared: PreparedRobot | None = None
+
+
+@contextmanager
+def chosen_robot(
+    word: str | None, scenario: Scenario, *, dry_run: bool = False, pace: float | None = None
+) -> Iterator[ChosenRobot]:
+    """Make `scenario.robot` what the word says, for as long as the block runs.
+
+    Args:
+        word: `simulated`; `emulated`, or `emulated@ADDRESS` for another loopback address; the address of a controller; None:
+            the scenario's own.
+        scenario: its `robot` is replaced.
+        dry_run: look at the robot, then run with a simulated arm that has its kinematics and stands where it stands.
+        pace: controller seconds per second of the wall clock; only an emulated controller has another than 1.
+
+    Raises:
+        InputError: options that do not go together.
+        RobotRefused: the controller does not answer, or does not allow the job; nothing has moved.
+    """
+    if word is None:
+        word = scenario.robot.host if isinstance(scenario.robot, UrRtde) else SIMULATED
+    if word == SIMULATED:
+        if dry_run or pace is not None:
+            raise InputError(
+                "--dry-run and --pace need a controller: give --robot emulated or the address of a controller."
+            )
+        if isinstance(scenario.robot, UrRtde):
+            scenario.robot = SimulatedUr()
+        yield ChosenRobot("simulated")
+        return
+    kind, _, address = word.partition("@")
+    if kind == EMULATED:
+        host, pace = address or EMULATOR_HOST, EMULATED_PACE if pace is None else pace
+        _check_pace(pace)
+        kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
+        q_home = np.deg2rad(scenario.home_deg)
+        with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace):
+            yield _at(host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
+        return
+    if pace is not None and not word.startswith("127."):
+        raise InputError("A controller keeps its own time: --pace is for an emulated one, at a loopback address.")
+    yield _at(word, f"the controller at {word}", scenario, dry_run=dry_run, pace=1.0 if pace is None else pace)
+
+
+def _check_pace(pace: float) -> None:
+    if not SLOWEST_PACE <= pace <= 1.0:
+        raise InputError(f"--pace must be from {SLOWEST_PACE:g} to 1, and it is {pace:g}.")
+
+
+def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float) -> ChosenRobot:
+    _check_pace(pace)
+    config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
+    config = dc.replace(config, host=host, pace=pace)
+    if not dry_run:
+        scenario.robot = config
+        return ChosenRobot(name)
+    scenario.robot = SimulatedUr()
+    return ChosenRobot(
+        f"dry run: a simulated arm with the kinematics of {name}, from where its arm stands; nothing was sent to it",
+        look_at(config, scenario),
+    )
+
+
+def robot_at(host: str, scenario: Scenario) -> UrRtde:
+    """The robot at an address, with the load that the scenario's tool is."""
+    if scenario.tool == "none":
+        return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
+    return UrRtde(host=host)
+
+
+def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
+    """The arm behind a controller, with its own kinematics and where it stands; nothing is written, sent or moved.
+
+    Raises:
+        RobotRefused: the controller does not answer, or a check of the pre-flight failed; the text says what to press.
+    """
+    report = preflight(config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm))
+    require_ready(report)
+    assert report.arm is not None
+    assert report.arm_q is not None
+    return PreparedRobot(report.arm, report.arm_q)

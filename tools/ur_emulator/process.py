@@ -1,0 +1,197 @@
+"""An emulated controller as a child process: one at a time per loopback address, and always ended."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import select
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from weldcal.models.errors import InputError
+
+HOST = "127.0.0.1"
+CONTROL_PORT = 30090
+READY = "ready"
+START_LIMIT_S = 30.0
+ANSWER_LIMIT_S = 10.0
+
+
+class Emulator:
+    """A running emulator and its control channel; one thread at a time may use it."""
+
+    def __init__(self, process: subprocess.Popen[str], host: str, control_port: int) -> None:
+        self.process = process
+        self.host = host
+        self.control_port = control_port
+        self._socket = socket.create_connection((host, control_port), timeout=ANSWER_LIMIT_S)
+        self._file = self._socket.makefile("rw")
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """One request, one answer; a check that fails is an answer too.
+
+        Raises:
+            InputError: the emulator refuses, or it does not answer any more.
+        """
+        try:
+            self._file.write(json.dumps(request) + "\n")
+            self._file.flush()
+            line = self._file.readline()
+        except OSError as error:
+            raise InputError(f"The emulated controller on {self.host} does not answer ({error}).") from error
+        if not line:
+            raise InputError(f"The emulated controller on {self.host} has ended. {self._last_words()}".rstrip())
+        answer: dict[str, Any] = json.loads(line)
+        if not answer["ok"] and "check" not in request:
+            raise InputError(str(answer["error"]))
+        return answer
+
+    def state(self) -> dict[str, Any]:
+        """Joint angles, modes, program, registers that matter."""
+        return self.ask(ask="state")
+
+    def log(self) -> str:
+        """What the controller wrote down."""
+        return "\n".join(self.ask(ask="log")["log"])
+
+    def fault(self, name: str, **values: Any) -> float:
+        """Injects a fault; its time on the host's monotonic clock."""
+        return float(self.ask(fault=name, **values)["time"])
+
+    def do(self, name: str, **values: Any) -> float:
+        """Puts something right; its time on the host's monotonic clock."""
+        return float(self.ask(do=name, **values)["time"])
+
+    def wait(self, key: str, value: Any, limit_s: float = 5.0) -> dict[str, Any]:
+        """The state once `key` has this value.
+
+        Raises:
+            InputError: it has another one for limit_s.
+        """
+        until = time.monotonic() + limit_s
+        while (state := self.state())[key] != value:
+            if time.monotonic() > until:
+                raise InputError(f"{key} is {state[key]!r} after {limit_s} s, not {value!r}.")
+            time.sleep(0.01)
+        return state
+
+    def close(self) -> None:
+        """Ends the process, whatever it does; may be called again."""
+        with suppress(OSError):
+            self._socket.close()
+        _end(self.process)
+
+    def _last_words(self) -> str:
+        if self.process.poll() is None or self.process.stdout is None or self.process.stdout.closed:
+            return ""
+        return self.process.stdout.read().strip().rpartition("\n")[2]
+
+
+@contextmanager
+def emulator_process(
+    *,
+    host: str = HOST,
+    control_port: int = CONTROL_PORT,
+    polyscope: str = "5.21",
+    q: Sequence[float] | None = None,
+    kinematics: Path | None = None,
+    pace: float = 1.0,
+    seed: int = 0,
+    wait_for_lock_s: float = 120.0,
+) -> Iterator[Emulator]:
+    """An emulator that listens, under the lock that keeps this address's ports for one owner at a time.
+
+    The child ends with the block, and with this process (`--parent`) where that is killed; it has a session of its own,
+    so that Ctrl-C reaches its user and not the controller.
+
+    Args:
+        host: the loopback address; each has its own lock.
+        control_port: port of the control channel.
+        polyscope: controller version, such as 5.12, 5.21 or 10.7.
+        q: joint angles at the start (6,) (rad); the emulator's home where None.
+        kinematics: a robot's factory calibration; nominal where None.
+        pace: controller seconds per host second, 0.05 to 1.
+        seed: everything random follows from it.
+        wait_for_lock_s: how long to wait for another owner to finish (s).
+
+    Raises:
+        InputError: the lock or a port is taken, or an argument is not one.
+    """
+    command = [sys.executable, "-m", "weldcal.tools.ur_emulator", "--parent", str(os.getpid()), "--host", host]
+    command += ["--control-port", str(control_port), "--polyscope", polyscope, "--pace", str(pace), "--seed", str(seed)]
+    if q is not None:
+        command += ["--q", *(repr(float(angle)) for angle in q)]
+    if kinematics is not None:
+        command += ["--kinematics", str(kinematics)]
+    with lock_path(host).open("w") as handle:
+        _take(handle, host, wait_for_lock_s)
+        emulator = _started(command, host, control_port)
+        try:
+            yield emulator
+        finally:
+            emulator.close()
+
+
+def lock_path(host: str) -> Path:
+    """The file whose lock keeps the ports of one address for one owner."""
+    name = f"weldcal-ur-emulator-{os.getuid()}" + ("" if host == HOST else f"-{host}")
+    return Path(tempfile.gettempdir()) / f"{name}.lock"
+
+
+def _take(handle: IO[str], host: str, limit_s: float) -> None:
+    until = time.monotonic() + limit_s
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > until:
+                raise InputError(
+                    f"Another emulated controller has held the ports of {host} for {limit_s:.0f} s; "
+                    "wait for it, stop it, or use another loopback address."
+                ) from None
+            time.sleep(0.05)
+
+
+def _started(command: list[str], host: str, control_port: int) -> Emulator:
+    process = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        start_new_session=True,
+    )
+    try:
+        assert process.stdout is not None
+        ready, _, _ = select.select([process.stdout], [], [], START_LIMIT_S)
+        line = process.stdout.readline() if ready else ""
+        if not line.startswith(READY):
+            process.kill()
+            words = (line + process.stdout.read()).strip().rpartition("\n")[2]
+            raise InputError(words or f"The emulated controller did not start within {START_LIMIT_S:.0f} s.")
+        return Emulator(process, host, control_port)
+    except BaseException:
+        process.kill()
+        _end(process)
+        raise
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    process.terminate()
+    try:
+        process.wait(timeout=3.0)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+    if process.stdout is not None:
+        process.stdout.close()

@@ -1,0 +1,135 @@
+"""URScript's sockets, by their own names: the script is the client of somebody on loopback, and waits frame by frame."""
+
+from __future__ import annotations
+
+import math
+import re
+import socket
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from weldcal.tools.ur_emulator.motions import STEP_S
+from weldcal.tools.ur_emulator.script_compiler import Slices
+from weldcal.tools.ur_emulator.script_dynamics import Dynamics
+from weldcal.tools.ur_emulator.script_syntax import ScriptError
+
+OPEN_LIMIT_S = 0.02
+NAME = "socket_0"
+
+
+class ScriptSocket:
+    """One open socket and what has arrived on it."""
+
+    def __init__(self, address: str, port: int) -> None:
+        self._socket = socket.create_connection((address, port), timeout=OPEN_LIMIT_S)
+        self._socket.setblocking(False)
+        self.inbox = bytearray()
+
+    def send(self, data: bytes) -> bool:
+        """False where the other side is gone or does not read."""
+        try:
+            return self._socket.send(data) == len(data)
+        except OSError:
+            return False
+
+    def fill(self) -> None:
+        """Takes in what has arrived."""
+        with suppress(OSError):
+            while data := self._socket.recv(65536):
+                self.inbox += data
+
+    def close(self) -> None:
+        """FIN."""
+        self._socket.close()
+
+
+class Sockets(Dynamics):
+    """Sockets belong to their program and close with it; reads answer 0 values, then nan or -1, when time runs out."""
+
+    def socket_open(self, address: str, port: int, socket_name: str = NAME) -> bool:
+        if not str(address).startswith("127."):
+            self._controller.note(f"socket_open: {address} is not on loopback")
+            return False
+        self.socket_close(socket_name)
+        try:
+            self._program.sockets[socket_name] = ScriptSocket(str(address), int(port))
+        except OSError as error:
+            self._controller.note(f"socket_open: {address}:{port} ({error})")
+            return False
+        return True
+
+    def socket_close(self, socket_name: str = NAME) -> None:
+        opened = self._program.sockets.pop(socket_name, None)
+        if opened is not None:
+            opened.close()
+
+    def socket_send_string(self, str: Any, socket_name: str = NAME) -> bool:
+        return self._send(f"{str}".encode(), socket_name)
+
+    def socket_send_line(self, str: Any, socket_name: str = NAME) -> bool:
+        return self._send(f"{str}\n".encode(), socket_name)
+
+    def socket_send_int(self, value: int, socket_name: str = NAME) -> bool:
+        return self._send(struct.pack(">i", int(value)), socket_name)
+
+    def socket_send_byte(self, value: int, socket_name: str = NAME) -> bool:
+        return self._send(bytes([int(value) & 0xFF]), socket_name)
+
+    def socket_read_line(self, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
+        line = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b"\n") + 1)
+        return line.decode("utf-8", "replace").rstrip("\r\n")
+
+    def socket_read_string(
+        self,
+        socket_name: str = NAME,
+        prefix: str = "",
+        suffix: str = "",
+        interpret_escape: bool = False,
+        timeout: float = 2.0,
+    ) -> Slices:
+        end = suffix.encode().decode("unicode_escape") if interpret_escape else suffix
+
+        def whole(inbox: bytearray) -> int:
+            return (inbox.find(end.encode()) + len(end)) * (end.encode() in inbox) if end else len(inbox)
+
+        text = (yield from self._read(socket_name, timeout, whole)).decode("utf-8", "replace")
+        return text.partition(prefix)[2].removesuffix(end) if prefix else text.removesuffix(end)
+
+    def socket_read_ascii_float(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
+        text = yield from self._read(socket_name, timeout, lambda inbox: inbox.find(b")") + 1)
+        found = [float(value) for value in re.findall(rb"[-+]?\d*\.?\d+(?:[eE][-+]?\d+)?", text)]
+        return [len(found), *found] if len(found) == number else [0, *[math.nan] * int(number)]
+
+    def socket_read_binary_integer(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
+        size = 4 * int(number)
+        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
+        return [int(number), *struct.unpack(f">{int(number)}i", data)] if data else [0, *[-1] * int(number)]
+
+    def socket_read_byte_list(self, number: int, socket_name: str = NAME, timeout: float = 2.0) -> Slices:
+        size = int(number)
+        data = yield from self._read(socket_name, timeout, lambda inbox: size * (len(inbox) >= size))
+        return [size, *data] if data else [0, *[-1] * size]
+
+    def _send(self, data: bytes, name: str) -> bool:
+        opened = self._program.sockets.get(name)
+        return opened is not None and opened.send(data)
+
+    def _read(self, name: str, timeout: float, whole: Callable[[bytearray], int]) -> Slices:
+        """What `whole` says is complete, taken off the inbox; nothing when the time is up. A timeout of 0 waits for ever."""
+        opened = self._program.sockets.get(name)
+        if opened is None:
+            raise ScriptError(f"The socket {name!r} is not open.")
+        frames = 0
+        while True:
+            opened.fill()
+            length = whole(opened.inbox)
+            if length > 0:
+                data = bytes(opened.inbox[:length])
+                del opened.inbox[:length]
+                return data
+            if timeout > 0.0 and frames * STEP_S >= timeout:
+                return b""
+            frames += 1
+            yield
