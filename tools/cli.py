@@ -282,6 +282,24 @@ def benchmark_robot_faults(
     finish("benchmark robot-faults", report.summary(), folder, json_wanted=json, rows=rows)
 
 
+@benchmarks.command("robot")
+def benchmark_robot(
+    minutes: Annotated[float, typer.Option("--minutes", metavar="M", min=0.05, help="Length of the stream.")] = 10.0,
+    address: AddressOption = "127.0.0.1",
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """A 125 Hz command stream to an emulated controller: periods, latencies, and every deadline missed by 20 ms."""
+    folder = out or fresh_folder("benchmark", "robot", seed)
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark robot") as progress:
+        from weldcal.tools.benchmarks.robot import run_robot_benchmark
+
+        report = run_robot_benchmark(folder, address=address, minutes=minutes, seed=seed, progress=progress)
+    finish("benchmark robot", report.summary(), folder, json_wanted=json)
+
+
 @app.command("emulate-ur", short_help="A UR controller on loopback.")
 def emulate_ur(
     polyscope: Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -63,3 +64,22 @@ def no_long_garbage_collections() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
+
+
+@contextmanager
+def real_time_priority() -> Iterator[None]:
+    """Run this thread before ordinary programs for the duration of the block, where the system lets it (rtprio, or root).
+
+    Below the link's worker and the emulated controller, so that neither waits for the cell. Threads and processes that it
+    starts meanwhile are ordinary ones.
+    """
+    before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, before, parameter)

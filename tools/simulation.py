@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from weldcal.systems.cell import Cell, job_plan
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import Scan
 from weldcal.systems.operator_panel import PACE_SLIDER
-from weldcal.tools.pacing import WallClock, no_long_garbage_collections
+from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
 
 Progress = Callable[[str, float], None]
 # How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
@@ -130,9 +130,11 @@ def run_cell(
 
     simulator.set_monitor(watch)
     try:
-        with nullcontext() if run.clock is None else no_long_garbage_collections():
+        with ExitStack() as around:
             if run.clock is not None:
+                around.enter_context(no_long_garbage_collections())
                 _first_pictures(cell, run.root)
+                around.enter_context(real_time_priority())
             simulator.Initialize()
             simulator.AdvanceTo(job_plan(cell.scenario).maximum_time_s + 5.0)
     except KeyboardInterrupt:

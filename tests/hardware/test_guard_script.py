@@ -113,6 +113,16 @@ def test_the_deadman_does_not_care_which_command_keeps_the_watchdog_fed() -> Non
     assert not guarded.qd.any()
 
 
+def test_an_arm_that_stands_still_needs_no_deadman() -> None:
+    guarded = Guarded()
+    guarded.speed([0.1, 0, 0, 0, 0, 0], 20)
+    guarded.speed([0.0] * 6, 30)
+    guarded.speed([0.0] * 6, 45, numbered=False)  # 90 ms without a word, less than the watchdog takes
+    assert guarded.says == OBEYING
+    guarded.speed([0.0, 0.1, 0, 0, 0, 0], 10)
+    assert guarded.qd[1] == pytest.approx(0.1)
+
+
 def test_a_silent_client_is_stopped_by_the_guards_own_watchdog() -> None:
     guarded = Guarded()
     guarded.frames(49, fed=False)

@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from weldcal.tools.ur_emulator.controller import Controller
+from weldcal.tools.ur_emulator.motions import STEP_S
 
 RECORD_FRAMES = 300_000  # ten minutes
 REST_RAD_S = 1e-3
-# A streamed motion whose client has been silent for longer than this moves unattended.
+# A streamed motion whose client has been silent for longer than this moves unattended. Silence is counted in frames, as the
+# watchdogs count it and as the arm moves: a controller whose frames come late lives slowly, and its arm moves as slowly.
 SILENT_S = 0.25
 TIME, SPEED, TOOL, SILENCE, STREAMED = range(5)
 
@@ -24,7 +26,7 @@ class Checker:
         self._pace = pace
         self._record = np.zeros((RECORD_FRAMES, 5))
         self._count = 0
-        self._heard = float("-inf")
+        self._heard: float = float("-inf")  # frame of the newest input package or script
         self._moving = False
         self._latched_at: float | None = None
         self._rested_since_fault = False
@@ -33,9 +35,9 @@ class Checker:
         self.moves_after_a_fault = 0
         self.unattended_s = 0.0
 
-    def heard(self, now: float) -> None:
+    def heard(self, *_: object) -> None:
         """A client has sent an input package or a script."""
-        self._heard = now
+        self._heard = self._count
 
     def fault(self, name: str, now: float) -> None:
         """A fault was injected: from the first rest on, any motion before `reset` is a violation."""
@@ -53,7 +55,7 @@ class Checker:
         qd = arm.qd
         moving_any = qd.any()
         speed = float(np.abs(qd).max()) if moving_any else 0.0
-        silence = (now - self._heard) * self._pace
+        silence = (self._count - self._heard) * STEP_S
         motion = arm.motion
         streamed = motion is not None and motion.streamed
         tool = float(np.linalg.norm(arm.tool_speed()[:3])) if moving_any else 0.0
@@ -64,7 +66,7 @@ class Checker:
             self.moves_without_a_command += silence > SILENT_S
             self.moves_after_a_fault += self._latched_at is not None and self._rested_since_fault
         if moving and streamed and silence > SILENT_S:
-            self.unattended_s += 0.002
+            self.unattended_s += STEP_S
         self._moving = moving
         if not moving:
             self._rested_since_fault = True
@@ -90,7 +92,7 @@ class Checker:
                 "ok": False,
                 "rest_after_s": None,
                 "moved_again_s": None,
-                "travel_m": float(rows[:, TOOL].sum() * 0.002),
+                "travel_m": float(rows[:, TOOL].sum() * STEP_S),
             }
         first = int(np.argmax(still))
         again = ~still[first:]
@@ -100,7 +102,7 @@ class Checker:
             "ok": rest <= within and moved is None,
             "rest_after_s": rest,
             "moved_again_s": moved,
-            "travel_m": float(rows[:first, TOOL].sum() * 0.002),
+            "travel_m": float(rows[:first, TOOL].sum() * STEP_S),
             "peak_tool_speed_after_m_s": float(rows[first:, TOOL].max()),
             "recorded_s": float(rows[-1, TIME] - fault_time) * self._pace,
         }

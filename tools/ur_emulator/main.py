@@ -9,6 +9,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ class _Emulator:
         self._network = Network(host, seed)
         self._rng = np.random.default_rng([seed, 1])
         heard = self._checker.heard
-        self._rtde = RtdeServer(controller, lambda names, now: heard(now))
+        self._rtde = RtdeServer(controller, heard)
         self._primary = PrimaryServer(controller, heard, primary=True)
         secondary = PrimaryServer(controller, heard, primary=False)
         real_time = RealTimeServer(controller, heard)
@@ -115,6 +116,10 @@ class _Emulator:
         if ready is not None:
             ready(self._sentence)
         gc.freeze()
+        with suppress(
+            OSError
+        ):  # a controller has a computer of its own: run before everything else, where that is allowed
+            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
         try:
             self._loop(parent)
         finally:

@@ -52,7 +52,7 @@ SAFETY_MODES = {
     9: "FAULT",
 }
 _AT = {name: i for i, name in enumerate(STATE)}
-PLAYING = 2
+PLAYING, PAUSING, PAUSED = 2, 3, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,8 +172,9 @@ class UrLink:
                 _kill(self._process)
         if fault is Fault.NONE and self._died is not None:
             fault, fault_time = self._died
-        if fault is not Fault.NONE:
-            self._see_to_the_stop(fault)
+        paused = found[_AT["runtime_state"]] in (PAUSING, PAUSED)
+        if fault is not Fault.NONE and (paused or ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE)):
+            self._see_to_the_stop()
         status = UrStatus(
             robot_mode=ROBOT_MODES.get(int(found[_AT["robot_mode"]]), "UNKNOWN"),
             safety_mode=SAFETY_MODES.get(int(found[_AT["safety_mode"]]), "UNKNOWN"),
@@ -210,15 +211,17 @@ class UrLink:
             self._memory.command.write([float(self._number), time.monotonic(), 1.0, *[0.0] * 6])
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(CLOSE_LIMIT_S / self._config.limits.pace)
-        if self._process.returncode != 0:
+        last = self._memory.state.read() or self._last
+        paused = last is not None and last[_AT["runtime_state"]] in (PAUSING, PAUSED)
+        if self._process.returncode != 0 or paused:
             self._stop_program()
         if self._stopper is not None:
             self._stopper.join()
         self._end()
 
-    def _see_to_the_stop(self, fault: Fault) -> None:
+    def _see_to_the_stop(self) -> None:
         """After a stop that is not our own, the program is stopped for good: a paused one could be played again."""
-        if self._stopper is None and ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE):
+        if self._stopper is None:
             self._stopper = threading.Thread(target=self._stop_program, daemon=True)
             self._stopper.start()
 

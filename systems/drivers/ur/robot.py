@@ -192,8 +192,3 @@ class Robot:
         if self.control.isProgramRunning():
             self.control.speedStop(5.0)
             self.control.stopScript()
-
-    def disconnect(self) -> None:
-        """Close both interfaces."""
-        self.control.disconnect()
-        self.receive.disconnect()

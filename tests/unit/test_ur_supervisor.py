@@ -1,0 +1,288 @@
+"""What stops the arm, and what does not: one sample and one command made by hand for each fault."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from weldcal.systems.drivers.ur.faults import SENTENCES, Fault, sentence
+from weldcal.systems.drivers.ur.supervisor import (
+    ACTIONS,
+    NORMAL,
+    OBEYING,
+    PAUSED,
+    PLAYING,
+    PROTECTIVE,
+    RECOVERY,
+    REDUCED,
+    ROBOT_EMERGENCY,
+    RUNNING,
+    SAFEGUARD,
+    SYSTEM_EMERGENCY,
+    Action,
+    Command,
+    Decision,
+    Limits,
+    RobotSample,
+    Supervisor,
+)
+
+PERIOD_S = 0.004
+COMMAND_PERIOD_S = 0.008
+STOPPED, STOPPING = 1, 0
+LIMITS = Limits(
+    position_lower=np.full(6, -6.0),
+    position_upper=np.full(6, 6.0),
+    speed=np.full(6, 1.2),
+    acceleration=np.full(6, 15.0),
+)
+VELOCITY = np.array([0.1, 0.0, -0.05, 0.0, 0.0, 0.1])
+
+
+class Rig:
+    """A supervisor at 250 Hz, an arm that follows its commands, a cell that gives one every 8 ms; `lag_s` is the arm's."""
+
+    def __init__(self, limits: Limits = LIMITS, velocity: np.ndarray = VELOCITY) -> None:
+        self.supervisor = Supervisor(limits)
+        self.now, self.velocity, self.lag_s = 1000.0, velocity, 0.0
+        self.pace = limits.pace
+        self._led = np.zeros(6)
+        self.robot = RobotSample(
+            robot_time=100.0,
+            fresh_at=self.now,
+            q=np.zeros(6),
+            qd=velocity,
+            robot_mode=RUNNING,
+            safety_mode=NORMAL,
+            runtime_state=PLAYING,
+            speed_scaling=1.0,
+            guard=OBEYING,
+            connected=True,
+        )
+        self.command = Command(1, self.now, velocity)
+
+    def passes(self, seconds: float, *, state: bool = True, commands: bool = True) -> Decision:
+        """So long with or without new states and commands; the last decision."""
+        decision = Decision(Action.SEND)
+        for _ in range(round(seconds / PERIOD_S)):
+            decision = self.one(state=state, commands=commands)
+        return decision
+
+    def one(self, *, state: bool = True, commands: bool = True, **changes: object) -> Decision:
+        """One pass; `changes` are of the sample."""
+        self.now += PERIOD_S
+        self._led = self._led + self.pace * PERIOD_S * self.velocity
+        if state:
+            share = 1.0 if self.lag_s == 0.0 else PERIOD_S / (PERIOD_S + self.lag_s)
+            q = self.robot.q + share * (self._led - self.robot.q)
+            time = self.robot.robot_time + self.pace * PERIOD_S
+            self.robot = replace(self.robot, robot_time=time, fresh_at=self.now, q=q)
+        if commands and self.now - self.command.given_at > COMMAND_PERIOD_S - 1e-6:
+            self.command = replace(self.command, number=self.command.number + 1, given_at=self.now, qd=self.velocity)
+        return self.supervisor.step(self.now, replace(self.robot, **changes), self.command)  # type: ignore[arg-type]
+
+    def told(self, qd: np.ndarray) -> Decision:
+        """One pass with a new command."""
+        self.command = Command(self.command.number + 1, self.now + PERIOD_S, qd)
+        return self.one(commands=False)
+
+
+@pytest.fixture
+def rig() -> Rig:
+    """Moving since half a second, nothing wrong."""
+    made = Rig()
+    assert made.passes(0.5) == Decision(Action.SEND)
+    return made
+
+
+# sample -> fault, one line each
+OF_THE_SAMPLE = [
+    ({"connected": False}, Fault.LINK_CLOSED),
+    ({"robot_time": 50.0}, Fault.CLOCK_JUMPED),
+    ({"robot_time": 150.0}, Fault.CLOCK_JUMPED),
+    ({"q": np.full(6, 0.5)}, Fault.STATE_IMPLAUSIBLE),
+    ({"q": np.full(6, np.nan)}, Fault.STATE_IMPLAUSIBLE),
+    ({"unheard_s": 0.081}, Fault.CONTROLLER_DEAF),
+    ({"safety_mode": PROTECTIVE}, Fault.PROTECTIVE_STOP),
+    ({"safety_mode": RECOVERY}, Fault.RECOVERY_MODE),
+    ({"safety_mode": SAFEGUARD}, Fault.SAFEGUARD_STOP),
+    ({"safety_mode": SYSTEM_EMERGENCY}, Fault.EMERGENCY_STOP),
+    ({"safety_mode": ROBOT_EMERGENCY}, Fault.EMERGENCY_STOP),
+    ({"safety_mode": 8}, Fault.SAFETY_VIOLATION),
+    ({"safety_mode": 9}, Fault.SAFETY_VIOLATION),
+    ({"safety_mode": 11}, Fault.SAFETY_VIOLATION),  # a mode that nobody has heard of
+    ({"robot_mode": 3}, Fault.ROBOT_NOT_RUNNING),
+    ({"robot_mode": 5}, Fault.ROBOT_NOT_RUNNING),
+    ({"runtime_state": STOPPED}, Fault.PROGRAM_STOPPED),
+    ({"runtime_state": STOPPING}, Fault.PROGRAM_STOPPED),
+    ({"runtime_state": PAUSED}, Fault.PROGRAM_PAUSED),
+    ({"guard": 3}, Fault.GUARD_LATCHED),
+    ({"guard": 0}, Fault.GUARD_LATCHED),
+    ({"pose_error_m": 6e-5}, Fault.POSE_MISMATCH),
+]
+
+
+@pytest.mark.parametrize(("changes", "fault"), OF_THE_SAMPLE, ids=lambda value: str(value))
+def test_a_sample_that_is_not_as_it_must_be_is_a_fault(rig: Rig, changes: dict[str, object], fault: Fault) -> None:
+    decision = rig.one(**changes)  # type: ignore[arg-type]
+    assert decision.fault is fault
+    assert decision.action is ACTIONS[fault]
+
+
+COMMANDS = [
+    (np.full(6, np.nan), Fault.COMMAND_NOT_FINITE),
+    (np.array([np.inf, 0, 0, 0, 0, 0]), Fault.COMMAND_NOT_FINITE),
+    (np.array([0, 0, 0, 0, -1.3, 0]), Fault.COMMAND_TOO_FAST),
+    # 15 rad/s^2 for the 8 ms between two commands and 20 ms on top
+    (VELOCITY + np.array([0, 0.5, 0, 0, 0, 0]), Fault.COMMAND_JUMPED),
+]
+
+
+@pytest.mark.parametrize(("qd", "fault"), COMMANDS, ids=lambda value: getattr(value, "name", None))
+def test_a_command_that_no_cell_gives_is_refused_and_the_arm_brakes(rig: Rig, qd: np.ndarray, fault: Fault) -> None:
+    decision = rig.told(qd)
+    assert (decision.action, decision.fault) == (Action.BRAKE, fault)
+
+
+def test_a_state_that_stays_the_same_is_stale_after_40_ms(rig: Rig) -> None:
+    assert rig.passes(0.036, state=False) == Decision(Action.SEND)
+    decision = rig.passes(0.012, state=False)
+    assert (decision.action, decision.fault) == (Action.LEAVE, Fault.LINK_STALE)
+    assert 40.0 < decision.detail < 45.0
+
+
+def test_a_command_that_grows_old_while_the_arm_moves_brakes_it_after_50_ms(rig: Rig) -> None:
+    assert rig.passes(0.044, commands=False) == Decision(Action.SEND)
+    decision = rig.passes(0.016, commands=False)
+    assert (decision.action, decision.fault) == (Action.BRAKE, Fault.COMMAND_LATE)
+
+
+def test_a_cell_that_commands_rest_may_think_as_long_as_it_likes() -> None:
+    rig = Rig(velocity=np.zeros(6))
+    assert rig.passes(0.1) == Decision(Action.SEND)
+    assert rig.passes(30.0, commands=False) == Decision(Action.SEND)
+
+
+def test_after_a_long_thought_the_arm_may_be_ramped_up_and_not_jerked() -> None:
+    # 15 rad/s^2 for one pass and 20 ms on top
+    for first, fault in ((0.3, Fault.NONE), (0.4, Fault.COMMAND_JUMPED)):
+        rig = Rig(velocity=np.zeros(6))
+        rig.passes(5.0, commands=False)
+        assert rig.told(np.full(6, first)).fault is fault
+
+
+def test_a_slow_slider_for_a_few_passes_is_no_fault(rig: Rig) -> None:
+    for _ in range(12):
+        assert rig.one(speed_scaling=0.9) == Decision(Action.SEND)
+    assert rig.one() == Decision(Action.SEND)
+    for _ in range(12):
+        assert rig.one(speed_scaling=0.9) == Decision(Action.SEND)
+
+
+def test_a_slider_that_stays_slow_is_a_fault(rig: Rig) -> None:
+    decisions = [rig.one(speed_scaling=0.5) for _ in range(15)]
+    assert decisions[0] == Decision(Action.SEND)
+    assert decisions[-1] == Decision(Action.BRAKE, Fault.SPEED_SLIDER, 50.0)
+
+
+def test_reduced_mode_goes_on(rig: Rig) -> None:
+    assert all(rig.one(safety_mode=REDUCED) == Decision(Action.SEND) for _ in range(50))
+
+
+def test_the_first_fault_stays(rig: Rig) -> None:
+    first = rig.one(safety_mode=PROTECTIVE)
+    assert first.fault is Fault.PROTECTIVE_STOP
+    assert rig.one(safety_mode=ROBOT_EMERGENCY) == first
+    assert rig.passes(1.0) == first, "also when everything is well again"
+    assert rig.told(np.zeros(6)) == first
+    assert rig.supervisor.latched == first
+
+
+@pytest.mark.parametrize("later", [{"connected": False}, {"robot_time": 50.0}], ids=["closed", "clock"])
+def test_a_link_that_breaks_while_the_arm_brakes_is_left_under_the_first_fault(
+    rig: Rig, later: dict[str, object]
+) -> None:
+    decision = rig.told(np.full(6, np.nan))
+    assert decision.action is Action.BRAKE
+    rig.command = replace(rig.command, qd=VELOCITY)
+    assert rig.one(commands=False).action is Action.BRAKE
+    assert rig.one(commands=False, **later) == replace(decision, action=Action.LEAVE)  # type: ignore[arg-type]
+    assert rig.one() == replace(decision, action=Action.LEAVE)
+
+
+def test_a_link_that_falls_silent_while_the_program_is_stopped_is_left(rig: Rig) -> None:
+    assert rig.one(runtime_state=STOPPED).action is Action.STOP
+    assert rig.passes(0.060, state=False) == Decision(Action.LEAVE, Fault.PROGRAM_STOPPED, float(STOPPED))
+
+
+@pytest.mark.parametrize("end", [{"stop": True}, {"orphaned": True}], ids=["stop", "orphaned"])
+def test_the_end_of_the_cell_brakes_the_arm_and_is_no_fault(rig: Rig, end: dict[str, bool]) -> None:
+    rig.command = replace(rig.command, **end)  # type: ignore[arg-type]
+    assert rig.passes(0.2, commands=False) == Decision(Action.BRAKE)
+
+
+def test_a_fault_after_the_end_is_still_told(rig: Rig) -> None:
+    rig.command = replace(rig.command, stop=True)
+    assert rig.one() == Decision(Action.BRAKE)
+    assert rig.one(connected=False).action is Action.LEAVE
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_joint_brakes_before_its_limit(sign: float) -> None:
+    near = 5.9  # at 1 rad/s: 0.1 to brake at 5 rad/s^2, 0.05 under way, 0.02 to spare
+    rig = Rig(velocity=sign * np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]))
+    rig.robot = replace(rig.robot, q=sign * np.array([0.0, 0.0, 0.0, 0.0, 0.0, near]))
+    rig._led = rig.robot.q.copy()
+    decision = rig.one()
+    assert decision == Decision(Action.BRAKE, Fault.JOINT_LIMIT, 6.0)
+
+
+def test_a_joint_at_its_limit_may_leave_it() -> None:
+    rig = Rig(velocity=np.array([0.0, -0.5, 0.0, 0.0, 0.0, 0.0]))
+    rig.robot = replace(rig.robot, q=np.array([0.0, 5.99, 0.0, 0.0, 0.0, 0.0]))
+    rig._led = rig.robot.q.copy()
+    assert rig.passes(0.2) == Decision(Action.SEND)
+
+
+def test_an_arm_that_is_held_is_seen(rig: Rig) -> None:
+    held = rig.robot.q
+    decisions = [rig.one(q=held) for _ in range(125)]
+    assert decisions[-1].fault is Fault.TRACKING
+    # 0.1 rad/s lead 0.014 rad off, which is allowed, in 0.14 s, and later where the reference forgets
+    seen_s = PERIOD_S * sum(decision.fault is Fault.NONE for decision in decisions)
+    assert 0.14 < seen_s < 0.3
+
+
+def test_an_arm_that_follows_half_a_second_late_is_seen(rig: Rig) -> None:
+    rig.lag_s = 0.5
+    assert rig.passes(1.0).fault is Fault.TRACKING
+
+
+@pytest.mark.parametrize("lag_s", [0.02, 0.04])
+def test_an_arm_that_follows_as_late_as_a_network_is_not_accused(lag_s: float) -> None:
+    rig = Rig()
+    rig.lag_s = lag_s
+    for k in range(500):
+        # to and fro at 1 rad/s and 5 rad/s^2
+        wave = np.sin(5.0 * PERIOD_S * k)
+        rig.velocity = np.array([wave, 0.0, 0.5 * wave, 0.0, 0.0, -wave])
+        assert rig.one() == Decision(Action.SEND)
+
+
+def test_a_slow_controller_has_longer_deadlines_by_its_own_clock() -> None:
+    rig = Rig(LIMITS.slowed(0.25))
+    assert rig.passes(2.0) == Decision(Action.SEND)
+    assert rig.passes(0.15, state=False, commands=False) == Decision(Action.SEND)
+    assert rig.passes(0.02, state=False, commands=False).fault is Fault.LINK_STALE
+
+
+def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
+    assert set(SENTENCES) == set(Fault) - {Fault.NONE}
+    assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
+    seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
+    seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
+    of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
+    assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
+    assert seen <= set(ACTIONS)
