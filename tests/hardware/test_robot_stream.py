@@ -9,40 +9,39 @@ import numpy as np
 import pytest
 
 from weldcal.tools.benchmarks.robot import MISSED_S, RATE_HZ, STEP_S, StreamReport, run_robot_benchmark
-from weldcal.tools.benchmarks.robot_faults import LOADED
 
 SECONDS = 10.0
 
 
 @pytest.fixture(scope="module")
 def streamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreamReport, Path]:
-    """One stream and its folder; a computer that is busy may stop the arm, and then it is tried again."""
-    for _ in range(3):
-        folder = tmp_path_factory.mktemp("stream")
-        report = run_robot_benchmark(folder, minutes=SECONDS / 60.0)
-        if report.final.fault.name not in LOADED:
-            break
-    return report, folder
+    """One stream and its folder; where a busy computer makes the link stop the arm, it goes on over a new link."""
+    folder = tmp_path_factory.mktemp("stream")
+    return run_robot_benchmark(folder, minutes=SECONDS / 60.0), folder
 
 
 def test_the_stream_goes_through_without_a_fault(streamed: tuple[StreamReport, Path]) -> None:
     report, _ = streamed
     assert report.fault == ""
     assert report.seconds == pytest.approx(SECONDS)
-    assert report.summary()["state"] == "done"
+    summary = report.summary()
+    assert summary["state"] == "done"
+    # every stop has its time and its reason, and each of them cost one new link
+    assert len(summary["stops"]) == len(report.tap.starts) - 1  # type: ignore[arg-type]
+    assert all(stop.sentence.startswith(("LINK", "COMMAND LATE", "GUARD")) for stop in report.stops)
 
 
 def test_the_diagram_never_hurries(streamed: tuple[StreamReport, Path]) -> None:
     report, _ = streamed
     times = np.array(report.tap.command_times)
-    assert times.size == pytest.approx(SECONDS * RATE_HZ, abs=2)
+    assert times.size == pytest.approx(SECONDS * RATE_HZ, abs=2 + 2 * len(report.stops))
     # the wall clock is kept to, but for the 20 ms that may be made up for
     assert times[-1] - times[0] > (times.size - 1) / RATE_HZ - 0.03
 
 
 def test_every_command_that_comes_late_is_named_with_its_time(streamed: tuple[StreamReport, Path]) -> None:
     report, folder = streamed
-    late = np.diff(np.array(report.tap.command_times)) > 1.0 / RATE_HZ + MISSED_S
+    late = report.tap.periods > 1.0 / RATE_HZ + MISSED_S
     summary = report.summary()
     assert summary["missed_deadlines"] == len(report.missed) == np.count_nonzero(late)
     assert len((folder / "missed.csv").read_text().splitlines()) == 1 + len(report.missed)

@@ -7,7 +7,7 @@ import io
 import json
 import time
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import cast
 
@@ -22,8 +22,9 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur_rtde import PrepareRobot, UrRtde, UrRtdeArm
+from weldcal.tools.benchmarks.robot_faults import LOADED
 from weldcal.tools.console import plain
-from weldcal.tools.pacing import WallClock, no_long_garbage_collections
+from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.simulation import Progress, no_progress
 from weldcal.tools.ur_emulator.process import HOST, emulator_process
@@ -32,6 +33,7 @@ RATE_HZ = 125.0
 READ_S = 0.002
 MISSED_S = 0.020  # a command that comes so much later than its time is named
 PERCENTILES = (50, 90, 99)
+MOST_STOPS = 20
 
 # all but the last joint swing to and fro; the last one jumps, and from its jumps the way to the motion is timed
 SWING = np.array([0.10, 0.08, 0.08, 0.10, 0.10, 0.0])  # rad/s
@@ -52,9 +54,24 @@ class Tap:
     echoes: array[float] = field(default_factory=lambda: array("d"))
     motions: array[float] = field(default_factory=lambda: array("d"))
     state_now: LinkState | None = None
+    starts: list[int] = field(default_factory=lambda: [0])  # how many commands had been sent when a link began
     _heard: int = -1
     _wanted: float = 0.0
     _stepped: tuple[float, float, float] | None = None  # when, from, to
+
+    def restart(self, link: UrLink) -> None:
+        """Go on with another link."""
+        self.link, self.state_now = link, None
+        self.starts.append(len(self.command_times))
+        self._heard, self._wanted, self._stepped = -1, 0.0, None
+
+    @property
+    def periods(self) -> NDArray[np.float64]:
+        """From each command to the next, s; NaN over the pause in which a link was made anew."""
+        found = np.diff(np.array(self.command_times))
+        for start in self.starts[1:]:
+            found[start - 1 : start] = np.nan
+        return found
 
     def state(self) -> LinkState:
         """As the link's."""
@@ -92,20 +109,29 @@ class Missed:
 
 
 @dataclass(frozen=True)
+class Stopped:
+    """The link stopped the arm by itself: when in the run (s), and what it said."""
+
+    at_s: float
+    sentence: str
+
+
+@dataclass(frozen=True)
 class StreamReport:
-    """One stream. `fault` is empty where it went through to its end."""
+    """One stream. `fault` is empty where it went through to its end; `stops` were lived through with a new start."""
 
     seconds: float
     tap: Tap
     final: LinkState
     clock: WallClock
     fault: str
+    stops: tuple[Stopped, ...] = ()
 
     @property
     def missed(self) -> list[Missed]:
         """Every one of them."""
         times = np.array(self.tap.command_times)
-        late = np.diff(times) - 1.0 / RATE_HZ
+        late = self.tap.periods - 1.0 / RATE_HZ
         return [Missed(float(times[k + 1] - times[0]), float(late[k])) for k in np.flatnonzero(late > MISSED_S)]
 
     def summary(self) -> dict[str, object]:
@@ -122,7 +148,7 @@ class StreamReport:
             "reason": self.fault or None,
             "seconds": self.seconds,
             "commands": len(tap.command_times),
-            "command_period_ms": _spread(np.diff(np.array(tap.command_times))),
+            "command_period_ms": _spread(tap.periods[np.isfinite(tap.periods)]),
             "echo_ms": _spread(np.array(tap.echoes)),
             "command_to_motion_ms": _spread(np.array(tap.motions)),
             "velocity_steps": len(tap.motions),
@@ -134,14 +160,14 @@ class StreamReport:
             "clock_drift_ppm": 1e6 * self.final.clock_drift,
             "diagram_late_ms": 1e3 * self.clock.late_s,
             "diagram_reanchored": self.clock.reanchored,
+            "stops": [{"id": f"at {stop.at_s:.3f} s", "reason": stop.sentence} for stop in self.stops],
             "missed_deadlines": len(missed),
             "missed": [{"id": f"at {m.at_s:.3f} s", "reason": f"{1e3 * m.late_s:.1f} ms late"} for m in missed],
         }
 
 
-def run_stream(link: UrLink, arm: ArmModel, seconds: float, progress: Progress = no_progress) -> StreamReport:
+def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_progress) -> StreamReport:
     """Moves the arm for so long, paced by the wall clock; ends early where the link latches a fault."""
-    tap = Tap(link)
     builder = DiagramBuilder()
     robot = builder.AddNamedSystem("robot", UrRtdeArm(arm, cast(UrLink, tap), 1.0, READ_S, 1.0 / RATE_HZ))
     frequencies = np.full(6, 2.0 * np.pi * SWING_HZ)
@@ -163,25 +189,40 @@ def run_stream(link: UrLink, arm: ArmModel, seconds: float, progress: Progress =
             return EventStatus.ReachedTermination(diagram, tap.state_now.status.fault or "")
         return EventStatus.DidNothing()
 
-    with no_long_garbage_collections():
+    with no_long_garbage_collections(), real_time_priority():
         simulator.Initialize()
         simulator.set_monitor(watch)
         simulator.AdvanceTo(seconds)
-    final = link.state()
+    final = tap.link.state()
     return StreamReport(simulator.get_context().get_time(), tap, final, clock, final.status.fault or "")
 
 
 def run_robot_benchmark(
     out: Path, *, address: str = HOST, minutes: float = 10.0, seed: int = 0, progress: Progress = no_progress
 ) -> StreamReport:
-    """On an emulated controller of its own; robot.json and missed.csv are written into `out`."""
+    """On an emulated controller of its own; robot.json and missed.csv are written into `out`.
+
+    Where this computer stood still for so long that the link stopped the arm, that is a stop in the report, and the stream
+    goes on over a new link.
+    """
+    left, stops, tap = 60.0 * minutes, list[Stopped](), None
     with emulator_process(host=address, seed=seed):
-        prepared = PrepareRobot(UrRtde(host=address), load_arm())
-        link = cast(UrLink, prepared.handle)
-        try:
-            report = run_stream(link, prepared.arm, 60.0 * minutes, progress)
-        finally:
-            link.close()
+        while True:
+            prepared = PrepareRobot(UrRtde(host=address), load_arm())
+            link = cast(UrLink, prepared.handle)
+            if tap is None:
+                tap = Tap(link)
+            else:
+                tap.restart(link)
+            try:
+                report = run_stream(tap, prepared.arm, left, progress)
+            finally:
+                link.close()
+            left -= report.seconds
+            if report.final.fault.name not in (*LOADED, "GUARD_LATCHED") or len(stops) == MOST_STOPS:
+                break
+            stops.append(Stopped(60.0 * minutes - left, report.fault))
+    report = replace(report, seconds=60.0 * minutes - left, stops=tuple(stops))
     write_atomic(out / "robot.json", json.dumps(plain(report.summary()), indent=1))
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
