@@ -16,11 +16,12 @@ from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario import Scenario
+from weldcal.tools.pacing import draw_in_this_thread
 from weldcal.tools.ur_emulator.process import HOST as EMULATOR_HOST
 from weldcal.tools.ur_emulator.process import emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
-EMULATED_PACE = 0.4  # the weld, with its rendered finger camera, holds 0.5 on two quiet cores
+EMULATED_PACE = 0.4  # ends done on two cores shared by cell, worker and emulator, other work beside them
 SLOWEST_PACE = 0.05
 
 
@@ -85,6 +86,7 @@ def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float)
     config = dc.replace(config, host=host, pace=pace)
     if not dry_run:
         scenario.robot = config
+        draw_in_this_thread()
         return ChosenRobot(name)
     scenario.robot = SimulatedUr()
     return ChosenRobot(
