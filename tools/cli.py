@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.studies.cli_reproduce import reproduce
 
 app = typer.Typer(
     name="weldcal",
@@ -21,6 +22,7 @@ app = typer.Typer(
 )
 benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
+app.add_typer(reproduce, name="reproduce")
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

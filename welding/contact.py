@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 
+from weldcal.welding.evolve import changed
 from weldcal.welding.plan_fit import add_point
 from weldcal.welding.refinement import drop_pending, refine, tip_point
 from weldcal.welding.seam import SeamFrame
 from weldcal.welding.servo_state import Measurement, ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import clip, dot, finite, norm
+from weldcal.welding.vectors import Array, clip, dot, finite, norm
 
 
 def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
@@ -22,6 +22,7 @@ def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
         and frame.valid
         and state.frame_time < frame.capture_time <= sample.time + 1e-6
         and finite(frame.deflection_T)
+        and finite(frame.X_BT_at_capture.translation())
     )
 
 
@@ -29,32 +30,91 @@ def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config
     """The state after a new frame: tip point, delta = P_r - P_s (Eq. 15), its part along n and the axial part."""
     frame = sample.deflection
     assert frame is not None
-    deflection = frame.deflection_T / state.gain
+    deflection = (frame.deflection_T if state.zero is None else frame.deflection_T - state.zero) / state.gain
     X_BT = frame.X_BT_at_capture
     point = tip_point(X_BT, deflection)
+    # The published laws go by the plan's frame alone.
+    minded = state.proven and config.law == "guarded"
+    felt = felt_turn(state, point, seam, config) if minded else 0.0
+    seam = turned(seam, felt)
     p_BT = np.asarray(X_BT.translation())
     delta = p_BT - point
+    steer = _steering(state, delta, seam, config) if minded else 0.0
+    seam = turned(seam, steer)
     delta_n, delta_axial = dot(delta, seam.normal), -dot(delta, seam.up)
-    return replace(
+    return changed(
         state,
         measurement=Measurement(frame.capture_time, point, delta, p_BT),
         frame_time=frame.capture_time,
         delta_n=delta_n,
         delta_axial=delta_axial,
-        steer=_steering(dot(delta, seam.tangent), delta_n, config) if state.proven else 0.0,
+        felt=felt,
+        steer=steer,
     )
 
 
-def _steering(delta_t: float, delta_n: float, config: ServoConfig) -> float:
+def turned(seam: SeamFrame, angle: float) -> SeamFrame:
+    """The seam's frame turned about its up by an angle rad."""
+    if angle == 0.0:
+        return seam
+    c, s = math.cos(angle), math.sin(angle)
+    return seam._replace(tangent=c * seam.tangent + s * seam.normal, normal=c * seam.normal - s * seam.tangent)
+
+
+def felt_turn(state: WeldingState, point: Array, seam: SeamFrame, config: ServoConfig) -> float:
+    """How far the path just felt turns from the plan's tangent, rad about up; zero where they agree.
+
+    A plan rounds its corners, and beside a rounded corner its tangent is wrong by half of the turn. The direction of
+    the last points is noisier than the plan's, so that it is believed only where the two plainly differ.
+    """
+    points = [point, *(q.point for q in reversed(state.refined.pending)), *state.refined.points[-1:-13:-1]]
+    x, y = [0.0], [0.0]
+    for earlier in points[1:]:
+        back = earlier - point
+        x.append(dot(back, seam.tangent))
+        y.append(dot(back, seam.normal))
+        if len(x) >= config.felt_points and math.hypot(x[-1], y[-1]) >= config.felt_length_m:
+            break
+    else:
+        return 0.0
+    n = len(x)
+    mx, my = sum(x) / n, sum(y) / n
+    xx = sum((v - mx) ** 2 for v in x)
+    yy = sum((v - my) ** 2 for v in y)
+    xy = sum((v - mx) * (w - my) for v, w in zip(x, y, strict=True))
+    angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+    # The principal axis has no sense; the way from the earliest to the newest point has.
+    if math.cos(angle) * x[-1] + math.sin(angle) * y[-1] > 0.0:
+        angle = math.remainder(angle + math.pi, 2.0 * math.pi)
+    share = (abs(angle) - config.felt_dead_rad) / (config.felt_full_rad - config.felt_dead_rad)
+    return clip(angle, -0.5 * math.pi, 0.5 * math.pi) * clip(share, 0.0, 1.0)
+
+
+def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoConfig) -> float:
     """How far to turn the tip's frame about up, rad, where the deformation contradicts the plan's normal.
 
-    The tip leans against what stops it. When that is far from the plan's normal the plan is wrong there (a corner it
-    rounded), and pressing on along its tangent would jam the tip; friction's steady drag is no such evidence.
+    The tip leans against what stops it. When that is far from the plan's normal the plan is wrong there, and pressing
+    on along its tangent would jam the tip; friction's steady drag is no such evidence. Two things explain the lean: a
+    plan that is ahead or behind at a corner, whose own tangent nearby then leaves no lean; or a wall where none is
+    planned, to which the frame turns.
     """
-    excess = max(0.0, abs(delta_t) - config.drag_m)
-    angle = math.copysign(math.atan2(excess, max(delta_n, 0.5 * config.delta_d_m)), delta_t)
-    share = (abs(angle) - config.steering_dead_rad) / (config.steering_full_rad - config.steering_dead_rad)
-    return -angle * clip(share, 0.0, 1.0)
+    lean, delta_n = dot(delta, seam.tangent), dot(delta, seam.normal)
+    excess = max(0.0, abs(lean) - config.drag_m)
+    angle = -math.copysign(math.atan2(excess, max(delta_n, 0.5 * config.delta_d_m)), lean)
+    share = clip(
+        (abs(angle) - config.steering_dead_rad) / (config.steering_full_rad - config.steering_dead_rad), 0.0, 1.0
+    )
+    if share == 0.0 or state.plan_fit is None:
+        return 0.0
+    curve, s, reach = state.plan_fit.curve, state.s_tip, config.steering_reach_m
+    best = excess
+    for k in (-8, -7, -6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6, 7, 8):
+        there = curve.frame(s + k * reach / 8.0).tangent
+        cost = max(0.0, abs(dot(delta, there)) - config.drag_m) + 0.02 * reach * abs(k)
+        if cost < best:
+            best = cost
+            angle = math.atan2(dot(there, seam.normal), dot(there, seam.tangent))
+    return angle * share
 
 
 def beyond_limit(state: WeldingState, config: ServoConfig) -> bool:
@@ -82,13 +142,13 @@ def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     assert state.plan_fit is not None
     proven = state.proven or state.delta_n > 0.5 * config.delta_d_m
     if not (proven or state.delta_axial > 0.33 * config.axial_d_m):
-        return replace(state, refined=drop_pending(state.refined), proven=proven)
+        return changed(state, refined=drop_pending(state.refined), proven=proven)
     arc = progress_at(state, state.measurement.capture_time)
     refined = refine(state.refined, state.measurement.point, arc, config.refinement)
     plan_fit = state.plan_fit
     if len(refined) > len(state.refined):
         plan_fit = add_point(plan_fit, refined.points[-1], float(refined.arc[-1]), config.plan_fit)
-    return replace(state, refined=refined, plan_fit=plan_fit, proven=proven)
+    return changed(state, refined=refined, plan_fit=plan_fit, proven=proven)
 
 
 def progress_at(state: WeldingState, time: float) -> float:
@@ -108,4 +168,7 @@ def progress_at(state: WeldingState, time: float) -> float:
 def with_progress(state: WeldingState, time: float, v_tip: float, dt: float) -> WeldingState:
     """The state with its progress advanced by one tick, and 0.25 s of it remembered for late frames."""
     progress = state.progress + v_tip * dt
-    return replace(state, progress=progress, progress_log=(*state.progress_log[-31:], (time, progress)))
+    furthest = max(state.furthest, progress)
+    return changed(
+        state, progress=progress, furthest=furthest, progress_log=(*state.progress_log[-31:], (time, progress))
+    )

@@ -1,145 +1,184 @@
-"""The chord map: what a seam asks of a tool whose torch trails its tip, known before the arc is lit."""
+"""What stands against a seam, named before the arc is lit, and where to split it so that nothing does."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
+from weldcal.welding.chord_map import ChordMap, chord_map
 from weldcal.welding.seam import SeamCurve
-from weldcal.welding.vectors import Array, dot, norm
+
+_SPACING_M = 1.0e-3
 
 
 class InfeasibleSeam(WeldcalError):
-    """The seam turns more than a right angle within the chord: the torch would have to run backwards."""
+    """No trailing torch can weld this seam in one go: it would have to run backwards, stand, or leave its windows."""
 
 
 @dataclass(frozen=True)
-class ChordMap:
-    """Tip and torch on the seam, one row per torch position; every figure is of the nominal plan.
+class SeamWindows:
+    """What a seam may ask of the tool.
 
     Attributes:
-        s_torch, s_tip: (n,) arc lengths m of the two ends of the chord.
-        turn: (n,) psi_r - psi_t in rad; max_turn: the largest, unsigned.
-        cos_tip, cos_torch: (n,) t_s . u and n_d . n_t.
-        conditioning: (n,) sqrt(cos_tip^2 + cos_torch^2); min_conditioning: the least.
-        tip_speed, torch_speed: (n,) m/s that the projective law gives; speed_loss: largest share of torch speed lost.
-        back_up_m: how far the torch must run backwards.
+        back_up_m: how far the torch may have to run backwards: what the plan's noise makes of a right angle.
+        conditioning: least sqrt(cos^2 th_r + cos^2 th_t).
+        sharp_rad: largest turn within 4 mm: beyond it the seam reverses in a cusp.
+        travel_rad: largest travel angle, unsigned; work_rad: largest lean off the wanted work angle.
+        speed_loss: largest share of torch speed that the limits may take away.
     """
 
-    s_torch: Array
-    s_tip: Array
-    turn: Array
-    cos_tip: Array
-    cos_torch: Array
-    conditioning: Array
-    tip_speed: Array
-    torch_speed: Array
-    back_up_m: float
+    back_up_m: float = 0.5e-3
+    conditioning: float = 0.4
+    sharp_rad: float = math.radians(115.0)
+    travel_rad: float = math.radians(20.0)
+    work_rad: float = math.radians(10.0)
+    speed_loss: float = 1.0
+
+
+@dataclass(frozen=True)
+class SeamProblem:
+    """One thing that stands against a seam: its kind, the torch's arc length m, and one sentence."""
+
+    kind: str
+    s: float
+    sentence: str
+
+
+@dataclass(frozen=True)
+class SeamReport:
+    """A seam's chord map, what stands against it, and where to split it (arc lengths m) when that helps."""
+
+    chart: ChordMap
+    problems: tuple[SeamProblem, ...]
+    splits: tuple[float, ...] = ()
 
     @property
-    def max_turn(self) -> float:
-        """Largest |psi_r - psi_t|, rad."""
-        return float(np.max(np.abs(self.turn)))
-
-    @property
-    def min_conditioning(self) -> float:
-        """Least conditioning, 0..sqrt 2."""
-        return float(np.min(self.conditioning))
-
-    @property
-    def speed_loss(self) -> float:
-        """The largest share of the weld speed that the limits take from the torch, 0..1."""
-        top = float(np.max(self.torch_speed))
-        return min(1.0, 1.0 - float(np.min(self.torch_speed)) / top) if top > 0.0 else 1.0
+    def feasible(self) -> bool:
+        """Whether the seam can be welded in one go."""
+        return not self.problems
 
 
-def chord_map(
-    plan: SeamCurve,
-    d: float,
-    weld_speed: float,
-    tip_speed_limit: float = 0.040,
-    omega_limit: float = 0.8,
-    spacing: float = 0.5e-3,
-) -> ChordMap:
-    """Run the chord along the plan with both ends on it, from the torch d before the seam to the torch at its end.
-
-    The pairs (tip, torch) at distance d form a curve whose tangent is (n_d . n_t, t_s . u): the projective law itself.
-    It is followed by its own length, so a tip that stands while the torch moves, or a torch that backs up, is seen.
+def assess_seam(plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindows | None = None) -> SeamReport:
+    """The chord map of a seam and everything that stands against welding it in one go.
 
     Args:
-        plan: the seam; straight beyond its ends.
-        d: chord m.
-        weld_speed, tip_speed_limit: m/s; omega_limit: rad/s.
-        spacing: step along the pair curve, m.
+        plan: the line that tip and torch run on; d: chord m; weld_speed: m/s.
+        windows: limits; SeamWindows() when None.
     """
-    pairs = [(0.0, -d)]
-    tip, torch = 0.0, -d
-    heading = (1.0, 1.0)
-    farthest = torch
-    for _ in range(math.ceil(6.0 * (plan.length + d) / spacing)):
-        c_tip, c_torch, _ = _ends(plan, tip, torch)
-        size = math.hypot(c_tip, c_torch)
-        if size > 1e-3:
-            way = (c_torch / size, c_tip / size)
-            # Through the fold of a hairpin the pair keeps its sense, the torch alone may reverse.
-            sense = 1.0 if way[0] * heading[0] + way[1] * heading[1] >= 0.0 else -1.0
-            heading = (sense * way[0], sense * way[1])
-        tip, torch = tip + spacing * heading[0], torch + spacing * heading[1]
-        for _ in range(3):
-            c_tip, c_torch, distance = _ends(plan, tip, torch)
-            pull = (d - distance) / max(c_tip * c_tip + c_torch * c_torch, 1e-3)
-            tip, torch = tip + pull * c_tip, torch - pull * c_torch
-            if abs(pull) < 1e-9:
-                break
-        pairs.append((tip, torch))
-        farthest = max(farthest, torch)
-        # A torch a whole chord back is a tool turned round in a hairpin: nothing further is worth knowing.
-        if torch >= plan.length or torch < farthest - d:
-            break
-    s_tip, s_torch = np.array(pairs).T
-    u = (plan.position(s_tip) - plan.position(s_torch)) / d
-    t_tip, t_torch = plan.tangent(s_tip), plan.tangent(s_torch)
-    cos_tip, cos_torch = np.sum(t_tip * u, axis=1), np.sum(t_torch * u, axis=1)
-    up = plan.up(s_torch)
-    turn = np.unwrap(np.arctan2(np.sum(np.cross(t_torch, t_tip) * up, axis=1), np.sum(t_torch * t_tip, axis=1)))
-    tiny = 1e-9
-    scale = np.minimum(
-        weld_speed / np.maximum(np.abs(cos_tip), tiny), tip_speed_limit / np.maximum(np.abs(cos_torch), tiny)
-    )
-    scale = np.minimum(scale, omega_limit * d / np.maximum(np.abs(np.sin(turn)), tiny))
-    back = float(np.sum(np.maximum(0.0, -np.diff(s_torch))))
-    return ChordMap(
-        s_torch, s_tip, turn, cos_tip, cos_torch, np.hypot(cos_tip, cos_torch), scale * cos_torch, scale * cos_tip, back
-    )
+    limits = windows or SeamWindows()
+    chart = chord_map(plan, d, weld_speed, spacing=_SPACING_M)
+    problems = _problems(plan, chart, d, limits)
+    splits = _splits(plan, d, weld_speed, limits) if problems else ()
+    return SeamReport(chart, problems, splits)
 
 
-def _ends(plan: SeamCurve, tip: float, torch: float) -> tuple[float, float, float]:
-    """(t_s . u at the tip, t_s . u at the torch, distance m) of a pair of arc lengths."""
-    a, b = plan.frame(tip), plan.frame(torch)
-    gap = a.position - b.position
-    distance = max(norm(gap), 1e-12)
-    return dot(gap, a.tangent) / distance, dot(gap, b.tangent) / distance, distance
-
-
-def check_feasible(plan: SeamCurve, d: float, weld_speed: float, wobble_rad: float = math.radians(5.0)) -> ChordMap:
+def check_feasible(plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindows | None = None) -> ChordMap:
     """The chord map of a seam that can be welded in one go.
 
-    Args:
-        wobble_rad: what a planned tangent may be wrong by: a right-angled seam is not refused for its plan's noise.
+    Raises:
+        InfeasibleSeam: naming the first thing against it, and where to split the seam if that helps.
+    """
+    report = assess_seam(plan, d, weld_speed, windows)
+    if report.problems:
+        places = " and ".join(f"{1e3 * s:.0f}" for s in report.splits)
+        remedy = (
+            f"split the weld at {places} mm or shorten the tool" if places else "shorten the tool or change the seam"
+        )
+        raise InfeasibleSeam(f"Plan infeasible: {report.problems[0].sentence}; {remedy}.")
+    return report.chart
+
+
+def split_seam(
+    plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindows | None = None
+) -> tuple[SeamCurve, ...]:
+    """The seam as pieces that each can be welded in one go, in order; the seam itself when nothing is against it.
 
     Raises:
-        InfeasibleSeam: the seam turns by more than 90 deg (and the wobble) between torch and tip. The bound is
-            sufficient: up to it no law ever has to back the torch up.
+        InfeasibleSeam: no split helps.
     """
-    chart = chord_map(plan, d, weld_speed, spacing=1.0e-3)
+    report = assess_seam(plan, d, weld_speed, windows)
+    if report.feasible:
+        return (plan,)
+    if not report.splits:
+        check_feasible(plan, d, weld_speed, windows)
+    ends = (0.0, *report.splits, plan.length)
+    return tuple(piece(plan, low, high) for low, high in itertools.pairwise(ends))
+
+
+def piece(plan: SeamCurve, low: float, high: float) -> SeamCurve:
+    """The stretch of a seam between two arc lengths m as a seam of its own."""
+    s = np.linspace(low, high, max(5, math.ceil((high - low) / 0.5e-3) + 1))
+    return SeamCurve.from_points(plan.position(s), plan.up(s))
+
+
+def _problems(plan: SeamCurve, chart: ChordMap, d: float, limits: SeamWindows) -> tuple[SeamProblem, ...]:
+    found = []
     worst = int(np.argmax(np.abs(chart.turn)))
-    if chart.max_turn > math.radians(90.0) + wobble_rad:
-        turn, place = math.degrees(chart.max_turn), 1e3 * chart.s_torch[worst]
-        raise InfeasibleSeam(
-            f"Plan infeasible: the seam turns {turn:.0f} deg within the {1e3 * d:.0f} mm between torch and tip at "
-            f"{place:.0f} mm; split the weld there or shorten the tool."
+    turn, place = math.degrees(chart.max_turn), float(chart.s_torch[worst])
+    within = f"the seam turns {turn:.0f} deg within the {1e3 * d:.0f} mm between torch and tip at {1e3 * place:.0f} mm"
+    if chart.back_up_m > limits.back_up_m:
+        text = f"{within}, and the torch would have to run {1e3 * chart.back_up_m:.1f} mm backwards"
+        found.append(SeamProblem("back-up", place, text))
+    elif chart.min_conditioning < limits.conditioning:
+        text = f"{within}, and the tool stands square to both ends of the seam"
+        found.append(SeamProblem("conditioning", place, text))
+    sharp, where = _sharpest(plan)
+    if sharp > limits.sharp_rad:
+        text = f"the seam reverses at {1e3 * where:.0f} mm: it turns {math.degrees(sharp):.0f} deg within 4 mm"
+        found.append(SeamProblem("cusp", where, text))
+    if chart.max_travel > limits.travel_rad:
+        k = int(np.argmax(np.abs(chart.travel)))
+        text = (
+            f"the travel angle would be {math.degrees(chart.max_travel):.1f} deg at {1e3 * chart.s_torch[k]:.0f} mm, "
+            f"and its window is {math.degrees(limits.travel_rad):.0f} deg"
         )
-    return chart
+        found.append(SeamProblem("travel angle", float(chart.s_torch[k]), text))
+    if chart.speed_loss > limits.speed_loss:
+        k = int(np.argmin(chart.torch_speed))
+        text = f"the torch would lose {100.0 * chart.speed_loss:.0f} % of its speed at {1e3 * chart.s_torch[k]:.0f} mm"
+        found.append(SeamProblem("speed", float(chart.s_torch[k]), text))
+    return tuple(found)
+
+
+def _sharpest(plan: SeamCurve) -> tuple[float, float]:
+    """The largest turn (rad) of the tangent within 4 mm, and the arc length m of its middle."""
+    s = np.arange(0.0, plan.length, _SPACING_M)
+    if len(s) < 6:
+        return 0.0, 0.0
+    t = plan.tangent(s)
+    cos = np.clip(np.sum(t[4:] * t[:-4], axis=1), -1.0, 1.0)
+    k = int(np.argmin(cos))
+    return math.acos(float(cos[k])), float(s[k] + 2.0 * _SPACING_M)
+
+
+def _splits(plan: SeamCurve, d: float, weld_speed: float, limits: SeamWindows, depth: int = 4) -> tuple[float, ...]:
+    """Where to split a seam that turns too far: at the middle of the turn, and the pieces again as need be."""
+    chart = chord_map(plan, d, weld_speed, spacing=_SPACING_M)
+    kinds = {p.kind for p in _problems(plan, chart, d, limits)}
+    if not kinds or depth == 0 or plan.length < 0.030 or not kinds <= {"back-up", "conditioning", "cusp"}:
+        return ()
+    sharp, where = _sharpest(plan)
+    if sharp < math.radians(50.0):
+        # A wide turn: the middle of what is turned within the chord where it is most.
+        k = int(np.argmax(np.abs(chart.turn)))
+        low, high = max(0.0, float(chart.s_torch[k])), min(plan.length, float(chart.s_tip[k]))
+        s = np.arange(low, high, _SPACING_M)
+        swept = np.cumsum(np.abs(plan.curvature(s))) if len(s) else np.zeros(1)
+        where = float(s[int(np.searchsorted(swept, 0.5 * swept[-1]))]) if len(s) else 0.5 * (low + high)
+    if not 0.012 < where < plan.length - 0.012:
+        return ()
+    places: list[float] = []
+    for low, high in ((0.0, where), (where, plan.length)):
+        part = piece(plan, low, high)
+        if _problems(part, chord_map(part, d, weld_speed, spacing=_SPACING_M), d, limits):
+            inner = _splits(part, d, weld_speed, limits, depth - 1)
+            if not inner:
+                return ()
+            places += [low + s for s in inner]
+        if high == where:
+            places.append(where)
+    return tuple(places)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.corner import CornerConfig, fill_corner, is_jump
 from weldcal.welding.vectors import Array
 
 _EMPTY_POINTS = np.zeros((0, 3))
@@ -28,19 +29,22 @@ class RefinementConfig:
 
     Attributes:
         frames_to_commit: further good frames a point waits for.
-        fit_sigma_m: width of the local fit's Gaussian; 0.4 of the plan's radius where that is less.
+        fit_sigma_m: width of the local fit's Gaussian; fit_radius_share: of the plan's radius, where that is less.
         fit_sigma_max_m: how wide it may grow to find points.
         fit_points: effective points it grows for.
         bridge_from_m: farther than this from any point a gap is bridged on the moved plan instead.
         slope_ridge: weight that holds the fitted slope to the plan's, in effective points at one fit width.
+        corner: how a corner is filled in that the tip sprang across.
     """
 
     frames_to_commit: int = 4
     fit_sigma_m: float = 1.5e-3
+    fit_radius_share: float = 0.2
     fit_sigma_max_m: float = 3.0e-3
     fit_points: float = 5.0
-    bridge_from_m: float = 1.5e-3
+    bridge_from_m: float = 0.6e-3
     slope_ridge: float = 0.2
+    corner: CornerConfig = field(default_factory=CornerConfig)
 
 
 @dataclass(frozen=True)
@@ -49,13 +53,19 @@ class RefinedSeam:
 
     Attributes:
         points: (n,3) m in B, the tip's centre.
-        arc: (n,) m, the commanded tip progress at each point, increasing.
+        arc: (n,) m, the commanded tip progress at each point and what the tip sprang beyond it, increasing.
         pending: points waiting for confirmation, oldest first.
+        sprung: what the tip sprang so far, m.
+        jump: number of points (before, after) a jump that is not filled in yet, or None.
+        corners: (k,) arcs m of corners filled in.
     """
 
     points: Array
     arc: Array
     pending: tuple[PendingPoint, ...] = ()
+    sprung: float = 0.0
+    jump: tuple[int, int] | None = None
+    corners: Array = field(default_factory=lambda: _EMPTY_ARC)
 
     @classmethod
     def empty(cls) -> RefinedSeam:
@@ -77,10 +87,42 @@ def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig
     if len(pending) <= config.frames_to_commit:
         return replace(seam, pending=pending)
     oldest, pending = pending[0], pending[1:]
+    seam = replace(seam, pending=pending)
+    arc = oldest.arc + seam.sprung
     # The path is a function of progress: a point that does not advance it would make the fit's slope meaningless.
-    if len(seam) and oldest.arc <= seam.arc[-1] + 1e-6:
-        return replace(seam, pending=pending)
-    return RefinedSeam(np.vstack([seam.points, oldest.point]), np.append(seam.arc, oldest.arc), pending)
+    if len(seam) and arc <= seam.arc[-1] + 1e-6:
+        return seam
+    if len(seam) and is_jump(seam.points[-4:], oldest.point, config.corner):
+        step = float(np.linalg.norm(oldest.point - seam.points[-1]))
+        extra = max(0.0, step - (arc - float(seam.arc[-1])))
+        # What was felt in the middle of a jump belongs to neither side.
+        before = len(seam) if seam.jump is None or len(seam) - seam.jump[1] > 4 else seam.jump[0]
+        seam = replace(seam, sprung=seam.sprung + extra, jump=(before, len(seam)))
+        arc += extra
+    seam = replace(seam, points=np.vstack([seam.points, oldest.point]), arc=np.append(seam.arc, arc))
+    return _filled(seam, config.corner) if seam.jump is not None else seam
+
+
+def _filled(seam: RefinedSeam, config: CornerConfig) -> RefinedSeam:
+    """The seam with its jump filled in, once the side behind it is long enough to be fitted."""
+    assert seam.jump is not None
+    before, after = seam.jump
+    if seam.arc[-1] - seam.arc[after] < config.side_m and len(seam) - after < 4 * config.points:
+        return seam
+    low = int(np.searchsorted(seam.arc, seam.arc[before - 1] - config.side_m))
+    corner = fill_corner(seam.points[low:before], seam.points[after:], config)
+    if corner is None:
+        return replace(seam, jump=None)
+    start = float(seam.arc[before - 1])
+    extra = start + corner.length - float(seam.arc[after])
+    return replace(
+        seam,
+        points=np.vstack([seam.points[:before], corner.points, seam.points[after:]]),
+        arc=np.concatenate([seam.arc[:before], start + corner.along, seam.arc[after:] + extra]),
+        sprung=seam.sprung + extra,
+        jump=None,
+        corners=np.append(seam.corners, start + corner.middle),
+    )
 
 
 def drop_pending(seam: RefinedSeam) -> RefinedSeam:
@@ -120,7 +162,10 @@ def local_fit(
     Returns:
         None where even the widest window holds fewer than 3 effective points.
     """
-    sigma = max(min(0.4 * radius, config.fit_sigma_m), 0.3e-3)
+    sigma = max(min(config.fit_radius_share * radius, config.fit_sigma_m), 0.3e-3)
+    if len(seam.corners):
+        # Round a corner that was filled in the points are dense and free of noise: a wide fit would cut it.
+        sigma = max(min(sigma, 0.4 * float(np.min(np.abs(seam.corners - arc)))), 0.3e-3)
     while True:
         low, high = np.searchsorted(seam.arc, (arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
         n = high - low
@@ -146,6 +191,11 @@ def local_fit(
     c = np.linalg.solve(normal, rhs)
     slope = c[1] / sigma
     speed = math.sqrt(float(slope @ slope))
-    if not (math.isfinite(speed) and speed > 1e-3):
+    if not math.isfinite(speed):
+        return None
+    # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it.
+    slope = slope + max(0.0, 0.8 - speed) * plan_tangent
+    speed = math.sqrt(float(slope @ slope))
+    if speed < 0.2:
         return None
     return LocalFit(c[0] + seam.points[low], slope / speed, 2.0 * c[2] / sigma**2, speed, effective)

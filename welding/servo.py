@@ -7,15 +7,26 @@ from dataclasses import replace
 
 import numpy as np
 
-from weldcal.welding.contact import beyond_limit, contact_lost, is_new_frame, with_frame, with_point, with_progress
+from weldcal.welding.contact import (
+    beyond_limit,
+    contact_lost,
+    is_new_frame,
+    turned,
+    with_frame,
+    with_point,
+    with_progress,
+)
+from weldcal.welding.evolve import changed
 from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
+from weldcal.welding.laws import get_law, motion_law
 from weldcal.welding.plan_fit import PlanFit
 from weldcal.welding.refinement import drop_pending
-from weldcal.welding.seam import SeamCurve, SeamFrame
+from weldcal.welding.seam import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.servo_state import Diagnostics, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.touch import touch_step
-from weldcal.welding.track import guarded_motion, tip_frame, torch_target
+from weldcal.welding.track import TorchTarget, torch_target
 from weldcal.welding.vectors import Array, clip, dot, finite
+from weldcal.welding.weave import weave_at
 
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
 
@@ -36,12 +47,15 @@ def welding_step(
         `ramp_s`, and stays until a new state is made. Source: flange calibration and tactile welding paper, Section
         2.2.2 and Algorithm 2, with the corrections of docs/weld_law.md.
     """
+    if not math.isfinite(sample.time):
+        state = _fault(state, state.time or 0.0, "The time of a servo tick is not a number; check the clock.")
+        sample = replace(sample, time=state.time or 0.0)
     dt = config.period_s if state.time is None else clip(sample.time - state.time, 0.0, 0.05)
-    if state.plan_fit is None:
+    if state.plan_fit is None and state.phase != Phase.FAULT:
         state = _begin(state, sample, plan, config)
     if not finite(sample.X_BT.translation()):
         state = _fault(state, sample.time, "The robot's pose is not a number; check the robot's connection.")
-    state = replace(state, time=sample.time)
+    state = changed(state, time=sample.time)
 
     is_new = state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
     before = state
@@ -58,15 +72,21 @@ def welding_step(
 
 
 def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: ServoConfig) -> WeldingState:
-    tip_line = plan.raised(config.tool.tip_seat_height_m) if config.tool.tip_seat_height_m else plan
-    state = replace(
+    tool = config.tool
+    try:
+        tip_line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
+        # Rest point and torch run beside the tip's line, lower by what the tip is pressed in.
+        line = tip_line.raised(config.clearance_m) if config.clearance_m else tip_line
+        if tip_line.length < config.touch.arc_m + config.contact.end_window_m:
+            return _fault(
+                state, sample.time, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short to be felt."
+            )
+        check_feasible(line, tool.torch_offset_m, config.weld_speed_m_s, config.windows)
+    except (InfeasibleSeam, SeamError) as problem:
+        return _fault(state, sample.time, str(problem))
+    return changed(
         state, plan_fit=PlanFit.start(tip_line), started=sample.time, s_tip=config.touch.arc_m, s_end=tip_line.length
     )
-    try:
-        check_feasible(tip_line, config.tool.torch_offset_m, config.weld_speed_m_s)
-    except InfeasibleSeam as problem:
-        return _fault(state, sample.time, str(problem))
-    return state
 
 
 def _frame_at_tip(state: WeldingState) -> SeamFrame:
@@ -78,7 +98,7 @@ def _fault(state: WeldingState, now: float, reason: str) -> WeldingState:
     """The first fault is kept; the arc goes off in this very tick."""
     if state.phase == Phase.FAULT:
         return state
-    return replace(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_at=now)
+    return changed(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_at=now)
 
 
 def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
@@ -112,7 +132,7 @@ def _touch(
         s = curve.nearest(p_BT, config.touch.arc_m)
         p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
         s_torch = curve.nearest(p_BW, s - config.tool.torch_offset_m, 0.1)
-        state = replace(state, phase=Phase.TRACK, proven=True, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch)
+        state = changed(state, phase=Phase.TRACK, proven=True, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch)
     return _answer(state, V, config, Diagnostics(omega=0.0))
 
 
@@ -121,24 +141,37 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
     limits = config.contact
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
-        if not contact_lost(before, state, config):
+        lost, law = contact_lost(before, state, config), get_law(config.law)
+        if not law.guarded:
+            # The paper appends every point, and knows of no contact; what it seeks without one depends on the reading.
+            return changed(
+                with_point(state, config), delta_wanted=0.0 if lost and law.lost == "zeroed" else None, sunk=lost
+            )
+        if not lost:
             return with_point(state, config)
-        state = replace(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0)
+        state = changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
         if state.s_tip > state.s_end - limits.end_window_m:
             assert before.measurement is not None
             assert state.plan_fit is not None
             last = state.plan_fit.curve.nearest(before.measurement.point, state.s_tip)
             low, high = state.s_end - limits.end_window_m, state.s_end + limits.end_window_m
-            return replace(_finish(state), s_end=clip(last, low, high))
-        return replace(state, phase=Phase.COAST, lost_at=state.s_tip, residual_at_loss=_tip_residual(state))
+            return changed(_finish(state), s_end=clip(last, low, high))
+        return changed(
+            state,
+            phase=Phase.COAST,
+            lost_at=state.s_tip,
+            lost_time=state.frame_time,
+            residual_at_loss=_tip_residual(state),
+        )
     if state.phase == Phase.COAST:
         # Just after the loss the springs are still relaxing: that is no new contact.
-        settled = state.s_tip - state.lost_at > limits.regain_after_m
+        waited = state.frame_time - state.lost_time > limits.regain_after_s
+        settled = waited and state.s_tip - state.lost_at > limits.regain_after_m
         touching = settled and state.delta_axial > limits.regain_axial_m
         regained = state.regained + 1 if touching else 0
         if regained >= limits.regain_frames:
-            return replace(state, phase=Phase.TRACK, regained=0, proven=False)
-        return replace(state, regained=regained)
+            return changed(state, phase=Phase.TRACK, regained=0, proven=False)
+        return changed(state, regained=regained)
     return state
 
 
@@ -154,13 +187,14 @@ def _tip_residual(state: WeldingState) -> Array:
 
 
 def _finish(state: WeldingState) -> WeldingState:
-    return replace(state, phase=Phase.FINISH, steer=0.0, hold=np.full(2, math.nan))
+    return changed(state, phase=Phase.FINISH, steer=0.0, felt=0.0, hold=np.full(2, math.nan))
 
 
 def _weld(
     state: WeldingState, sample: ServoSample, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
     assert state.plan_fit is not None
+    law = get_law(config.law)
     curve = state.plan_fit.curve
     p_BT = np.asarray(sample.X_BT.translation())
     at = p_BT
@@ -171,27 +205,31 @@ def _weld(
     seam = curve.frame(s_tip)
     gap = p_BT - seam.position
     off = np.array((dot(gap, seam.normal), dot(gap, seam.up)))
-    state = replace(state, s_tip=s_tip)
+    state = changed(state, s_tip=s_tip)
     if state.phase == Phase.COAST and s_tip - state.lost_at > config.contact.coast_m:
         text = (
             f"Contact lost for {1e3 * config.contact.coast_m:.0f} mm in the middle of the seam; check the groove there."
         )
         return _rest(_fault(state, sample.time, text), sample, config)
     beyond = config.contact.end_window_m if state.phase == Phase.TRACK else 0.0
-    if state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
-        state = _finish(state)
+    if law.guarded and state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
+        # Still in contact so far beyond the plan's end: the seam ends no earlier than here.
+        state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
-        state = replace(state, hold=off)
+        state = changed(state, hold=off)
 
     state = _slewed(state, *_servo(state, off, sample, config), config, dt)
     p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
     target = torch_target(state, curve, p_BW, config)
-    motion = guarded_motion(
-        state, sample.X_BT, tip_frame(seam, state.steer), target, (state.u_n, state.u_a), config, dt
+    if state.torch_on and config.weave.amplitude_m > 0.0:
+        offset, rate = weave_at(config.weave, sample.time - state.lit_at)
+        target = target._replace(point=target.point + offset * target.normal, rate=rate)
+    motion = motion_law(law)(
+        state, sample.X_BT, turned(seam, state.felt + state.steer), target, (state.u_n, state.u_a), config, dt
     )
     e = p_BW - target.point
     e_n, e_b = dot(e, target.normal), dot(e, target.up)
-    state = replace(
+    state = changed(
         with_progress(state, sample.time, motion.v_tip, dt),
         s_torch=target.s,
         torch_arc=target.arc,
@@ -200,13 +238,20 @@ def _weld(
         omega=motion.omega,
     )
     error = math.hypot(e_n, e_b)
-    inside = 0.0 <= target.s < state.s_end
+    state, problem = _advance(state, target.s, sample.time, config)
+    problem = problem or _angles(sample, target, config)
+    if problem is not None and (state.torch_on or state.phase == Phase.COAST):
+        return _rest(_fault(state, sample.time, problem), sample, config)
     if state.torch_on and error > config.torch_error_max_m:
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(_fault(state, sample.time, text), sample, config)
-    state = replace(state, torch_on=inside and (state.torch_on or error < config.ignition_error_m))
+    # Once lit it burns to the end: the plan may still move back under a torch that has just passed its start.
+    lit = state.torch_on or (target.s >= 0.0 and error < config.ignition_error_m)
+    burning = lit and target.s < state.s_end
+    lit_at = sample.time if burning and not state.torch_on else state.lit_at
+    state = changed(state, torch_on=burning, lit_at=lit_at)
     if target.s >= state.s_end:
-        done = replace(state, phase=Phase.DONE, torch_on=False, V_stop=state.V, stopped_at=sample.time)
+        done = changed(state, phase=Phase.DONE, torch_on=False, V_stop=state.V, stopped_at=sample.time)
         return _rest(done, sample, config)
     diagnostics = Diagnostics(
         e_t=e_n,
@@ -221,12 +266,46 @@ def _weld(
     return _answer(state, motion.V_BT, config, diagnostics)
 
 
+def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfig) -> tuple[WeldingState, str | None]:
+    """Whether the torch still comes along: half a millimetre in `stall_s`, or the weld is stopped."""
+    since, s = state.advanced
+    if abs(s_torch - s) > 0.5e-3:
+        return changed(state, advanced=(now, s_torch)), None
+    if now - since <= config.stall_s:
+        return state, None
+    return (
+        state,
+        f"The torch has stood at {1e3 * s_torch:.0f} mm for {config.stall_s:.0f} s; check the seam's shape there.",
+    )
+
+
+def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> str | None:
+    """Work and travel angle beyond their windows, and by more than what a plan's error makes of them."""
+    R = sample.X_BT.rotation().matrix()
+    margin = math.radians(5.0)
+    travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0))
+    work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.work_angle_rad
+    for name, angle, limit in (
+        ("travel", travel, config.windows.travel_rad),
+        ("work", work, config.windows.work_rad),
+    ):
+        if abs(angle) > limit + margin:
+            return (
+                f"The {name} angle is {math.degrees(angle):.1f} deg, beyond its window of {math.degrees(limit):.0f} deg; "
+                "check the plan's surface."
+            )
+    return None
+
+
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
     """The tip's wanted lateral and upward speed, m/s: by feel in TRACK, by the moved plan in COAST and FINISH."""
     if state.phase == Phase.TRACK:
         # A frame later than two periods says where the tip was, not where it is: its correction fades out.
         fresh = clip(2.0 - (sample.time - state.frame_time) / 0.1, 0.0, 1.0)
-        lateral = config.k_p * (config.delta_d_m - state.delta_n)
+        seek = config.delta_d_m if state.delta_wanted is None else state.delta_wanted
+        lateral = config.k_p * (seek - state.delta_n)
+        if state.sunk:
+            return fresh * lateral, 0.0
         return fresh * lateral, fresh * config.k_z * (state.delta_axial - config.axial_d_m)
     wanted = (
         state.residual_at_loss + np.array((0.0, -config.contact.hover_m)) if state.phase == Phase.COAST else state.hold
@@ -243,13 +322,13 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
     )
     u_n = clip(clip(lateral, -top, top), state.u_n - step, state.u_n + step)
     u_a = clip(clip(upward, -top, top), state.u_a - step, state.u_a + step)
-    return replace(state, u_n=u_n, u_a=u_a)
+    return changed(state, u_n=u_n, u_a=u_a)
 
 
 def _rest(state: WeldingState, sample: ServoSample, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
     """DONE and FAULT: the last motion fades to nothing; the arc is already off."""
     share = clip(1.0 - (sample.time - state.stopped_at) / config.ramp_s, 0.0, 1.0)
-    return _answer(replace(state, torch_on=False), share * state.V_stop, config, Diagnostics())
+    return _answer(changed(state, torch_on=False), share * state.V_stop, config, Diagnostics())
 
 
 def _answer(
@@ -260,7 +339,7 @@ def _answer(
         state = _fault(state, now, "The welding law gave no number here; this is a defect, report it with a recording.")
         V = state.V_stop
     measurement = state.measurement
-    diagnostics = replace(
+    diagnostics = changed(
         diagnostics,
         delta_n=state.delta_n,
         delta_axial=state.delta_axial,
@@ -270,5 +349,5 @@ def _answer(
         gain=state.gain,
         n_points=len(state.refined),
     )
-    state = replace(state, V=V)
+    state = changed(state, V=V)
     return state, WeldingCommand(V, state.torch_on, state.phase, state.reason, diagnostics)

@@ -11,9 +11,11 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
+from weldcal.welding.feasibility import SeamWindows
 from weldcal.welding.plan_fit import PlanFit, PlanFitConfig
 from weldcal.welding.refinement import RefinedSeam, RefinementConfig
 from weldcal.welding.vectors import Array
+from weldcal.welding.weave import WeaveConfig
 
 
 class ServoConfigError(InputError):
@@ -65,6 +67,8 @@ class TouchConfig:
         settle_s: pause on the face before the search.
         calibrate_gain: press to `press_ratio` times the wanted deflection and back, and fit the tag's gain.
         press_m_s: speed of that; gain_sigma: prior sigma of the gain about 1.
+        zero_frames: frames of the free tip, before the descent, whose mean is taken for its rest (0: the tag's own rest
+            pose is); zero_limit_m: a larger mean, or as large a spread, is no free tip.
     """
 
     arc_m: float = 6.0e-3
@@ -81,6 +85,8 @@ class TouchConfig:
     press_ratio: float = 1.6
     press_m_s: float = 1.0e-3
     gain_sigma: float = 0.06
+    zero_frames: int = 0
+    zero_limit_m: float = 1.0e-3
 
 
 @dataclass(frozen=True)
@@ -91,7 +97,7 @@ class ContactConfig:
         normal_min_m, axial_min_m: below either, contact is lost; drop_m: so it is when both fall by this in a
             frame.
         regain_axial_m: axial deflection that shows the groove again; regain_frames: for so many frames,
-            regain_after_m: this far past the loss at the earliest.
+            regain_after_m, regain_after_s: this far past the loss, and this long after it, at the earliest.
         limit_lateral_m, limit_axial_m: mechanical limits of the tip.
         hidden_s: tag not seen for this long stops the weld.
         coast_m: longest gap; hover_m: how far below its seat the free tip hangs while crossing one.
@@ -104,6 +110,7 @@ class ContactConfig:
     regain_axial_m: float = 0.2e-3
     regain_frames: int = 2
     regain_after_m: float = 1.0e-3
+    regain_after_s: float = 0.12
     limit_lateral_m: float = 5.0e-3
     limit_axial_m: float = 6.5e-3
     hidden_s: float = 0.3
@@ -127,10 +134,17 @@ class ServoConfig:
         tip_acceleration_m_s2, omega_acceleration_rad_s2: rate limits.
         turn_rate_max_rad_s: tip speed is at most this times the seam's radius; tip_speed_floor: but not under this
             share of the weld speed.
-        weight_*: of the torch's lateral equation, its speed, the tip's speed; steering_*, drag_m: where the
-            deformation, less what friction drags the tip back, overrules the plan's normal, and by when fully.
+        weight_*: of the torch's lateral equation, its speed, the tip's speed.
+        steering_*, drag_m: where the deformation, less what friction drags the tip back, overrules the plan's normal, and
+            by when fully; steering_reach_m: how far ahead or behind the plan may be at a corner.
+        felt_length_m, felt_points, felt_dead_rad, felt_full_rad: length and number of last points whose direction
+            overrules the plan's tangent, from which difference on, and by when fully.
+        creep: share of the weld speed that a tip square to the chord keeps; give_back_m_s, give_back_m: how fast and far
+            it may go back where the chord is past square to the torch's way.
+        lag_s: between command and motion of the robot; the torch's equations look that far ahead.
+        stall_s: a torch that comes on by less than half a millimetre in this time stops the weld.
         ignition_error_m, torch_error_max_m: the arc starts only this close to the seam; farther than that it faults.
-        ramp_s: how long a stop takes; period_s: servo tick.
+        ramp_s: how long a stop takes; period_s: servo tick; law: a name of welding.laws, for comparison.
     """
 
     tool: ToolGeometry = field(default_factory=ToolGeometry)
@@ -138,14 +152,16 @@ class ServoConfig:
     contact: ContactConfig = field(default_factory=ContactConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     plan_fit: PlanFitConfig = field(default_factory=PlanFitConfig)
+    windows: SeamWindows = field(default_factory=SeamWindows)
+    weave: WeaveConfig = field(default_factory=WeaveConfig)
     weld_speed_m_s: float = 8.0e-3
     delta_d_m: float = 2.0e-3
     axial_d_m: float = 3.0e-3
     k_p: float = 5.0
     k_z: float = 5.0
     servo_speed_m_s: float = 6.0e-3
-    servo_slew_m_s2: float = 60.0e-3
-    k_b: float = 2.5
+    servo_slew_m_s2: float = 40.0e-3
+    k_b: float = 4.0
     k_h: float = 2.5
     feedback_limit_m: float = 1.5e-3
     k_roll: float = 2.0
@@ -165,10 +181,21 @@ class ServoConfig:
     steering_dead_rad: float = math.radians(20.0)
     steering_full_rad: float = math.radians(40.0)
     drag_m: float = 1.0e-3
+    steering_reach_m: float = 8.0e-3
+    felt_length_m: float = 1.6e-3
+    felt_points: int = 5
+    felt_dead_rad: float = math.radians(15.0)
+    felt_full_rad: float = math.radians(30.0)
+    creep: float = 0.4
+    give_back_m_s: float = 2.0e-3
+    give_back_m: float = 1.5e-3
+    stall_s: float = 4.0
+    lag_s: float = 0.025
     ignition_error_m: float = 1.5e-3
     torch_error_max_m: float = 4.0e-3
     ramp_s: float = 0.15
     period_s: float = 0.008
+    law: str = "guarded"
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -177,6 +204,8 @@ class ServoConfig:
                 continue
             if not (math.isfinite(value) and value > 0.0):
                 raise ServoConfigError(f"The servo setting '{name}' must be a positive number, not {value}.")
+        if self.weave.peak_speed_m_s > 0.7 * self.omega_max_rad_s * self.tool.torch_offset_m:
+            raise ServoConfigError("The weave asks for more turning than the limit leaves; make it slower or smaller.")
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")
 
@@ -274,7 +303,7 @@ class GainFit(NamedTuple):
 
 @dataclass(frozen=True)
 class TouchState:
-    """Where the search is: its step, the step's start, heights and lateral place."""
+    """Where the search is: its step, the step's start, heights and lateral place; `free`: deflections of the free tip."""
 
     step: str = "descend"
     since: float = 0.0
@@ -282,6 +311,7 @@ class TouchState:
     start_left: float = math.nan
     seated_frames: int = 0
     gain_fit: GainFit = field(default_factory=GainFit)
+    free: tuple[Array, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -296,28 +326,36 @@ class WeldingState:
     refined: RefinedSeam = field(default_factory=RefinedSeam.empty)
     touch: TouchState = field(default_factory=TouchState)
     gain: float = 1.0
+    zero: Array | None = None
     measurement: Measurement | None = None
     frame_time: float = -math.inf
     delta_n: float = 0.0
     delta_axial: float = 0.0
+    delta_wanted: float | None = None
+    sunk: bool = False
     regained: int = 0
     proven: bool = False
     progress: float = 0.0
+    furthest: float = -math.inf
     progress_log: tuple[tuple[float, float], ...] = ()
     s_tip: float = 0.0
     s_torch: float = 0.0
     torch_arc: float = 0.0
     residual: Array = field(default_factory=lambda: np.zeros(2))
+    felt: float = 0.0
     steer: float = 0.0
     v_tip: float = 0.0
     omega: float = 0.0
     u_n: float = 0.0
     u_a: float = 0.0
     lost_at: float = math.nan
+    lost_time: float = -math.inf
     hold: Array = field(default_factory=lambda: np.zeros(2))
     residual_at_loss: Array = field(default_factory=lambda: np.zeros(2))
     s_end: float = math.nan
+    advanced: tuple[float, float] = (0.0, -math.inf)
     torch_on: bool = False
+    lit_at: float = math.nan
     V: Array = field(default_factory=lambda: np.zeros(6))
     V_stop: Array = field(default_factory=lambda: np.zeros(6))
     stopped_at: float = 0.0

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.evolve import changed
 from weldcal.welding.seam import SeamCurve, SeamFrame
 from weldcal.welding.servo_state import GainFit, ServoConfig, ServoSample, WeldingState
 from weldcal.welding.vectors import clip, dot, pose, unit
@@ -54,6 +55,9 @@ def touch_step(
         return state, 0.0, 0.0, "Seam not found: the tip met no work; check the plan's height.", False
 
     if t.step == "descend":
+        if state.zero is None and touch.zero_frames > 0:
+            state, problem = _zeroed(state, sample, is_new, config)
+            return state, 0.0, 0.0, problem, False
         fast = height > config.tool.tip_drop_m + touch.slow_height_m and deep < 0.3 * config.axial_d_m
         speed = touch.fast_m_s if fast else touch.slow_m_s
         if is_new and deep > 0.9 * config.axial_d_m:
@@ -66,11 +70,29 @@ def touch_step(
         if sample.time - t.since < touch.settle_s:
             return state, 0.0, depth_servo, None, False
         t = replace(t, step="search", since=sample.time, face_height=tip_height, start_left=left)
-        return replace(state, touch=t), 0.0, depth_servo, None, False
+        return changed(state, touch=t), 0.0, depth_servo, None, False
 
     if t.step == "search":
         return _search(state, is_new, left, tip_height, depth_servo, config, sample.time)
     return _press(state, sample, is_new, left, seam, config)
+
+
+def _zeroed(
+    state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
+) -> tuple[WeldingState, str | None]:
+    """What the tag reads while the tip hangs free is its zero: the rendered or printed tag's own bias goes with it."""
+    touch, t = config.touch, state.touch
+    if not is_new or sample.deflection is None:
+        return state, None
+    free = (*t.free, np.asarray(sample.deflection.deflection_T, dtype=float))
+    if len(free) < touch.zero_frames:
+        return changed(state, touch=replace(t, free=free)), None
+    readings = np.array(free)
+    zero = readings.mean(axis=0)
+    if max(float(np.abs(zero).max()), float(np.ptp(readings, axis=0).max())) > touch.zero_limit_m:
+        text = f"The tip is not free before touch-on: it reads {1e3 * float(np.linalg.norm(zero)):.1f} mm; raise the start pose."
+        return state, text
+    return changed(state, zero=zero, touch=replace(t, free=())), None
 
 
 def _search(
@@ -91,7 +113,7 @@ def _search(
         pressed = abs(state.delta_axial - config.axial_d_m) < 0.25 * config.axial_d_m
         frames = frames + 1 if leaning and (pressed or not dropped) else 0
         t = replace(t, seated_frames=frames)
-        state = replace(state, touch=t)
+        state = changed(state, touch=t)
     if dropped and frames >= _SEATED_FRAMES:
         if not touch.calibrate_gain:
             return state, 0.0, depth_servo, None, True
@@ -125,14 +147,14 @@ def _press(
     if is_new and state.measurement is not None and state.measurement.capture_time >= t.since - 1.0:
         x = dot(state.measurement.p_BT - seam.position, seam.normal)
         t = replace(t, gain_fit=_add(t.gain_fit, x, state.delta_n))
-        state = replace(state, touch=t)
+        state = changed(state, touch=t)
     target = t.start_left + sign * (touch.press_ratio - 1.0) * config.delta_d_m
     gap = target - left
     if abs(gap) > 0.05e-3:
         return state, clip(config.k_p * gap, -touch.press_m_s, touch.press_m_s), 0.0, None, False
     if following:
         return _next(state, following, sample.time, t.start_left), 0.0, 0.0, None, False
-    return replace(state, gain=_gain(t.gain_fit, config)), 0.0, 0.0, None, True
+    return changed(state, gain=_gain(t.gain_fit, config)), 0.0, 0.0, None, True
 
 
 def _add(fit: GainFit, x: float, y: float) -> GainFit:
@@ -150,4 +172,4 @@ def _gain(fit: GainFit, config: ServoConfig) -> float:
 
 def _next(state: WeldingState, step: str, now: float, left: float | None = None) -> WeldingState:
     t = replace(state.touch, step=step, since=now, seated_frames=0)
-    return replace(state, touch=t if left is None else replace(t, start_left=left))
+    return changed(state, touch=t if left is None else replace(t, start_left=left))

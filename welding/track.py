@@ -11,16 +11,20 @@ from pydrake.math import RigidTransform
 
 from weldcal.welding.guard import SeamConditioning, seam_conditioning
 from weldcal.welding.lsq import box_least_squares
-from weldcal.welding.refinement import local_fit
+from weldcal.welding.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.seam import SeamCurve, SeamFrame
 from weldcal.welding.servo_state import ServoConfig, WeldingState
 from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
-_EDGE_POINTS = 20  # points on a gap's side: 5 mm at the nominal speed and frame rate
+_SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
+_CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no point: too late to be confirmed
+_BEND_OVER_M = 10.0e-3
+_EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
 
 class TorchTarget(NamedTuple):
-    """Where the torch should be: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m."""
+    """Where the torch should be: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m;
+    `bend`: of the path to the left, 1/m; `rate`: how fast it is to swing to the left, m/s."""
 
     point: Array
     tangent: Array
@@ -29,6 +33,8 @@ class TorchTarget(NamedTuple):
     arc: float
     s: float
     residual: Array
+    bend: float = 0.0
+    rate: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -66,13 +72,13 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
             off = fit.point - here.position
             residual = np.array((dot(off, here.normal), dot(off, here.up)))
             if inside != arc:
-                fit = None
+                fit = _carried_on(seam, fit, inside, arc, plan, config) if arc > last else None
         else:
             # The change is spread over the path, so that the torch is not asked to step.
             step = 0.05 * abs(s - state.s_torch)
             residual = state.residual + np.clip(_bridged(state, curve, arc, s) - state.residual, -step, step)
     if fit is None:
-        t, up = plan.tangent, plan.up
+        t, up, bend = plan.tangent, plan.up, plan.curvature
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
@@ -80,9 +86,41 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         up = unit(plan.up - dot(plan.up, t) * t, plan.up)
         step = dot(p_BW - on_path, t) / fit.speed
     n = cross(up, t)
+    if fit is not None:
+        bend = dot(fit.bend, n) / fit.speed**2
+        reach = config.weld_speed_m_s * config.lag_s
+        ahead_of = (
+            local_fit(seam, arc + reach, plan.tangent, 1.0 / max(abs(plan.curvature), 1e-6), config.refinement)
+            if abs(plan.curvature) > _SHARP_PER_M
+            else None
+        )
+        if ahead_of is not None:
+            # Round a sharp corner the bend here says little of the path a moment later.
+            bend = math.asin(clip(dot(ahead_of.tangent, n), -1.0, 1.0)) / reach
+    if config.clearance_m:
+        # Where the surface twists along the seam, a line above or below it heads a little to the side.
+        h = 2.0e-3
+        twist = dot(curve.frame(s + h).up - curve.frame(s - h).up, n) / (2.0 * h)
+        t = unit(t + config.clearance_m * twist * n, t)
+        n = cross(up, t)
     point = on_path + config.clearance_m * up + tool.side_offset_m * n
     ahead = dot(p_BW - point, t)
-    return TorchTarget(point + ahead * t, t, n, up, arc + clip(step, -2e-3, 2e-3), s, residual)
+    return TorchTarget(point + ahead * t, t, n, up, arc + clip(step, -2e-3, 2e-3), s, residual, bend)
+
+
+def _carried_on(
+    seam: RefinedSeam, fit: LocalFit, inside: float, arc: float, plan: SeamFrame, config: ServoConfig
+) -> LocalFit | None:
+    """The path a little past the last point, bending as the points before it do; None farther on, where the plan leads."""
+    ahead = arc - inside
+    if ahead > _CARRY_M:
+        return None
+    before = local_fit(seam, inside - _BEND_OVER_M, plan.tangent, 1.0, config.refinement)
+    bend = np.zeros(3) if before is None else (fit.tangent - before.tangent) / _BEND_OVER_M
+    if norm(bend) > 0.5 / _BEND_OVER_M:
+        return None
+    tangent = unit(fit.tangent + ahead * bend, fit.tangent)
+    return LocalFit(fit.point + ahead * fit.tangent + 0.5 * ahead**2 * bend, tangent, bend, 1.0, fit.effective)
 
 
 def _nearest_point(arcs: Array, arc: float) -> float:
@@ -119,14 +157,6 @@ def _bridged(state: WeldingState, curve: SeamCurve, arc: float, s: float) -> Arr
     return np.asarray(y0 + rise * (y1 - y0) + width * (leave * m0 + meet * m1))
 
 
-def tip_frame(seam: SeamFrame, steer: float) -> SeamFrame:
-    """The seam's frame at the tip, turned about its up by `steer` rad."""
-    if steer == 0.0:
-        return seam
-    c, s = math.cos(steer), math.sin(steer)
-    return seam._replace(tangent=c * seam.tangent + s * seam.normal, normal=c * seam.normal - s * seam.tangent)
-
-
 def guarded_motion(
     state: WeldingState,
     X_BT: RigidTransform,
@@ -157,8 +187,14 @@ def guarded_motion(
     t, n, b = target.tangent, target.normal, target.up
     e = p_BT - chord - target.point
     limit = config.feedback_limit_m
-    back_n = -config.k_b * clip(dot(e, n), -limit, limit)
+    back_n = target.rate - config.k_b * clip(dot(e, n), -limit, limit)
     back_b = -config.k_h * clip(dot(e, b), -limit, limit)
+
+    # What is commanded now is done a robot's lag later: the rows look that far ahead along the path.
+    turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.3, 0.3)
+    t, n = math.cos(turn) * t + math.sin(turn) * n, math.cos(turn) * n - math.sin(turn) * t
+    swing = clip(state.omega * config.lag_s, -0.1, 0.1)
+    m_then = math.cos(swing) * m - math.sin(swing) * u
 
     # V_W = v t_s + V_0 - d w m + d w_p a. The height row gives w_p; putting it in leaves x -> x - (x.b)/(a.b) a.
     ab = dot(a, b)
@@ -166,16 +202,24 @@ def guarded_motion(
     tb = tip.tangent
     base = servo[0] * tip.normal + servo[1] * tip.up
     lean_n, lean_t = dot(a, n) / ab, dot(a, t) / ab
-    up_v, up_w, up_0 = dot(tb, b), -d * dot(m, b), dot(base, b) - back_b
-    n_v, n_w = dot(tb, n) - up_v * lean_n, -d * dot(m, n) - up_w * lean_n
-    t_v, t_w = dot(tb, t) - up_v * lean_t, -d * dot(m, t) - up_w * lean_t
+    up_v, up_w, up_0 = dot(tb, b), -d * dot(m_then, b), dot(base, b) - back_b
+    n_v, n_w = dot(tb, n) - up_v * lean_n, -d * dot(m_then, n) - up_w * lean_n
+    t_v, t_w = dot(tb, t) - up_v * lean_t, -d * dot(m_then, t) - up_w * lean_t
     n_0, t_0 = dot(base, n) - up_0 * lean_n, dot(base, t) - up_0 * lean_t
 
     speed = config.weld_speed_m_s
     radius = 1.0 / max(abs(tip.curvature), 1e-6)
     top = min(config.tip_speed_max_m_s, max(config.tip_speed_floor * speed, config.turn_rate_max_rad_s * radius))
     dv, dw, w_top = config.tip_acceleration_m_s2 * dt, config.omega_acceleration_rad_s2 * dt, config.omega_max_rad_s
-    v_low = max(0.0, state.v_tip - dv)
+    # Where the tip would have to move square to the torch's way, or against it, speed at the torch is no reason to
+    # stand: the tip creeps round, and the torch waits.
+    creep = config.creep * speed * clip(1.0 - 10.0 * dot(tb, u), 0.0, 1.0)
+    # Chord just past square to the torch's way: the rest point may give back a little, within what friction holds.
+    given_back = state.furthest - state.progress
+    least = (
+        creep if creep > 0.0 else -config.give_back_m_s * clip(2.0 - 2.0 * given_back / config.give_back_m, 0.0, 1.0)
+    )
+    v_low = min(max(least, state.v_tip - dv), state.v_tip + dv)
     v_high = max(v_low, min(top, state.v_tip + dv))
     w_low, w_high = max(-w_top, state.omega - dw), min(w_top, state.omega + dw)
     v, w = box_least_squares(
@@ -192,7 +236,7 @@ def guarded_motion(
 
     # Roll about the level chord goes to the work angle; what yaw about a tilted tool axis adds to it is taken off.
     level = unit(u - dot(u, up) * up, u)
-    lean = math.asin(clip(dot(R[:, 1], up), -1.0, 1.0)) - config.work_angle_rad
+    lean = math.asin(clip(dot(R[:, 1], b), -1.0, 1.0)) - config.work_angle_rad
     roll = clip(-config.k_roll * lean, -0.3, 0.3)
     w_r = clip((roll - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
     V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])

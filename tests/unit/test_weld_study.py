@@ -1,0 +1,177 @@
+"""The study in short: one weld of each kind holds its target, and the command writes what it promises."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from weldcal.tools.studies.budgets import HARD, NOMINAL, PERFECT, planned_seam, roughness
+from weldcal.tools.studies.cli_reproduce import reproduce
+from weldcal.tools.studies.groove import DROP_M, SEAT_M, Groove, Tip, floor
+from weldcal.tools.studies.metrics import RunMetrics
+from weldcal.tools.studies.seams import NAMES, UnknownSeam, get_seam
+from weldcal.tools.studies.turns import run_turn
+from weldcal.tools.studies.weld_rows import ROWS, Case, Target, UnknownRow, get_rows
+from weldcal.tools.studies.weld_study import CaseResult, hold_against, run_case
+from weldcal.welding.process import path_error
+from weldcal.welding.seam import SeamCurve
+
+MM = 1e-3
+TARGETS = {row.key: row for row in ROWS}
+
+
+def holds(key: str, case: Case, seed: int = 0) -> RunMetrics:
+    """One weld against the targets of its row."""
+    _, figures = run_case(case, seed)
+    assert figures.completed, figures.reason
+    for target in TARGETS[key].targets:
+        assert getattr(figures, target.figure) <= target.limit, target.figure
+    return figures
+
+
+@pytest.mark.parametrize("seam", ["s_r60", "l_r20_concave"])
+def test_a_gentle_seam_holds_the_nominal_targets(seam: str) -> None:
+    holds("nominal", Case(seam), 1)
+
+
+def test_the_hard_budget_holds_its_targets() -> None:
+    holds("hard", Case("s_r60", "hard"))
+
+
+def test_a_sharp_convex_corner_is_put_back_from_its_sides() -> None:
+    holds("r1_convex", Case("l_r1_convex"))
+
+
+def test_a_sharp_concave_corner_is_welded_in_the_hard_budget() -> None:
+    holds("hard_corners", Case("l_r1_concave", "hard"), 2)
+
+
+def test_a_gap_of_ten_millimetres_hardly_shows() -> None:
+    holds("gap_10", Case("s_r60", gaps=((0.145, 0.155),)))
+
+
+def test_a_fast_weld_holds_its_target() -> None:
+    holds("speed_24", Case("l_r20_convex", speed_m_s=0.024))
+
+
+def test_on_a_cylinder_work_and_travel_angle_are_as_foretold() -> None:
+    figures = holds_space(Case("s_r60_on_r150", "kinematic"))
+    # asin(d/2R) of the line that rest point and torch run on, R 150 mm raised by the seat, less 3 mm, on the part of it
+    # that is crossed square to the axis.
+    assert figures.travel_deg == pytest.approx(
+        math.degrees(math.asin(0.060 / (2.0 * (0.150 + SEAT_M - 3.0 * MM)))), abs=0.15
+    )
+
+
+def holds_space(case: Case) -> RunMetrics:
+    _, figures = run_case(case, 0)
+    assert figures.completed
+    assert figures.mean_mm <= 0.03
+    assert figures.work_deg <= 3.0
+    return figures
+
+
+def test_a_turn_no_torch_can_follow_is_refused_and_welded_in_pieces() -> None:
+    turn = run_turn("u_r20", 0.060, 0)
+    assert not turn.possible
+    assert turn.refused
+    assert turn.named
+    assert turn.pieces_done == len(turn.splits_mm) + 1 == 2
+    # The split is in the middle of the half circle: 120 mm and a quarter of 2 pi 20 mm along.
+    assert turn.splits_mm[0] == pytest.approx(120.0 + 0.5 * math.pi * 20.0, abs=3.0)
+
+
+def test_figures_that_a_run_lacks_count_as_missed() -> None:
+    case = Case("straight")
+    good, broken = RunMetrics(True, "DONE", "", 300.0, max_mm=0.1), RunMetrics(False, "FAULT", "why", 20.0)
+    target = Target("max_mm", 0.15)
+    assert hold_against(target, [CaseResult(case, (0,), (good,))]).met
+    both = hold_against(target, [CaseResult(case, (0, 1), (good, broken))])
+    assert not both.met
+    assert both.worst_run.endswith("seed 1")
+    mean = hold_against(Target("max_mm", 0.15, "mean"), [CaseResult(case, (0, 1), (good, good))])
+    assert mean.value == pytest.approx(0.1)
+
+
+def test_rows_and_seams_are_named_when_unknown() -> None:
+    with pytest.raises(UnknownRow, match="nominal"):
+        get_rows(("nonsense",))
+    with pytest.raises(UnknownSeam, match="s_r60"):
+        get_seam("nonsense")
+    assert {case.seam for row in ROWS for case in row.cases} <= set(NAMES)
+
+
+@pytest.mark.parametrize("name", ["straight", "s_r60", "l_r20_convex", "l_r1_concave", "arc_r60_end"])
+def test_every_flat_seam_is_three_hundred_millimetres_long(name: str) -> None:
+    seam = get_seam(name)
+    assert SeamCurve.from_points(seam.points, seam.up).length == pytest.approx(0.3, abs=0.3 * MM)
+
+
+def test_a_plan_is_off_by_what_its_budget_says() -> None:
+    seam = get_seam("s_r60")
+    true = SeamCurve.from_points(seam.points, seam.up)
+    assert planned_seam(seam, PERFECT, np.random.default_rng(0)).length == pytest.approx(true.length, abs=1e-9)
+    off = [path_error(planned_seam(seam, b, np.random.default_rng(k)).position(np.linspace(0.01, 0.29, 60)), true).max_m
+           for b in (NOMINAL, HARD) for k in range(6)]  # fmt: skip
+    # Shift, bend, half a degree over 150 mm, noise: at most their sum, and hardly ever under a fifth of it.
+    assert max(off[:6]) <= 2.0 * MM + 0.5 * MM + 1.31 * MM + 1.0 * MM
+    assert max(off[6:]) <= 3.0 * MM + 1.0 * MM + 1.31 * MM + 1.5 * MM
+    assert min(off) >= 0.5 * MM
+
+
+def test_the_walls_roughness_has_its_sigma_and_its_length() -> None:
+    rough = roughness(20.0, HARD, np.random.default_rng(0))
+    assert rough.std() == pytest.approx(0.1 * MM, rel=1e-6)
+    lag = round(2.0 * MM / 0.25e-3)
+    # exp(-(x/L)^2) at x = L; 10,000 lengths leave a hundredth.
+    assert np.mean(rough[lag:] * rough[:-lag]) / rough.var() == pytest.approx(math.exp(-1.0), abs=0.05)
+
+
+def test_the_tip_sits_in_the_groove_lags_by_friction_and_relaxes_beyond_the_end() -> None:
+    line = SeamCurve.from_points(get_seam("straight").points).raised(SEAT_M)
+    pressed = np.array([0.1, 1.0 * MM, SEAT_M - 3.0 * MM])
+    tip = Tip(pressed, Groove(line, friction=0.2))
+    for k in range(300):
+        centre = tip.step(pressed + np.array([1e-4 * k, 0.0, 0.0]), 0.008)
+    np.testing.assert_allclose(centre[1:], [0.0, SEAT_M], atol=1e-9)
+    # It drags behind by mu F / (k sin b): F = 0.9 N of the axial spring, k = 600 N/m.
+    assert 0.1 + 1e-4 * 299 - centre[0] == pytest.approx(0.2 * 0.9 / math.sin(math.radians(22.5)) / 600.0, rel=1e-3)
+    beyond = np.array([0.32, 1.0 * MM, SEAT_M - 3.0 * MM])
+    free = Tip(beyond, Groove(line))
+    for _ in range(100):
+        centre = free.step(beyond, 0.008)
+    np.testing.assert_allclose(centre, beyond, atol=1e-6)
+    assert floor(0.0) == (0.0, pytest.approx(1.0 / math.tan(math.radians(22.5))))
+    assert floor(20.0 * MM) == (DROP_M, 0.0)
+
+
+def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    answer = CliRunner().invoke(reproduce, ["weld", "--rows", "r5", "--seeds", "1", "--out", str(out), "--json"])
+    assert answer.exit_code == 0, answer.output
+    told = json.loads(answer.stdout.strip().splitlines()[-1])
+    written = json.loads((out / "table.json").read_text())
+    assert told["rows"]["r5"]["completed"] == 2
+    assert written["rows"]["r5"]["figures"]["max_mm"]["target"] == 0.35
+    with (out / "runs.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["case"] for row in rows] == ["l_r5_convex-d60-nominal", "l_r5_concave-d60-nominal"]
+    assert max(float(row["max_mm"]) for row in rows) == pytest.approx(told["rows"]["r5"]["figures"]["max_mm"]["worst"])
+    with (out / "runs" / "l_r5_convex-d60-nominal.csv").open() as file:
+        ticks = list(csv.DictReader(file))
+    assert {tick["phase"] for tick in ticks} == {"TOUCH", "TRACK", "FINISH", "DONE"}
+    report = (out / "report.html").read_text()
+    assert "Corner of 5 mm, convex" in report
+    assert report.count("data:image/svg+xml") == 4
+
+
+def test_an_unknown_row_is_one_sentence_and_exit_code_one(tmp_path: Path) -> None:
+    answer = CliRunner().invoke(reproduce, ["weld", "--rows", "nonsense", "--out", str(tmp_path / "x")])
+    assert answer.exit_code == 1
+    assert "Unknown row 'nonsense'" in answer.stderr

@@ -1,0 +1,149 @@
+"""The steering laws by name: the paper's as printed and as mended step by step, and the guarded one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.welding.chord import UnknownLaw
+from weldcal.welding.guard import seam_conditioning
+from weldcal.welding.refinement import RefinedSeam
+from weldcal.welding.seam import SeamFrame
+from weldcal.welding.servo_state import ServoConfig, WeldingState
+from weldcal.welding.track import Motion, TorchTarget, guarded_motion
+from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
+
+_OMEGA_CEILING = 100.0  # rad/s; an unguarded law asks for thousands, no robot turns by more than this in a tick
+
+MotionLaw = Callable[
+    [WeldingState, RigidTransform, SeamFrame, TorchTarget, tuple[float, float], ServoConfig, float], Motion
+]
+
+
+@dataclass(frozen=True)
+class SteeringLaw:
+    """One law of the comparison.
+
+    Attributes:
+        name: as in ServoConfig.law; words: what it is, for tables.
+        guarded: ours, with its phases; the paper's knows no gap and no end.
+        sign: of omega; -1 as printed. fitted: normal from a local fit, else from the two points beside the nearest.
+        feedback: whether the torch's offset is fed back.
+        damping: of the division by n_d . n_t (0: as printed); omega_limit: clip, rad/s.
+        lost: what the deformation servo does without contact: keep seeking delta_d, or zero it (Section 3.3).
+    """
+
+    name: str
+    words: str
+    guarded: bool = False
+    sign: float = 1.0
+    fitted: bool = True
+    feedback: bool = True
+    damping: float = 0.0
+    omega_limit: float = _OMEGA_CEILING
+    lost: Literal["kept", "zeroed"] = "kept"
+
+
+LAWS: dict[str, SteeringLaw] = {
+    law.name: law
+    for law in (
+        SteeringLaw("guarded", "ours: torch speed first, box-constrained, guarded phases", guarded=True),
+        SteeringLaw("printed", "Algorithm 2 as printed", sign=-1.0, feedback=False),
+        SteeringLaw("literal", "sign mended, normal from neighbouring points", fitted=False, feedback=False),
+        SteeringLaw("open", "sign mended, fitted normal, no feedback", feedback=False),
+        SteeringLaw("fixed", "sign mended, fitted normal, torch position fed back"),
+        SteeringLaw("fixed_zeroed", "the same; delta_d goes to zero where contact does", lost="zeroed"),
+        SteeringLaw("dls", "the same, division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8),
+    )
+}
+
+
+def get_law(name: str) -> SteeringLaw:
+    """The law of that name.
+
+    Raises:
+        UnknownLaw: naming the known ones.
+    """
+    if name not in LAWS:
+        raise UnknownLaw(f"Unknown steering law '{name}'; use one of {', '.join(LAWS)}.")
+    return LAWS[name]
+
+
+def motion_law(law: SteeringLaw) -> MotionLaw:
+    """What turns a tick's target into motion under a law."""
+    if law.guarded:
+        return guarded_motion
+
+    def paper(
+        state: WeldingState,
+        X_BT: RigidTransform,
+        tip: SeamFrame,
+        target: TorchTarget,
+        servo: tuple[float, float],
+        config: ServoConfig,
+        dt: float,
+    ) -> Motion:
+        del dt  # the published law bounds no rate
+        return paper_motion(law, state, X_BT, tip, target, servo, config)
+
+    return paper
+
+
+def paper_motion(
+    law: SteeringLaw,
+    state: WeldingState,
+    X_BT: RigidTransform,
+    tip: SeamFrame,
+    target: TorchTarget,
+    servo: tuple[float, float],
+    config: ServoConfig,
+) -> Motion:
+    """Algorithm 2, lines 8-14: V_r = V_const t + servo, omega from V_t . n_t = 0 (weld_law.md, section 2).
+
+    The paper is planar; as in the guarded law, pitch keeps the torch's height and roll the work angle.
+    """
+    R = X_BT.rotation().matrix()
+    p_BT = X_BT.translation()
+    chord = -(R @ config.p_TW)
+    d = norm(chord)
+    u = chord / d
+    up = unit(tip.up + target.up, tip.up)
+    m = unit(cross(up, u), R[:, 1])  # the paper's n_d
+    a = cross(u, m)
+    n, t = target.normal, target.tangent
+    if not law.fitted:
+        t = literal_tangent(state.refined, p_BT - chord, target.tangent)
+        n = unit(cross(target.up, t), target.normal)
+    v = config.weld_speed_m_s
+    V_tip = v * tip.tangent + servo[0] * tip.normal + servo[1] * tip.up
+    e = p_BT - chord - target.point
+    back = config.k_b * dot(e, n) if law.feedback else 0.0
+    c = dot(m, n)
+    wanted = law.sign * dot(V_tip, n) + back
+    slope = c / (c * c + law.damping**2) if law.damping else 1.0 / math.copysign(max(abs(c), 1e-9), c)
+    omega = clip(wanted * slope / d, -law.omega_limit, law.omega_limit)
+
+    b = target.up
+    ab = dot(a, b)
+    ab = math.copysign(max(abs(ab), 0.2), ab)
+    flat = V_tip - d * omega * m
+    w_p = -(dot(flat, b) + config.k_h * clip(dot(e, b), -config.feedback_limit_m, config.feedback_limit_m)) / (d * ab)
+    w_p = clip(w_p, -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
+    lean = math.asin(clip(dot(R[:, 1], b), -1.0, 1.0)) - config.work_angle_rad
+    roll = clip(-config.k_roll * lean, -0.3, 0.3)
+    V = np.concatenate([omega * a + w_p * m + roll * u, V_tip])
+    return Motion(V, v, dot(flat, t), omega, seam_conditioning(u, tip.tangent, t))
+
+
+def literal_tangent(seam: RefinedSeam, p_torch: Array, otherwise: Array) -> Array:
+    """Line 10 taken literally: direction (3,) between the two points beside the one nearest to the torch."""
+    if len(seam) < 3:
+        return otherwise
+    i = int(np.argmin(np.sum((seam.points - p_torch) ** 2, axis=1)))
+    i = min(max(i, 1), len(seam) - 2)
+    return unit(seam.points[i + 1] - seam.points[i - 1], otherwise)
