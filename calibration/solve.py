@@ -12,7 +12,7 @@ from scipy.special import gammaincinv
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.observability import check_diversity, unobservable_sentences
 from weldcal.calibration.observation import Observation
-from weldcal.calibration.rigid import exp_rotation, fit_rigid, fit_rotation, skew
+from weldcal.calibration.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -197,18 +197,15 @@ def _robust_start(data: _Data, config: SolveConfig) -> RigidTransform:
         sets = sets[(sets[:, 0] < sets[:, 1]) & (sets[:, 1] < sets[:, 2])]
     else:
         sets = np.array([rng.choice(n, 3, replace=False) for _ in range(config.hypotheses)])
-    candidates: list[tuple[float, RigidTransform]] = []
-    for s in sets:
-        try:
-            X = fit_rigid(data.b[s], data.c[s])
-        except ValueError:
-            continue
-        candidates.append((_trimmed(data, X, h), X))
-    if not candidates:
+    R, t = fit_rigid_sets(data.b[sets], data.c[sets])
+    if len(R) == 0:
         return _closed_form(data)
-    candidates.sort(key=lambda item: item[0])
+    square = ((np.einsum("kij,nj->kni", R, data.c) + t[:, None] - data.b) ** 2).sum(axis=2)
+    costs = np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1)
+    order = np.argsort(costs, kind="stable")[:15]
+    candidates = [(float(costs[k]), RigidTransform(RotationMatrix.ProjectToRotationMatrix(R[k]), t[k])) for k in order]
     best = candidates[0]
-    for cost, X in candidates[:15]:
+    for cost, X in candidates:
         for _ in range(6):
             nearest = np.argsort(_residuals(data, X)[0], kind="stable")[:h]
             try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,11 +11,14 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.iterative import Cost, algorithm1_start, algorithm1_step, translation_cost
 from weldcal.calibration.observation import Observation
+from weldcal.calibration.scanner_model import ScannerCorrection
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.verification import VerificationError, Verifier
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
+Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
+"""Camera pose and scanner correction from sightings."""
 
 
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
@@ -42,9 +45,11 @@ def k_fold(
     repeats: int = 10,
     seed: int = 0,
     config: SolveConfig | None = None,
+    solve: Solve | None = None,
 ) -> Array:
     """Held-out position errors (repeats, n) m, NaN where a fold could not be solved (too few or coplanar poses left).
 
+    ``solve`` replaces the plain estimate and may correct the scanner as well; it sees the poses of its fold only.
     Deterministic for ``seed``. Raises InputError when there are fewer poses than folds.
     """
     n = len(observations)
@@ -59,10 +64,12 @@ def k_fold(
             test = order[f::folds]
             train = [observations[i] for i in range(n) if i not in set(test.tolist())]
             try:
-                X = estimate_eye_on_base(train, plain).X_BC
+                X, correction = (
+                    (estimate_eye_on_base(train, plain).X_BC, ScannerCorrection()) if solve is None else solve(train)
+                )
             except InputError:
                 continue
-            errors[r, test] = position_errors(X, [observations[i] for i in test])
+            errors[r, test] = position_errors(X, [correction.observation(observations[i]) for i in test])
     return errors
 
 

@@ -15,12 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.clouds import CloudError
 from weldcal.calibration.dataset import Dataset, load_dataset
-from weldcal.calibration.errors import FlangeNotFound, TooFewPoses
-from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.flange_fit import FlangeFit
 from weldcal.calibration.observability import turn_deg
-from weldcal.calibration.observation import Observation, observation_from_fit
+from weldcal.calibration.observation import Observation
 from weldcal.calibration.result import (
     CalibrationResult,
     IcpRecord,
@@ -30,6 +29,8 @@ from weldcal.calibration.result import (
     save_result,
     software_version,
 )
+from weldcal.calibration.self_calibration import SelfCalibration, apply_self_calibration, calibrate_corrected
+from weldcal.calibration.sightings import see_flanges
 from weldcal.calibration.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import (
     Algorithm1Run,
@@ -44,7 +45,6 @@ from weldcal.calibration.verification import (
     Sight,
     Verification,
     Verifier,
-    face_cloud,
     icp_error,
     make_verification,
     sight,
@@ -91,11 +91,13 @@ class Algorithm1Outcome:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """What a run of the job leaves: the estimate, the records written, and where."""
+    """What a run of the job leaves: the estimate, the records written, and where. ``observations`` carry the scanner
+    correction where one was accepted."""
 
     result: CalibrationResult
     estimate: CalibrationEstimate
     observations: tuple[Observation, ...]
+    scanner: SelfCalibration | None
     fits: dict[str, FlangeFit]
     refused: tuple[tuple[str, str], ...]
     outliers: tuple[str, ...]
@@ -115,7 +117,7 @@ class CalibrationReport:
             "refused": [{"id": i, "reason": t} for i, t in self.refused],
             "X_BC": matrix4(r.X_BC),
             "covariance": r.covariance.tolist(),
-            "scanner_correction": None,
+            "scanner_correction": r.scanner_correction,
             "held_out_mm": {k: r.held_out_mm[k] for k in ("median", "mean", "p95")},
             "tilt_deg": r.tilt_deg,
             "outliers": list(self.outliers),
@@ -145,12 +147,14 @@ def calibrate_dataset(
     seed: int = 0,
     progress: Progress | None = None,
     centres: bool = False,
+    correct_scanner: bool = True,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
     ``robot`` and ``flange`` override dataset.yaml. ``progress`` is told (stage, fraction). ``centres`` also writes
-    centres.csv (camera frame, metres). Nothing is written unless the calibration succeeded. Raises InputError (one
-    sentence) for bad data; a cloud that cannot be used is refused by name and reported, as long as enough remain.
+    centres.csv (camera frame, metres, uncorrected). Without ``correct_scanner`` the scanner is taken as it is. Nothing
+    is written unless the calibration succeeded. Raises InputError (one sentence) for bad data; a cloud that cannot be
+    used is refused by name and reported, as long as enough remain.
     """
     started = time.monotonic()
     tell: Progress = progress or (lambda stage, fraction: None)
@@ -158,10 +162,15 @@ def calibrate_dataset(
         raise InputError(f"'{out}' is a file; give a folder for the result.")
     data = load_dataset(Path(folder))
     standard = get_flange(flange or data.header.flange)
-    observations, fits, clouds, refused = _sightings(data, standard, seed, tell)
+    seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
+    observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
     _enough(observations, refused, data)
     tell("solving", 0.7)
     estimate = estimate_eye_on_base(observations, SolveConfig(seed=seed))
+    tell("judging the scanner", 0.72)
+    scanner, corrected, estimate = apply_self_calibration(
+        observations, estimate, seen.patterns, seed=seed, wanted=correct_scanner
+    )
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
     errors = dict(zip((o.id for o in observations), estimate.position_residuals_m, strict=True))
     refused += [
@@ -171,7 +180,15 @@ def calibrate_dataset(
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     tell("cross-validating", 0.75)
     folds = (
-        k_fold(inliers, folds=min(5, len(inliers)), repeats=5, seed=seed)
+        k_fold(
+            inliers,
+            folds=min(5, len(inliers)),
+            repeats=5,
+            seed=seed,
+            solve=None
+            if scanner is None or scanner.accepted is None
+            else lambda poses: calibrate_corrected(poses, seen.patterns, seed=seed),
+        )
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
     )
@@ -184,6 +201,9 @@ def calibrate_dataset(
             "The poses hardly differ in orientation: a constant error of the flange centre would not show in these "
             "figures."
         )
+    if scanner is not None and scanner.worth_saying:
+        warnings.append(scanner.sentence)
+    correction = None if scanner is None or scanner.accepted is None else scanner.accepted.document()
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
@@ -200,12 +220,14 @@ def calibrate_dataset(
         sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)) if fits else 0.0,
         seed=seed,
         data_hashes=data.hashes,
+        scanner_correction=correction,
         software=software_version(),
     )
     report = CalibrationReport(
         result,
         estimate,
-        tuple(observations),
+        tuple(corrected),
+        scanner,
         fits,
         tuple(refused),
         outliers,
@@ -226,55 +248,6 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
-
-
-def _sightings(
-    data: Dataset, standard: FlangeStandard, seed: int, tell: Progress
-) -> tuple[list[Observation], dict[str, FlangeFit], dict[str, Array], list[tuple[str, str]]]:
-    """Fit every cloud, or take the pairs as they are."""
-    if data.pairs:
-        return [Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs], {}, {}, []
-    _check_clouds(data)
-    observations, fits, clouds = [], {}, {}
-    refused = list(data.refused)
-    for k, id in enumerate(data.clouds):
-        tell("fitting flanges", 0.7 * k / len(data.clouds))
-        try:
-            points = data.cloud(id)
-            fit = fit_flange(points, standard, guess=_guess(data, id, standard))
-        except FlangeNotFound as e:
-            refused.append((id, e.reason))
-            continue
-        fits[id] = fit
-        clouds[id] = face_cloud(points, fit, standard)
-        observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
-    return observations, fits, clouds, refused
-
-
-def _check_clouds(data: Dataset) -> None:
-    """Read every file before any work: a damaged one is the user's to mend, unlike a scan in which no flange is found.
-
-    Raises:
-        InputError: naming the first such file, what is wrong with it and how many there are.
-    """
-    bad: list[str] = []
-    for id in data.clouds:
-        try:
-            data.cloud(id)
-        except CloudError as e:
-            bad.append(f"{id}: {e.reason}")
-    if bad:
-        more = f" ({len(bad) - 1} more clouds are damaged too)" if len(bad) > 1 else ""
-        raise InputError(f"A cloud cannot be used{more}; mend it, or take it away together with its pose: {bad[0]}")
-
-
-def _guess(data: Dataset, id: str, standard: FlangeStandard) -> FlangeGuess | None:
-    """Where to look in this cloud, where the dataset says roughly where the scanner stands."""
-    X_CR = data.guess(id)
-    if X_CR is None or data.header.scanner_guess is None:
-        return None
-    radius = data.header.scanner_guess.radius_m + 0.5 * standard.outer_m
-    return FlangeGuess(center_C=X_CR.translation(), radius_m=radius, normal_C=X_CR.rotation().matrix()[:, 2])
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]], data: Dataset) -> None:

@@ -196,6 +196,27 @@ def calibrate(
     finish("calibrate", summary, folder, json_wanted=json, rows=rows)
 
 
+@app.command(short_help="How good is a calibration on scans it never saw?")
+def verify(
+    result: Annotated[Path, typer.Argument(help="A result folder, or its calibration.yaml.")],
+    dataset: Annotated[Path, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/, or pairs.csv.")],
+    out: OutOption = None,
+    flange: Annotated[
+        str | None, typer.Option("--flange", metavar="NAME", help="Flange standard, where the dataset does not say it.")
+    ] = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """How good is a calibration on scans it never saw? Position error and tilt per pose, at the flange."""
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("verify") as progress:
+        from weldcal.tools.verify import verify_dataset
+
+        folder = out or fresh_folder("verify", dataset.resolve().name, seed)
+        report = verify_dataset(result, dataset, folder, flange=flange, seed=seed, progress=progress)
+    finish("verify", report.summary(), folder, json_wanted=json)
+
+
 @app.command(short_help="Follow a seam in a scenario.")
 def weld(
     scenario: ScenarioOption = "straight_groove",

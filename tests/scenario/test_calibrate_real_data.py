@@ -36,13 +36,39 @@ def test_every_aubo_cloud_is_used_and_held_out_errors_beat_the_paper(aubo: Calib
     d = aubo.summary()
     assert d["n_used"] == 18
     assert d["refused"] == []
-    # the paper's method: 0.63 to 0.73 mm on these scans; good centres, rigid: 0.22 to 0.23 (median), 0.30 (mean)
-    assert d["held_out_mm"]["median"] < 0.25
-    assert d["held_out_mm"]["mean"] < 0.30
-    assert d["k_fold_mm"]["median"] < 0.26
+    # the paper's method: 0.63 to 0.73 mm on these scans; good centres, rigid: 0.22 to 0.23 (median), 0.30 (mean); with
+    # the scanner corrected: 0.16 to 0.20 and 0.17 to 0.20
+    assert d["held_out_mm"]["median"] < 0.20
+    assert d["held_out_mm"]["mean"] < 0.205
+    assert d["held_out_mm"]["p95"] < 0.34
+    assert d["k_fold_mm"]["median"] < 0.21
     # normals scatter by 0.07 deg per axis between scans
     assert d["tilt_deg"]["median"] < 0.10
     assert any("constant bias of the flange centre" in s for s in d["unobservable"])
+
+
+def test_the_scanner_of_the_aubo_is_corrected_as_its_hole_circle_and_the_robot_both_ask(
+    aubo: CalibrationReport,
+) -> None:
+    c = aubo.summary()["scanner_correction"]
+    # from other people's fits of this set: 0.16 to 0.21 % short, 0.13 to 0.15 % per 100 mm along x, each to 0.02 to 0.04
+    assert c["scale"] == pytest.approx(1.0018, abs=6e-4)
+    assert c["gradient_per_m"][0] == pytest.approx(0.014, abs=5e-3)
+    assert abs(c["gradient_per_m"][1]) < 6e-3
+    scanner = aubo.scanner
+    assert scanner is not None
+    assert scanner.motion is not None
+    assert scanner.holes is not None
+    assert any(w == scanner.sentence for w in aubo.result.warnings)
+    # the centres are those that the scanner saw
+    row = (aubo.out / "centres.csv").read_text().splitlines()[1].split(",")
+    assert np.allclose([float(v) for v in row[1:4]], aubo.fits[row[0]].center_C, atol=1e-9)
+
+
+def test_pairs_without_clouds_are_not_corrected_and_the_result_says_what_motion_asks(ur10e: CalibrationReport) -> None:
+    d = ur10e.summary()
+    assert d["scanner_correction"] is None
+    assert any("No scanner correction" in w and "+0.24 %" in w for w in d["warnings"])
 
 
 def test_algorithm_1_reports_less_than_the_truth_and_the_report_says_what_it_misses(aubo: CalibrationReport) -> None:
@@ -78,13 +104,6 @@ def test_result_folder_is_complete_and_reads_back(aubo: CalibrationReport) -> No
     assert len(back.data_hashes) == 20
     assert (aubo.out / "centres.csv").read_text().count("\n") == 19
     json.dumps(aubo.summary(), allow_nan=False)
-
-
-def test_the_same_data_give_the_same_answer(aubo: CalibrationReport, tmp_path: Path) -> None:
-    again = calibrate_dataset(AUBO, tmp_path / "out", centres=True)
-    assert (again.out / "centres.csv").read_text() == (aubo.out / "centres.csv").read_text()
-    assert again.summary()["X_BC"] == aubo.summary()["X_BC"]
-    assert again.summary()["held_out_mm"] == aubo.summary()["held_out_mm"]
 
 
 def test_franka_ply_in_millimetres_is_read_and_fitted() -> None:
@@ -195,11 +214,11 @@ def test_one_bad_cloud_among_good_ones_is_refused_by_name(tmp_path: Path) -> Non
     shutil.copytree(AUBO, folder, copy_function=shutil.copyfile)
     for path in [folder, *folder.rglob("*")]:
         path.chmod(0o755)
-    _keep(folder, 8)
+    _keep(folder, 6)
     points = np.asarray(o3d.io.read_point_cloud(folder / "clouds/pose04.pcd").points)
     half = points[points[:, 0] < np.median(points[:, 0]) - 0.004]
     o3d.io.write_point_cloud(folder / "clouds/pose04.pcd", o3d.geometry.PointCloud(o3d.utility.Vector3dVector(half)))
     d = calibrate_dataset(folder, tmp_path / "out").summary()
-    assert d["n_used"] == 7
+    assert d["n_used"] == 5
     assert d["refused"][0]["id"] == "pose04"
     assert d["refused"][0]["reason"].endswith(".")

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING
 
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,6 +12,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.result import export_ros2, export_ur_pose
 from weldcal.calibration.rigid import rotation_vector
 from weldcal.calibration.solve import point_error_covariance
+from weldcal.tools.report.pictures import OURS, error_bars, error_field, svg
 from weldcal.tools.report.render import fixed, render
 
 if TYPE_CHECKING:
@@ -23,7 +20,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_OURS, _THEIRS, _TRUTH, _REFUSED = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
+_THEIRS, _TRUTH = "#b08a2e", "#a8402f"
 
 
 def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
@@ -55,6 +52,8 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
             ("ROS 2", export_ros2(r.X_BC).strip()),
             ("URScript", export_ur_pose(r.X_BC).strip()),
         ],
+        scanner_sentence=None if report.scanner is None else report.scanner.sentence,
+        scanner_rows=_scanner_rows(report),
         algorithm1=report.algorithm1,
         k_fold=report.k_fold_mm,
         convergence=_convergence(report),
@@ -83,18 +82,40 @@ def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
     return rows
 
 
+def _scanner_rows(report: CalibrationReport) -> list[tuple[str, ...]]:
+    """What each source says of the scanner: scale error and gradient, per cent, with one sigma."""
+    if report.scanner is None:
+        return []
+    rows: list[tuple[str, ...]] = []
+    for name, e in (("robot motion", report.scanner.motion), ("hole circle", report.scanner.holes)):
+        if e is not None:
+            per_cent = np.array([1e2, 10.0, 10.0])  # scale in %; gradient in % per 100 mm
+            values, sigma = per_cent * (e.values - np.array([1.0, 0.0, 0.0])), per_cent * e.sigma
+            rows.append(
+                (name, *(f"{fixed(float(v), 3)} ± {fixed(float(q), 3)}" for v, q in zip(values, sigma, strict=True)))
+            )
+    c = report.scanner.accepted
+    if c is not None:
+        used = (1e2 * (c.scale - 1.0), *(10.0 * g for g in c.gradient_per_m))
+        rows.append(("applied", *(fixed(float(v), 3) for v in used)))
+    return rows
+
+
 def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
     figure = Figure(figsize=(8.2, 3.9), layout="constrained")
     axes = figure.subplots()
-    _band(axes, c.counts, 1e3 * c.held_out, _OURS, "this calibration, on scans not used yet")
+    _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on scans not used yet")
     _band(axes, c.counts, 1e3 * c.figure_true, _TRUTH, "Algorithm 1, on scans not used yet")
     _band(axes, c.counts, 1e3 * c.figure, _THEIRS, "Algorithm 1's own figure")
     axes.set_xlabel("number of scans")
     axes.set_ylabel("error at the flange, mm")
     axes.set_ylim(bottom=0.0)
-    axes.legend(frameon=False, fontsize=9)
-    return _svg(figure, axes)
+    if axes.lines:
+        axes.legend(frameon=False, fontsize=9)
+    else:
+        axes.text(0.5, 0.5, "too few scans for a curve", transform=axes.transAxes, ha="center", color="#555")
+    return svg(figure, axes)
 
 
 def _band(axes: Axes, x: Array, y: Array, color: str, label: str) -> None:
@@ -108,64 +129,11 @@ def _band(axes: Axes, x: Array, y: Array, color: str, label: str) -> None:
 
 def _residual_bars(report: CalibrationReport) -> bytes:
     e = report.estimate
-    error = 1e3 * e.held_out.position_m
-    x = np.arange(len(error))
-    figure = Figure(figsize=(8.2, 3.2), layout="constrained")
-    axes = figure.subplots()
-    axes.bar(x, error, color=[_OURS if keep else _REFUSED for keep in e.inliers], width=0.7)
-    median = float(np.median(error[e.inliers]))
-    axes.axhline(median, color="#444", linewidth=1, linestyle="--")
-    axes.annotate(f"median {median:.2f}", (x[-1] + 0.5, median), fontsize=9, va="bottom", ha="right")
-    step = max(1, len(x) // 25)
-    axes.set_xticks(x[::step], [o.id for o in report.observations][::step], rotation=60, ha="right", fontsize=8)
-    # gross outliers would flatten every other bar
-    top = 1.25 * float(np.max(error[e.inliers]))
-    axes.set_ylim(0.0, top)
-    for i in np.nonzero(error > top)[0]:
-        axes.annotate(f"{error[i]:.1f}", (float(i), top), fontsize=8, ha="center", va="top", color="#333")
-    axes.set_ylabel("held-out error, mm")
-    return _svg(figure, axes)
+    ids = [o.id for o in report.observations]
+    return error_bars(ids, 1e3 * e.held_out.position_m, e.inliers, "held-out error, mm")
 
 
 def _residual_field(report: CalibrationReport) -> bytes:
-    """Residuals in the camera frame, across the field of view and along the line of sight: a scanner's own error has a
-    pattern."""
-    e = report.estimate
-    R = e.X_BC.rotation().matrix()
-    seen = np.array([o.p_CR for o in report.observations])[e.inliers]
-    base = np.array([o.p_BR for o in report.observations])[e.inliers]
-    error = (seen @ R.T + e.X_BC.translation() - base) @ R
-    figure = Figure(figsize=(8.2, 3.7), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    scale = 0.12 * float(np.ptp(seen[:, :2], axis=0).max()) / max(float(np.median(np.linalg.norm(error, axis=1))), 1e-9)
-    for axes, (i, j), names in ((left, (0, 1), ("x", "y")), (right, (0, 2), ("x", "z"))):
-        axes.quiver(
-            1e3 * seen[:, i],
-            1e3 * seen[:, j],
-            error[:, i],
-            error[:, j],
-            angles="xy",
-            scale_units="xy",
-            scale=1e-3 / scale,
-            color=_OURS,
-            width=0.004,
-        )
-        axes.plot(1e3 * seen[:, i], 1e3 * seen[:, j], ".", color="#555", markersize=4)
-        axes.set_xlabel(f"camera {names[0]}, mm")
-        axes.set_ylabel(f"camera {names[1]}, mm")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.invert_yaxis()
-        axes.margins(0.15)
-    left.set_title(f"residuals, {scale:.0f} times enlarged", fontsize=9, loc="left")
-    return _svg(figure, left, right)
-
-
-def _svg(figure: Figure, *all_axes: Axes) -> bytes:
-    for axes in all_axes:
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", color="#e3e6e9", linewidth=0.8)
-        axes.set_axisbelow(True)
-    stream = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "weldcal", "svg.fonttype": "path"}):
-        figure.savefig(stream, format="svg", metadata={"Date": None}, facecolor="white")
-    return stream.getvalue()
+    """Residuals of the poses used, in the camera frame."""
+    kept = [o for o, keep in zip(report.observations, report.estimate.inliers, strict=True) if keep]
+    return error_field(report.estimate.X_BC, kept)

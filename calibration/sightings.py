@@ -1,0 +1,119 @@
+"""From a dataset to sightings of the flange: every cloud fitted or refused by name, pairs taken as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.clouds import CloudError
+from weldcal.calibration.dataset import Dataset
+from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange_fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.holes import HolePattern, find_holes
+from weldcal.calibration.observation import Observation, observation_from_fit
+from weldcal.calibration.verification import face_cloud
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard
+
+Array = NDArray[np.float64]
+
+_SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error is searched for in the whole scan
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """What was seen: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
+    (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
+
+    observations: tuple[Observation, ...]
+    fits: dict[str, FlangeFit]
+    patterns: dict[str, HolePattern]
+    clouds: dict[str, Array]
+    refused: tuple[tuple[str, str], ...]
+
+
+def see_flanges(
+    data: Dataset,
+    standard: FlangeStandard,
+    *,
+    X_BC: RigidTransform | None = None,
+    holes: bool = True,
+    seed: int = 0,
+    tell: Callable[[float], None] = lambda fraction: None,
+) -> Sightings:
+    """Fit the flange in every cloud of a dataset, or take its pairs as they are.
+
+    ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole. Without
+    ``holes`` no hole pattern is looked for. Deterministic for ``seed``. ``tell`` is told the fraction done. Raises
+    InputError, before any work, naming the first cloud file that is damaged.
+    """
+    if data.pairs:
+        return Sightings(tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, ())
+    _check_clouds(data)
+    observations: list[Observation] = []
+    fits: dict[str, FlangeFit] = {}
+    patterns: dict[str, HolePattern] = {}
+    clouds: dict[str, Array] = {}
+    refused = list(data.refused)
+    for k, id in enumerate(data.clouds):
+        tell(k / len(data.clouds))
+        points = data.cloud(id)
+        try:
+            fit = _fit(points, standard, _guess(data, id, standard, X_BC), seed, whole=X_BC is not None)
+        except FlangeNotFound as e:
+            refused.append((id, e.reason))
+            continue
+        fits[id] = fit
+        pattern = find_holes(points, fit, standard) if holes else None
+        if pattern is not None:
+            patterns[id] = pattern
+        clouds[id] = face_cloud(points, fit, standard)
+        observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
+    return Sightings(tuple(observations), fits, patterns, clouds, tuple(refused))
+
+
+def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, seed: int, *, whole: bool) -> FlangeFit:
+    config = FlangeFitConfig(seed=seed)
+    try:
+        return fit_flange(points, standard, guess=guess, config=config)
+    except FlangeNotFound:
+        if guess is None or not whole:
+            raise
+        return fit_flange(points, standard, config=config)
+
+
+def _check_clouds(data: Dataset) -> None:
+    """Read every file before any work: a damaged one is the user's to mend, unlike a scan in which no flange is found.
+
+    Raises:
+        InputError: naming the first such file, what is wrong with it and how many there are.
+    """
+    bad: list[str] = []
+    for id in data.clouds:
+        try:
+            data.cloud(id)
+        except CloudError as e:
+            bad.append(f"{id}: {e.reason}")
+    if bad:
+        more = f" ({len(bad) - 1} more clouds are damaged too)" if len(bad) > 1 else ""
+        raise InputError(f"A cloud cannot be used{more}; mend it, or take it away together with its pose: {bad[0]}")
+
+
+def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransform | None) -> FlangeGuess | None:
+    """Where to look in this cloud, where the dataset or a calibration says roughly where the scanner stands."""
+    X_CR, reach = data.guess(id), _SEARCH_M
+    if X_CR is not None and data.header.scanner_guess is not None:
+        reach = data.header.scanner_guess.radius_m
+    elif X_BC is not None:
+        X_CR = X_BC.InvertAndCompose(data.poses[id] @ data.X_FR)
+    if X_CR is None:
+        return None
+    return FlangeGuess(
+        center_C=np.asarray(X_CR.translation()),
+        radius_m=reach + 0.5 * standard.outer_m,
+        normal_C=X_CR.rotation().matrix()[:, 2],
+    )

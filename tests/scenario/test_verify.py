@@ -1,0 +1,278 @@
+"""A calibration judged on scans it never saw: half of the real scans calibrate, the other half verify."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pytest
+from pydrake.math import RigidTransform
+from typer.testing import CliRunner
+
+from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.result import CalibrationResult, load_result, save_result
+from weldcal.calibration.self_calibration import apply_self_calibration
+from weldcal.calibration.sightings import see_flanges
+from weldcal.calibration.solve import estimate_eye_on_base
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.tools.calibrate import calibrate_dataset
+from weldcal.tools.cli import app
+from weldcal.tools.verify import VerifyReport, verify_dataset
+
+DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
+AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
+
+
+def _part(source: Path, folder: Path, rows: slice) -> Path:
+    """A dataset that holds some rows of another, and their clouds."""
+    table = "poses.csv" if (source / "poses.csv").is_file() else "pairs.csv"
+    lines = (source / table).read_text().splitlines()
+    kept = lines[1:][rows]
+    folder.mkdir(parents=True)
+    shutil.copyfile(source / "dataset.yaml", folder / "dataset.yaml")
+    (folder / table).write_text("\n".join([lines[0], *kept]) + "\n")
+    if table == "poses.csv":
+        (folder / "clouds").mkdir()
+        for id in (line.split(",")[0] for line in kept):
+            shutil.copyfile(source / "clouds" / f"{id}.pcd", folder / "clouds" / f"{id}.pcd")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def halves(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The calibration of every other AUBO scan, and a dataset of the rest."""
+    top = tmp_path_factory.mktemp("aubo")
+    calibrate_dataset(_part(AUBO, top / "even", slice(0, None, 2)), top / "result")
+    return top / "result", _part(AUBO, top / "odd", slice(1, None, 2))
+
+
+@pytest.fixture(scope="module")
+def verified(halves: tuple[Path, Path]) -> VerifyReport:
+    return verify_dataset(*halves, halves[0].parent / "verified")
+
+
+def _few(halves: tuple[Path, Path], folder: Path, n: int = 3) -> Path:
+    return _part(halves[1], folder, slice(0, n))
+
+
+def _result(folder: Path, result: CalibrationResult) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    save_result(result, folder)
+    return folder
+
+
+def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(verified: VerifyReport) -> None:
+    d = verified.summary()
+    assert set(d) == {"state", "position_error_mm", "tilt_deg", "per_pose", "warnings"}
+    assert len(d["per_pose"]) == 9
+    # nine scans: the paper's method leaves 0.63 on poses it did not use, good centres 0.29, and a corrected scanner 0.16
+    assert d["position_error_mm"]["median"] < 0.2
+    assert d["position_error_mm"]["max"] < 0.4
+    assert d["tilt_deg"]["median"] < 0.12
+    assert not any("given to the calibration" in w for w in d["warnings"])
+    assert not any("calibrate again" in w for w in d["warnings"])
+    assert any("orientations hardly vary" in w for w in d["warnings"])
+
+
+def test_the_same_scans_give_the_same_calibration(halves: tuple[Path, Path]) -> None:
+    data = load_dataset(halves[0].parent / "even")
+    seen = see_flanges(data, get_flange(data.header.flange))
+    rigid = estimate_eye_on_base(seen.observations)
+    scanner, _, again = apply_self_calibration(list(seen.observations), rigid, seen.patterns)
+    first = load_result(halves[0])
+    assert scanner is not None
+    assert scanner.accepted is not None
+    assert scanner.accepted.document() == first.scanner_correction
+    # reading a result makes its rotation orthonormal again, which costs the last digit
+    assert np.allclose(again.X_BC.GetAsMatrix4(), first.X_BC.GetAsMatrix4(), rtol=0.0, atol=1e-14)
+    held_out = {p.id: p.held_out_mm for p in first.poses}
+    assert [1e3 * e for e in again.held_out.position_m] == [held_out[o.id] for o in seen.observations]
+
+
+def test_each_error_is_the_distance_at_the_flange_centre_in_the_base(
+    verified: VerifyReport, halves: tuple[Path, Path]
+) -> None:
+    data = load_dataset(halves[1])
+    correction = verified.result.scanner_correction
+    for pose in verified.poses[:2]:
+        p = fit_flange(data.cloud(pose.id), get_flange(data.header.flange)).center_C
+        if correction is not None:
+            gx, gy = correction["gradient_per_m"]
+            p = p * (correction["scale"] + gx * p[0] + gy * p[1])
+        error = np.linalg.norm(verified.result.X_BC @ p - data.poses[pose.id].translation())
+        # the search is led to the flange here and not there: the fits may differ by their own noise, 0.03 mm
+        assert pose.error_mm == pytest.approx(1e3 * error, abs=0.03)
+
+
+def test_a_page_with_pictures_and_a_record_are_left(verified: VerifyReport) -> None:
+    html = (verified.out / "report.html").read_text()
+    assert html.count('<img src="data:image/svg+xml') == 3
+    assert all(p.id in html for p in verified.poses)
+    assert json.loads((verified.out / "verification.json").read_text()) == verified.summary()
+
+
+def test_the_correction_of_a_result_is_applied_to_what_the_scanner_saw(
+    halves: tuple[Path, Path], tmp_path: Path
+) -> None:
+    few = _few(halves, tmp_path / "few", 2)
+    plain = load_result(halves[0])
+    bare = _result(tmp_path / "bare", replace(plain, scanner_correction=None))
+    corrected = _result(
+        tmp_path / "corrected", replace(plain, scanner_correction={"scale": 1.01, "gradient_per_m": [0.02, -0.03]})
+    )
+    before, after = (verify_dataset(r, few, tmp_path / f"out-{r.name}") for r in (bare, corrected))
+    assert any("holds no scanner correction" in w for w in before.warnings)
+    assert not any("holds no scanner correction" in w for w in after.warnings)
+    for o, p in zip(before.observations, after.poses, strict=True):
+        x, y, _ = o.p_CR
+        moved = plain.X_BC @ (o.p_CR * (1.01 + 0.02 * x - 0.03 * y))
+        assert p.error_mm == pytest.approx(1e3 * float(np.linalg.norm(moved - o.p_BR)), abs=1e-9)
+
+
+def test_a_scanner_that_was_pushed_shows(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    good = load_result(halves[0])
+    pushed = RigidTransform(good.X_BC.rotation(), good.X_BC.translation() + np.array([0.0, 0.003, 0.0]))
+    report = verify_dataset(
+        _result(tmp_path / "pushed", replace(good, X_BC=pushed)), _few(halves, tmp_path / "few", 4), tmp_path / "out"
+    )
+    assert report.position_error_mm["median"] == pytest.approx(3.0, abs=0.5)
+    assert any("calibrate again" in w for w in report.warnings)
+
+
+def test_scans_that_made_the_calibration_are_named(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    seen = _part(AUBO, tmp_path / "seen", slice(0, 3))  # the first and the third were given, the second was not
+    report = verify_dataset(halves[0] / "calibration.yaml", seen, tmp_path / "out")
+    assert [p.used_before for p in report.poses] == [True, False, True]
+    given = next(w for w in report.warnings if "given to the calibration" in w)
+    assert report.poses[0].id in given
+    assert report.poses[1].id not in given
+    assert any("Only 3 scans were judged" in w for w in report.warnings)
+
+
+def test_a_scan_without_a_flange_is_named_and_the_rest_is_judged(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    few = _few(halves, tmp_path / "few", 3)
+    first, second, third = sorted((few / "clouds").iterdir())
+    points = np.asarray(o3d.io.read_point_cloud(first).points)
+    sliver = points[points[:, 0] < np.median(points[:, 0]) - 0.004]
+    o3d.io.write_point_cloud(first, o3d.geometry.PointCloud(o3d.utility.Vector3dVector(sliver)))
+    third.unlink()
+    report = verify_dataset(halves[0], few, tmp_path / "out")
+    assert [p.id for p in report.poses] == [second.stem]
+    for missing in (first, third):
+        assert any(w.startswith(f"{missing.stem} was not judged: ") for w in report.warnings)
+    assert f"<td>{first.stem}</td>" in (tmp_path / "out/report.html").read_text()
+    shutil.copyfile(first, second)
+    with pytest.raises(InputError, match=f"None of the 3 scans can be judged; for the first, {third.stem}: "):
+        verify_dataset(halves[0], few, tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_another_robot_flange_or_scanner_is_named(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    few = _few(halves, tmp_path / "few", 1)
+    header = (few / "dataset.yaml").read_text()
+    (few / "dataset.yaml").write_text(header.replace("aubo_i5", "ur5").replace("phoxi_s", "phoxi_m"))
+    report = verify_dataset(halves[0], few, tmp_path / "out", flange="tool-ring-63")
+    for what, was, now in (
+        ("robot", "aubo_i5", "ur5"),
+        ("flange", "iso9409-1-50-4-m6", "tool-ring-63"),
+        ("scanner", "phoxi_s", "phoxi_m"),
+    ):
+        assert any(f"{what} '{was}', these scans say '{now}'" in w for w in report.warnings)
+
+
+def test_pairs_are_judged_by_their_centres(tmp_path: Path) -> None:
+    given, kept = _part(UR10E, tmp_path / "given", slice(0, 20)), _part(UR10E, tmp_path / "kept", slice(23, None))
+    pairs = load_dataset(given).pairs
+    estimate = estimate_eye_on_base([Observation(p.id, p.X_BR, p.p_CR) for p in pairs])
+    result = _result(
+        tmp_path / "result",
+        CalibrationResult(estimate.X_BC, estimate.covariance, {}, {}, (), data_hashes=load_dataset(given).hashes),
+    )
+    d = verify_dataset(result, kept, tmp_path / "out").summary()
+    assert len(d["per_pose"]) == 23
+    assert d["tilt_deg"] == {"median": None, "p95": None}
+    # the paper's method on pairs it did not use: 0.74; all pairs, robustly: 0.62; these 20 lie to one side
+    assert d["position_error_mm"]["median"] < 0.9
+    again = verify_dataset(result, given, tmp_path / "again")
+    assert all(p.used_before for p in again.poses)
+
+
+def _no_result(result: Path, _: Path) -> None:
+    shutil.rmtree(result)
+
+
+def _no_calibration(result: Path, _: Path) -> None:
+    (result / "calibration.yaml").write_text("just: text\n")
+
+
+def _sheared(result: Path, _: Path) -> None:
+    text = (result / "calibration.yaml").read_text().splitlines()
+    row = next(k for k, line in enumerate(text) if "matrix:" in line)
+    text[row + 1] = "  - [0.5, 0.5, 0.5, 0.4]"
+    (result / "calibration.yaml").write_text("\n".join(text))
+
+
+def _spoilt_correction(result: Path, _: Path) -> None:
+    save_result(replace(load_result(result), scanner_correction={"scale": 1.2}), result)
+
+
+def _huge_correction(result: Path, _: Path) -> None:
+    save_result(replace(load_result(result), scanner_correction={"scale": 1.2, "gradient_per_m": [0, 0]}), result)
+
+
+def _no_dataset(_: Path, data: Path) -> None:
+    shutil.rmtree(data)
+
+
+def _cloud_cut_short(_: Path, data: Path) -> None:
+    path = next((data / "clouds").iterdir())
+    path.write_bytes(path.read_bytes()[:4000])
+
+
+def _unknown_flange(_: Path, data: Path) -> None:
+    text = (data / "dataset.yaml").read_text()
+    (data / "dataset.yaml").write_text(text.replace("iso9409-1-50-4-m6", "iso9409-1-55-4-m6"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (_no_result, "There is no calibration at"),
+        (_no_calibration, "is not a calibration result"),
+        (_sheared, "is not orthonormal"),
+        (_spoilt_correction, "scanner correction in the result cannot be read"),
+        (_huge_correction, "scale must lie within 5 %"),
+        (_no_dataset, "does not exist"),
+        (_cloud_cut_short, r"pose\d+\.pcd is truncated"),
+        (_unknown_flange, "is not known"),
+    ],
+)
+def test_a_mistake_gets_one_sentence_and_leaves_nothing(
+    halves: tuple[Path, Path], tmp_path: Path, spoil: Callable[[Path, Path], None], sentence: str
+) -> None:
+    result, data = _result(tmp_path / "result", load_result(halves[0])), _few(halves, tmp_path / "data", 1)
+    spoil(result, data)
+    with pytest.raises(InputError, match=sentence) as caught:
+        verify_dataset(result, data, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_prints_one_json_object_last(halves: tuple[Path, Path], tmp_path: Path) -> None:
+    few = _few(halves, tmp_path / "few", 1)
+    run = CliRunner().invoke(app, ["verify", str(halves[0]), str(few), "--out", str(tmp_path / "out"), "--json"])
+    assert run.exit_code == 0, run.output
+    assert json.loads(run.stdout.splitlines()[-1])["state"] == "done"
+    (tmp_path / "file").write_text("")
+    refused = CliRunner().invoke(app, ["verify", str(halves[0]), str(few), "--out", str(tmp_path / "file"), "--json"])
+    assert refused.exit_code == 1
+    assert "is a file; give a folder" in json.loads(refused.stdout.splitlines()[-1])["reason"]

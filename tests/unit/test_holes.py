@@ -1,0 +1,79 @@
+"""The hole pattern fixes the flange's rotation about its axis, and measures the scanner's scale."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.holes import find_holes
+from weldcal.models.flanges import FlangeStandard, face_points, get_flange
+
+Array = NDArray[np.float64]
+STANDARD = get_flange("iso9409-1-50-4-m6")
+NOISE_M = 3e-5
+# a rim point lies up to one pitch (0.4 mm) outside the hole and 24 of them fix a centre: 0.4 / sqrt(12) / sqrt(12) mm
+# each, and the size of a circle of 25 mm follows from four or five such centres
+RATIO_SIGMA = 0.4e-3 / 12.0 / 0.025 / 2.0
+
+
+def _scan(standard: FlangeStandard, yaw_deg: float, *, scale: float = 1.0) -> tuple[Array, RigidTransform]:
+    """A noisy face, looking at the scanner from 0.5 m, turned about its axis."""
+    tilt = RollPitchYaw(np.pi + 0.2, -0.1, 0.0).ToRotationMatrix()
+    X_CR = RigidTransform(tilt @ RotationMatrix.MakeZRotation(np.radians(yaw_deg)), [0.03, -0.02, 0.5])
+    rng = np.random.default_rng(5)
+    points = face_points(standard, 0.0004)
+    points = points + NOISE_M * rng.standard_normal(points.shape)
+    return scale * (X_CR @ points.T).T, X_CR
+
+
+def _filled(points: Array, X_CR: RigidTransform, hole: int) -> Array:
+    """The scan with one hole plugged."""
+    x, y, r = STANDARD.openings()[hole]
+    u, v = np.mgrid[-1:1:20j, -1:1:20j] * r
+    plug = np.column_stack([x + u.ravel(), y + v.ravel(), np.zeros(u.size)])
+    return np.vstack([points, (X_CR @ plug[np.hypot(u.ravel(), v.ravel()) < r].T).T])
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 33.0, 101.5, -140.0])
+def test_the_rotation_about_the_axis_is_found(yaw_deg: float) -> None:
+    points, X_CR = _scan(STANDARD, yaw_deg)
+    pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
+    assert pattern is not None
+    assert len(pattern.holes_C) == 5
+    error = (X_CR.rotation().inverse() @ pattern.X_CR.rotation()).ToAngleAxis().angle()
+    # the angle is as well known as the size of the circle, and the face's tilt adds a hundredth of a degree
+    assert np.degrees(error) < np.degrees(4.0 * RATIO_SIGMA) + 0.02
+    assert np.linalg.norm(pattern.center_C - X_CR.translation()) < 1e-4
+
+
+@pytest.mark.parametrize("scale", [0.995, 1.0, 1.004])
+def test_the_pitch_circle_measures_the_scale(scale: float) -> None:
+    points, _ = _scan(STANDARD, 20.0, scale=scale)
+    pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
+    assert pattern is not None
+    assert pattern.ratio == pytest.approx(scale, abs=4.0 * RATIO_SIGMA)
+
+
+def test_one_plugged_hole_leaves_the_pattern_and_two_do_not() -> None:
+    points, X_CR = _scan(STANDARD, 75.0)
+    fit = fit_flange(points, STANDARD)
+    once = _filled(points, X_CR, 1)
+    pattern = find_holes(once, fit, STANDARD)
+    assert pattern is not None
+    assert len(pattern.holes_C) == 4
+    assert STANDARD.openings()[1][:2] not in [
+        tuple(p[:2]) for p in (X_CR.inverse() @ pattern.holes_C.T).T.round(3).tolist()
+    ]
+    assert find_holes(_filled(once, X_CR, 3), fit, STANDARD) is None
+
+
+def test_a_ring_has_no_pattern() -> None:
+    ring = get_flange("tool-ring-63")
+    points, _ = _scan(ring, 10.0)
+    fit = fit_flange(points, ring)
+    assert find_holes(points, fit, ring) is None
+    # nor is one imagined where the standard promises holes
+    assert find_holes(points, fit, STANDARD) is None

@@ -1,0 +1,67 @@
+"""A scanner correction: one factor for every point, its derivative, and what it does to a face."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.scanner_model import ScannerCorrection, correction_from_document
+from weldcal.models.errors import InputError
+
+CORRECTION = ScannerCorrection(1.002, (0.015, -0.02))
+
+
+def test_a_point_is_scaled_by_the_factor_of_its_place_in_the_image() -> None:
+    p = np.array([[0.1, -0.2, 0.5], [0.0, 0.0, 0.4]])
+    factor = np.array([1.002 + 0.015 * 0.1 + 0.02 * 0.2, 1.002])
+    assert np.allclose(CORRECTION.points(p), p * factor[:, None], atol=1e-15)
+    assert np.isnan(CORRECTION.points(np.full(3, np.nan))).all()
+
+
+def test_the_jacobian_is_the_slope_of_the_correction() -> None:
+    p, h = np.array([0.1, -0.2, 0.5]), 1e-6
+    slope = [(CORRECTION.points(p + d) - CORRECTION.points(p - d)) / (2 * h) for d in h * np.eye(3)]
+    # the correction is quadratic: central differences are exact but for rounding, 1e-16 / 1e-6
+    assert np.allclose(CORRECTION.jacobian(p), np.transpose(slope), atol=1e-9)
+
+
+def test_the_normal_stays_upright_on_the_corrected_face() -> None:
+    p, n = np.array([0.1, -0.1, 0.45]), np.array([0.2, -0.1, -0.97])
+    n = n / np.linalg.norm(n)
+    across = np.linalg.svd(n[None])[2][1:]
+    h = 1e-4
+    corrected = CORRECTION.points(np.array([p, *(p + h * across), *(p - h * across)]))
+    seen = np.cross(corrected[1] - corrected[3], corrected[2] - corrected[4])
+    seen = seen / np.linalg.norm(seen) * np.sign(seen @ n)
+    assert np.allclose(CORRECTION.normals(p, n), seen, atol=1e-9)
+    assert np.degrees(np.arccos(min(1.0, float(seen @ n)))) > 0.1  # it does turn
+
+
+def test_a_sighting_is_corrected_whole() -> None:
+    o = Observation("a", RigidTransform(), np.array([0.1, 0.0, 0.5]), np.array([0.0, 0.0, -1.0]))
+    c = CORRECTION.observation(o)
+    assert np.allclose(c.p_CR, CORRECTION.points(o.p_CR))
+    assert c.n_C is not None
+    assert np.allclose(c.n_C, CORRECTION.normals(o.p_CR, np.array([0.0, 0.0, -1.0])))
+    assert CORRECTION.observation(Observation("b", RigidTransform(), o.p_CR)).n_C is None
+
+
+def test_it_is_written_and_read_back() -> None:
+    assert correction_from_document(CORRECTION.document()) == CORRECTION
+    assert correction_from_document(None) is None
+
+
+@pytest.mark.parametrize(
+    "document", [{}, {"scale": "one", "gradient_per_m": [0, 0]}, {"scale": 1.0, "gradient_per_m": [0.0]}]
+)
+def test_what_is_no_correction_is_refused(document: dict[str, object]) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        correction_from_document(document)
+
+
+@pytest.mark.parametrize("scale", [0.9, 1.2, float("nan")])
+def test_a_scale_no_scanner_has_is_refused(scale: float) -> None:
+    with pytest.raises(InputError, match="within 5 % of 1"):
+        ScannerCorrection(scale)

@@ -1,0 +1,144 @@
+"""A scanner's scale error is found from motion and hole circles, believed only where they agree and it pays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.scanner_model import ScannerCorrection
+from weldcal.calibration.self_calibration import (
+    SelfCalibration,
+    apply_self_calibration,
+    from_holes,
+    from_motion,
+    self_calibrate,
+)
+from weldcal.calibration.solve import estimate_eye_on_base
+
+X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
+WRONG = ScannerCorrection(1.003, (0.015, -0.01))
+RIGHT = ScannerCorrection()
+NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4
+
+
+def _cell(
+    needs: ScannerCorrection, *, n: int = 18, seed: int = 0, spread: float = 1.0
+) -> tuple[list[Observation], dict[str, HolePattern]]:
+    """Sightings and hole circles by a scanner that needs a correction; the robot tells the truth."""
+    rng = np.random.default_rng(seed)
+    observations, patterns = [], {}
+    for k in range(n):
+        true = np.array([0.0, 0.0, 0.4]) + spread * rng.uniform([-0.12, -0.1, -0.06], [0.12, 0.1, 0.06])
+        seen = true.copy()
+        for _ in range(20):  # a contraction: the correction is near the identity
+            seen = seen + true - needs.points(seen)
+        R_CR = RollPitchYaw(
+            np.pi + rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(-3, 3)
+        ).ToRotationMatrix()
+        normal = R_CR.matrix()[:, 2]
+        measured = np.linalg.solve(
+            np.linalg.inv(needs.jacobian(seen)).T, normal
+        )  # inverse of ScannerCorrection.normals
+        measured = measured / np.linalg.norm(measured) + NOISE_RAD * rng.standard_normal(3)
+        n_C = measured / np.linalg.norm(measured)
+        p_C = seen + NOISE_M * rng.standard_normal(3)
+        observations.append(Observation(f"p{k:02d}", X_BC @ RigidTransform(R_CR, true), p_C, n_C))
+        # a small circle in the face, corrected, must come out at its nominal size
+        x, y = R_CR.matrix()[:, 0], R_CR.matrix()[:, 1]
+        J = needs.jacobian(seen)
+        ratio = 2.0 / float(x @ J @ x + y @ J @ y) + NOISE_RATIO * rng.standard_normal()
+        patterns[f"p{k:02d}"] = HolePattern(np.zeros((4, 3)), np.zeros(4), p_C, RigidTransform(R_CR, p_C), ratio, 0.0)
+    return observations, patterns
+
+
+def _verdict(observations: list[Observation], patterns: dict[str, HolePattern]) -> SelfCalibration:
+    return self_calibrate(observations, patterns, estimate_eye_on_base(observations).held_out.position_m)
+
+
+def test_both_sources_find_the_error_and_it_is_corrected() -> None:
+    observations, patterns = _cell(WRONG)
+    s = _verdict(observations, patterns)
+    truth = np.array([WRONG.scale, *WRONG.gradient_per_m])
+    assert s.motion is not None
+    assert s.holes is not None
+    assert np.all(np.abs(s.motion.values - truth) < 4.0 * s.motion.sigma)
+    assert np.all(np.abs(s.holes.values - truth) < 4.0 * s.holes.sigma)
+    assert s.accepted is not None
+    assert s.accepted.scale == pytest.approx(WRONG.scale, abs=1e-3)
+    assert s.sentence.startswith("The scanner is corrected")
+    # what is left of a held-out error is the noise of one sighting in 3-D, and what 18 of them cannot average out
+    assert float(np.sqrt(np.mean(s.held_out_m**2))) < 1.5 * np.sqrt(3.0) * NOISE_M
+
+
+def test_the_stated_sigma_of_each_source_is_the_spread_of_its_answers() -> None:
+    motion, holes = [], []
+    for seed in range(30):
+        observations, patterns = _cell(WRONG, seed=seed)
+        truth = np.array([WRONG.scale, *WRONG.gradient_per_m])
+        m, h = from_motion(observations, {}), from_holes(observations, patterns)
+        assert h is not None
+        motion.append((m.values - truth) / m.sigma)
+        holes.append((h.values - truth) / h.sigma)
+    # 30 x 3 numbers of unit variance: their rms is known to 0.075; the circles' sigma is held up by what is expected
+    assert 0.75 < float(np.sqrt(np.mean(np.square(motion)))) < 1.25
+    assert 0.5 < float(np.sqrt(np.mean(np.square(holes)))) < 1.25
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_right_scanner_is_left_alone(seed: int) -> None:
+    s = _verdict(*_cell(RIGHT, seed=seed))
+    assert s.accepted is None
+    assert "may be chance" in s.sentence or "do not fall" in s.sentence
+
+
+def test_sources_that_contradict_each_other_change_nothing() -> None:
+    observations, _ = _cell(WRONG)
+    _, innocent = _cell(RIGHT)
+    s = _verdict(observations, innocent)
+    assert s.accepted is None
+    assert "contradict each other" in s.sentence
+    assert s.worth_saying
+
+
+def test_motion_alone_is_not_believed_but_told() -> None:
+    observations, patterns = _cell(WRONG)
+    few = {id: p for id, p in patterns.items() if id < "p05"}
+    s = _verdict(observations, few)
+    assert s.accepted is None
+    assert "not seen in enough scans" in s.sentence
+    assert s.worth_saying
+
+
+def test_poses_that_do_not_determine_a_scale_are_refused_with_a_sentence() -> None:
+    narrow = _verdict(*_cell(WRONG, spread=0.12))
+    assert narrow.accepted is None
+    assert "positions vary too little" in narrow.sentence
+    few = _verdict(*_cell(WRONG, n=7))
+    assert few.accepted is None
+    assert "take 8 or more" in few.sentence
+
+
+def test_the_held_out_error_of_a_pose_never_saw_it() -> None:
+    observations, patterns = _cell(WRONG)
+    scanner, corrected, estimate = apply_self_calibration(observations, estimate_eye_on_base(observations), patterns)
+    assert scanner is not None
+    assert scanner.accepted is not None
+    o, rest = observations[3], [*observations[:3], *observations[4:]]
+    without = from_motion(rest, patterns).correction
+    X = estimate_eye_on_base([without.observation(p) for p in rest]).X_BC
+    error = float(np.linalg.norm(X @ without.points(o.p_CR) - o.p_BR))
+    # the two differ in their random starts only, and both have converged
+    assert estimate.held_out.position_m[3] == pytest.approx(error, abs=1e-7)
+    assert np.allclose(corrected[3].p_CR, scanner.accepted.points(o.p_CR), atol=1e-15)
+
+
+def test_an_unwanted_correction_is_not_looked_for() -> None:
+    observations, patterns = _cell(WRONG)
+    rigid = estimate_eye_on_base(observations)
+    scanner, same, estimate = apply_self_calibration(observations, rigid, patterns, wanted=False)
+    assert scanner is None
+    assert same is observations
+    assert estimate is rigid

@@ -1,0 +1,102 @@
+"""The pictures that more than one report shows: errors as bars, errors as arrows across the scanner's field of view."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.observation import Observation
+
+Array = NDArray[np.float64]
+
+OURS, REFUSED = "#1d5f8a", "#9aa3ab"
+_PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.0}  # keeps a label readable on a bar
+
+
+def error_bars(
+    ids: Sequence[str], error: Array, keep: NDArray[np.bool_], label: str, *, stated: tuple[float, str] | None = None
+) -> bytes:
+    """One bar a pose (n,), grey where not ``keep``; the median as a line, and ``stated`` (a height and its name) as
+    another."""
+    x = np.arange(len(error))
+    figure = Figure(figsize=(8.2, 3.2), layout="constrained")
+    axes = figure.subplots()
+    axes.bar(x, error, color=[OURS if k else REFUSED for k in keep], width=0.7)
+    median = float(np.median(error[keep])) if keep.any() else float(np.median(error))
+    axes.axhline(median, color="#444", linewidth=1, linestyle="--")
+    axes.annotate(f"median {median:.2f}", (x[-1] + 0.5, median), fontsize=9, va="bottom", ha="right", bbox=_PLATE)
+    # gross outliers would flatten every other bar
+    top = 1.25 * float(np.max(error[keep] if keep.any() else error))
+    if stated is not None:
+        axes.axhline(stated[0], color="#a8402f", linewidth=1, linestyle=":")
+        axes.annotate(
+            f"{stated[1]} {stated[0]:.2f}",
+            (x[0] - 0.5, stated[0]),
+            fontsize=9,
+            va="bottom",
+            color="#a8402f",
+            bbox=_PLATE,
+        )
+        top = max(top, 1.25 * stated[0])
+    step = max(1, len(x) // 25)
+    axes.set_xticks(x[::step], list(ids)[::step], rotation=60, ha="right", fontsize=8)
+    axes.set_ylim(0.0, max(top, 1e-9))
+    for i in np.nonzero(error > top)[0]:
+        axes.annotate(f"{error[i]:.1f}", (float(i), top), fontsize=8, ha="center", va="top", color="#333")
+    axes.set_ylabel(label)
+    return svg(figure, axes)
+
+
+def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> bytes:
+    """Errors in the camera frame, across the field of view and along the line of sight: a scanner's own error has a
+    pattern."""
+    R = X_BC.rotation().matrix()
+    seen = np.array([o.p_CR for o in observations])
+    base = np.array([o.p_BR for o in observations])
+    error = (seen @ R.T + X_BC.translation() - base) @ R
+    figure = Figure(figsize=(8.2, 3.7), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    # a lone pose has no extent: its arrow is drawn against 50 mm
+    extent = max(float(np.ptp(seen[:, :2], axis=0).max()), 0.05)
+    scale = 0.12 * extent / max(float(np.median(np.linalg.norm(error, axis=1))), 1e-9)
+    for axes, (i, j), names in ((left, (0, 1), ("x", "y")), (right, (0, 2), ("x", "z"))):
+        axes.quiver(
+            1e3 * seen[:, i],
+            1e3 * seen[:, j],
+            error[:, i],
+            error[:, j],
+            angles="xy",
+            scale_units="xy",
+            scale=1e-3 / scale,
+            color=OURS,
+            width=0.004,
+        )
+        axes.plot(1e3 * seen[:, i], 1e3 * seen[:, j], ".", color="#555", markersize=4)
+        axes.set_xlabel(f"camera {names[0]}, mm")
+        axes.set_ylabel(f"camera {names[1]}, mm")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.invert_yaxis()
+        axes.margins(0.15)
+    left.set_title(f"errors, {scale:.0f} times enlarged", fontsize=9, loc="left")
+    return svg(figure, left, right)
+
+
+def svg(figure: Figure, *all_axes: Axes) -> bytes:
+    """The figure as SVG, the same bytes for the same data."""
+    for axes in all_axes:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", color="#e3e6e9", linewidth=0.8)
+        axes.set_axisbelow(True)
+    stream = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "weldcal", "svg.fonttype": "path"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None}, facecolor="white")
+    return stream.getvalue()

@@ -1,0 +1,236 @@
+"""`weldcal verify RESULT DATASET`: how good is a calibration on scans it never saw, pose by pose, at the flange."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.dataset import Dataset, load_dataset
+from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.observability import turn_deg
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.result import CalibrationResult, load_result
+from weldcal.calibration.scanner_model import ScannerCorrection, correction_from_document
+from weldcal.calibration.sightings import see_flanges
+from weldcal.calibration.validation import position_errors, tilt_errors
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.tools.report.plots_verify import verify_report
+from weldcal.tools.report.render import write_atomic
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, float], None]
+
+_FEW = 4
+_TURN_DEG = 3.0  # orientations closer than this are one orientation to a verification
+_SAME_MM = 1e-6  # a scan of the same name whose error repeats the recorded residual to a nanometre is the same scan
+_EVIDENT = 4.0  # standard errors of a scale error that is worth naming
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """One scan: distance (mm) between where the calibration puts the flange centre and where the robot says it is, angle
+    (deg) between the face normals (None where none was seen), and whether the calibration was made with this scan."""
+
+    id: str
+    error_mm: float
+    tilt_deg: float | None
+    used_before: bool
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """What a verification found. ``observations`` carry the scanner correction where the result has one."""
+
+    result: CalibrationResult
+    correction: ScannerCorrection | None
+    observations: tuple[Observation, ...]
+    fits: dict[str, FlangeFit]
+    poses: tuple[PoseError, ...]
+    refused: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    hashes: dict[str, str]
+    out: Path
+
+    @property
+    def position_error_mm(self) -> dict[str, float]:
+        """Median, mean, 95th percentile and largest position error, mm."""
+        e = np.array([p.error_mm for p in self.poses])
+        return {
+            "median": float(np.median(e)),
+            "mean": float(e.mean()),
+            "p95": float(np.percentile(e, 95)),
+            "max": float(e.max()),
+        }
+
+    @property
+    def tilt_deg(self) -> dict[str, float | None]:
+        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
+        t = [p.tilt_deg for p in self.poses if p.tilt_deg is not None]
+        if not t:
+            return {"median": None, "p95": None}
+        return {"median": float(np.median(t)), "p95": float(np.percentile(t, 95))}
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `--json` (keys of the design's "verify" line). A refused scan is named in the warnings."""
+        return {
+            "state": "done",
+            "position_error_mm": self.position_error_mm,
+            "tilt_deg": self.tilt_deg,
+            "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
+            "warnings": list(self.warnings),
+        }
+
+
+def verify_dataset(
+    result: Path,
+    dataset: Path,
+    out: Path,
+    *,
+    flange: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> VerifyReport:
+    """Judge a calibration (its folder or calibration.yaml) on a dataset folder; write verification.json and report.html.
+
+    Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
+    is found is named and takes no part in the figures. ``flange`` overrides dataset.yaml; the fits follow ``seed``. Nothing is written unless at least one
+    scan could be judged.
+    Raises InputError, one sentence, for everything a user may have mistaken.
+    """
+    tell: Progress = progress or (lambda stage, fraction: None)
+    if Path(out).exists() and not Path(out).is_dir():
+        raise InputError(f"'{out}' is a file; give a folder for the verification.")
+    calibration = load_result(Path(result))
+    correction = correction_from_document(calibration.scanner_correction)
+    data = load_dataset(Path(dataset))
+    standard = get_flange(flange or data.header.flange)
+    seen = see_flanges(
+        data,
+        standard,
+        X_BC=calibration.X_BC,
+        holes=False,
+        seed=seed,
+        tell=lambda fraction: tell("fitting flanges", 0.9 * fraction),
+    )
+    if not seen.observations:
+        first, reason = seen.refused[0]
+        raise InputError(f"None of the {len(seen.refused)} scans can be judged; for the first, {first}: {reason}")
+    observations = tuple(o if correction is None else correction.observation(o) for o in seen.observations)
+    poses = _judge(calibration, data, observations)
+    warnings = (
+        *(f"{id} was not judged: {reason}" for id, reason in seen.refused),
+        *_differences(calibration, data, standard.designation),
+        *_doubts(calibration, data, observations, poses),
+    )
+    report = VerifyReport(
+        calibration, correction, observations, seen.fits, poses, seen.refused, warnings, data.hashes, Path(out)
+    )
+    tell("writing the report", 0.9)
+    write_atomic(Path(out) / "report.html", verify_report(report, dataset=Path(dataset).resolve().name))
+    # last, so that its presence means that everything else is there
+    write_atomic(Path(out) / "verification.json", json.dumps(report.summary(), indent=2, allow_nan=False) + "\n")
+    tell("done", 1.0)
+    return report
+
+
+def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observation, ...]) -> tuple[PoseError, ...]:
+    errors = 1e3 * position_errors(result.X_BC, observations)
+    tilts = np.degrees(tilt_errors(result.X_BC, observations))
+    known = {digest for name, digest in result.data_hashes.items() if name.startswith("clouds/")}
+    same_pairs = bool(data.pairs) and result.data_hashes.get("pairs.csv") == data.hashes["pairs.csv"]
+    records = {p.id: p.residual_mm for p in result.poses if p.residual_mm is not None}
+    poses = []
+    for o, e, t in zip(observations, errors, tilts, strict=True):
+        recorded = records.get(o.id)
+        again = recorded is not None and abs(recorded - float(e)) < _SAME_MM
+        if not data.pairs:
+            again = again or data.hashes[f"clouds/{data.clouds[o.id].name}"] in known
+        poses.append(PoseError(o.id, float(e), float(t) if np.isfinite(t) else None, again or same_pairs))
+    return tuple(poses)
+
+
+def _differences(result: CalibrationResult, data: Dataset, flange: str) -> list[str]:
+    """What the calibration and these scans say differently of the cell."""
+    h = data.header
+    pairs = (
+        ("robot", result.robot, h.robot),
+        ("flange", result.flange, flange),
+        ("scanner", result.scanner, h.scanner),
+    )
+    return [
+        f"The calibration was made with the {what} '{was}', these scans say '{now}': the figures hold only if both "
+        "names mean the same one."
+        for what, was, now in pairs
+        if was and now and was != now
+    ]
+
+
+def _doubts(
+    result: CalibrationResult, data: Dataset, observations: tuple[Observation, ...], poses: tuple[PoseError, ...]
+) -> list[str]:
+    """Why the figures may flatter, or what they show of the cell."""
+    out = []
+    again = [p.id for p in poses if p.used_before]
+    n = len(poses)
+    if again:
+        names = ", ".join(again[:5]) + (f" and {len(again) - 5} more" if len(again) > 5 else "")
+        out.append(
+            f"{len(again)} of the {n} scans were given to the calibration itself ({names}): their errors flatter it; take "
+            "new scans."
+        )
+    if n < _FEW:
+        out.append(f"Only {n} scan{' was' if n == 1 else 's were'} judged: take {_FEW} or more across the work space.")
+    turned = [o.X_BR for o in observations]
+    if data.pairs and not all(p.has_orientation for p in data.pairs):
+        out.append("The pairs give no orientation of the flange: whether it varies is not known.")
+    elif n > 1 and turn_deg(turned) < _TURN_DEG:
+        out.append(
+            f"The orientations hardly vary (by {turn_deg(turned):.1f} degrees): a constant error of the flange centre "
+            "need not show in these figures."
+        )
+    stated = result.held_out_mm.get("p95")
+    median = float(np.median([p.error_mm for p in poses]))
+    if stated is not None and n >= _FEW and median > stated:
+        out.append(
+            f"The median error, {median:.2f} mm, is larger than what the calibration stated for 95 % of its own held-out "
+            f"scans ({stated:.2f} mm): scanner, robot or flange has changed, or these scans lie elsewhere; calibrate "
+            "again."
+        )
+    if result.scanner_correction is None:
+        out.append(_uncorrected(result, observations))
+    return out
+
+
+def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...]) -> str:
+    """The sentence on an absent scanner correction, with the scale error these scans show, where they do."""
+    text = "The result holds no scanner correction, so these errors contain the scanner's own error of scale"
+    scale, sigma = _scale_error(result, observations)
+    if np.isfinite(sigma) and abs(scale) > _EVIDENT * sigma:
+        return f"{text}; these scans ask for {1e2 * scale:+.2f} % (one sigma {1e2 * sigma:.2f} %)."
+    return f"{text}, if it has one."
+
+
+def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[float, float]:
+    """Change of scale that best explains the errors beside a shift, and its standard error; NaN for few scans."""
+    n = len(observations)
+    if n < 6:
+        return float("nan"), float("nan")
+    c = np.array([result.X_BC.rotation() @ o.p_CR for o in observations])
+    e = np.array([o.p_BR - result.X_BC @ o.p_CR for o in observations])
+    c, e = c - c.mean(axis=0), e - e.mean(axis=0)
+    spread = float((c**2).sum())
+    if spread < 1e-6:
+        return float("nan"), float("nan")
+    scale = float((c * e).sum()) / spread
+    left = float(((e - scale * c) ** 2).sum()) / (3 * n - 4)
+    return scale, float(np.sqrt(left / spread))
+
+
+__all__ = ["PoseError", "VerifyReport", "verify_dataset"]
