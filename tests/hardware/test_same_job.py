@@ -19,6 +19,7 @@ from weldcal.tools.ur_emulator.process import Emulator, emulator_process
 HOST = "127.0.0.41"
 SAME_MM = 0.05
 PACE = 0.5  # a faster one leaves the link less time than a busy machine of two cores may take
+STOOD_STILL = ("LINK: no new state", "COMMAND LATE")
 NOMINAL = Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml"
 
 
@@ -38,8 +39,16 @@ def finished_job(folder: Path, robot: str, pace: float | None) -> DemoResult:
 
 @pytest.fixture(scope="module")
 def emulated_job(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    """The job on the emulated controller."""
-    return finished_job(tmp_path_factory.mktemp("emulated") / "run", f"emulated@{HOST}", PACE)
+    """The job on the emulated controller.
+
+    Where the computer as a whole stands still for a tenth of a second the link stops the arm, as it must; then the job is
+    done again.
+    """
+    for _ in range(3):
+        job = finished_job(tmp_path_factory.mktemp("emulated") / "run", f"emulated@{HOST}", PACE)
+        if not str(job.summary().get("reason")).startswith(STOOD_STILL):
+            break
+    return job
 
 
 def test_the_same_job_on_the_emulated_robot_ends_with_the_same_figures(
