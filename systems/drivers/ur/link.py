@@ -20,6 +20,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.dashboard import stop_program
 from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.faults import Fault, sentence
+from weldcal.systems.drivers.ur.remedies import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import STATE, Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
@@ -28,29 +29,6 @@ from weldcal.systems.messages import UrStatus
 START_LIMIT_S = 20.0
 CLOSE_LIMIT_S = 5.0
 HEARTBEAT_LIMIT_S = 0.15
-ROBOT_MODES = {
-    -1: "NO_CONTROLLER",
-    0: "DISCONNECTED",
-    1: "CONFIRM_SAFETY",
-    2: "BOOTING",
-    3: "POWER_OFF",
-    4: "POWER_ON",
-    5: "IDLE",
-    6: "BACKDRIVE",
-    7: "RUNNING",
-    8: "UPDATING_FIRMWARE",
-}
-SAFETY_MODES = {
-    1: "NORMAL",
-    2: "REDUCED",
-    3: "PROTECTIVE_STOP",
-    4: "RECOVERY",
-    5: "SAFEGUARD_STOP",
-    6: "SYSTEM_EMERGENCY_STOP",
-    7: "ROBOT_EMERGENCY_STOP",
-    8: "VIOLATION",
-    9: "FAULT",
-}
 _AT = {name: i for i, name in enumerate(STATE)}
 PLAYING, PAUSING, PAUSED = 2, 3, 4
 
