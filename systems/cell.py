@@ -29,6 +29,7 @@ from weldcal.systems.job_sequencer import JobPlan, JobSequencer
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseRecorder
+from weldcal.systems.process_switch import ProcessSwitch
 from weldcal.systems.scenario import Scenario
 from weldcal.systems.seam_planner import SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
@@ -39,7 +40,7 @@ from weldcal.welding.guard import SlewLimits
 from weldcal.welding.servo_state import ServoConfig, ToolGeometry
 
 AnySystem = TypeVar("AnySystem", bound=LeafSystem)
-LOG_PERIOD_S = 0.016
+LOG_PERIOD_S = 0.008  # a row per servo tick
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two against refused scans
 MOVE_TIMEOUT_S = 20.0  # at speed_factor 1
 MOVE_SPEED, MOVE_ACCELERATION = 1.0, 2.5  # rad/s and rad/s^2 of the fastest joint, at speed_factor 1
@@ -54,6 +55,7 @@ class WeldingPorts:
     seam: OutputPort
     report: OutputPort
     velocity: OutputPort
+    arm_stopped: OutputPort
     logged: dict[str, OutputPort] = dc.field(default_factory=dict)
 
 
@@ -225,7 +227,8 @@ def _make_cell(scenario: Scenario, station: Station, seed: int, meshcat: Meshcat
     chooser = wiring.add("calibration_pose_planner", CalibrationPosePlanner(poses))
     wiring.connect(chooser, calibration_status=status)
 
-    welding = _add_welding(wiring, sequencer, status, history)
+    hold = wiring.zeros("nobody_holds", 1) if meshcat is None else panel(wiring, meshcat)
+    welding = _add_welding(wiring, sequencer, status, history, hold)
     mover = wiring.add("flange_mover", FlangeMover(MOVE_SPEED * job.speed_factor, MOVE_ACCELERATION * job.speed_factor))
     wiring.connect(mover, job=command, position_measured=q_measured, velocity_measured=v_measured)
     arbiter = wiring.add("command_arbiter", CommandArbiter())
@@ -250,7 +253,8 @@ def _make_cell(scenario: Scenario, station: Station, seed: int, meshcat: Meshcat
         calibration_status=status,
         planned_seam=welding.seam,
         servo_report=welding.report,
-        hold=wiring.zeros("nobody_holds", 1) if meshcat is None else panel(wiring, meshcat),
+        hold=hold,
+        arm_stopped=welding.arm_stopped,
     )
     if meshcat is not None:
         ports = {
@@ -303,8 +307,10 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
     )
 
 
-def _add_welding(wiring: Wiring, sequencer: JobSequencer, status: OutputPort, history: OutputPort) -> WeldingPorts:
-    """Seam planner, deformation estimator, servo and guard; constants stand in for them in a cell without a tool."""
+def _add_welding(
+    wiring: Wiring, sequencer: JobSequencer, status: OutputPort, history: OutputPort, hold: OutputPort
+) -> WeldingPorts:
+    """Seam planner, deformation estimator, servo, guard and process switch; constants stand in for them in a cell without a tool."""
     station, scenario, config = wiring.station, wiring.scenario, wiring.servo_config
     tool, spec = station.tool, scenario.workpiece
     if tool is None or spec is None or station.cad is None or isinstance(scenario.finger_camera, NoDevice):
@@ -312,6 +318,7 @@ def _add_welding(wiring: Wiring, sequencer: JobSequencer, status: OutputPort, hi
             seam=wiring.constant("no_seam", PlannedSeam()),
             report=wiring.constant("no_servo", ServoReport()),
             velocity=wiring.zeros("no_servo_velocity", 6),
+            arm_stopped=wiring.zeros("no_arm_stopped", 1),
         )
     out, command, job = station.diagram.GetOutputPort, sequencer.GetOutputPort("job"), scenario.job
     welding = scenario.welding
@@ -348,13 +355,24 @@ def _add_welding(wiring: Wiring, sequencer: JobSequencer, status: OutputPort, hi
     )
     guard = wiring.add("singularity_guard", SingularityGuard(station.arm, tool.X_FT))
     wiring.connect(guard, V_BT=servo.GetOutputPort("V_BT"), position_measured=out("ur10e.position_measured"))
+    switch = wiring.add("process_switch", ProcessSwitch())
+    wiring.connect(
+        switch,
+        torch_wanted=servo.GetOutputPort("torch_on"),
+        job=command,
+        robot_status=out("ur10e.status"),
+        margin=guard.GetOutputPort("margin"),
+        hold=hold,
+    )
+    wiring.builder.ExportOutput(switch.GetOutputPort("process_on"), "process_on")
     return WeldingPorts(
         seam=planner.GetOutputPort("planned_seam"),
         report=servo.GetOutputPort("servo_report"),
         velocity=guard.GetOutputPort("velocity"),
+        arm_stopped=switch.GetOutputPort("arm_stopped"),
         logged={
             "telemetry": servo.GetOutputPort("telemetry"),
-            "torch_on": servo.GetOutputPort("torch_on"),
+            "torch_on": switch.GetOutputPort("process_on"),
             "margin": guard.GetOutputPort("margin"),
             "deflection": finger.GetOutputPort("deflection"),
             "tip_and_deflection": out("cheat.contact"),

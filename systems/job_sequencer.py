@@ -53,6 +53,7 @@ class Seen(Message):
     seam: PlannedSeam
     servo: ServoReport
     hold_requested: bool = False
+    arm_stopped: bool = False
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -221,6 +222,10 @@ def _approached(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
 def _welding(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if seen.servo.phase == "FAULT":
         return hold(state, seen, seen.servo.reason or "The welding servo stopped.")
+    if seen.arm_stopped:
+        return hold(
+            state, seen, "The arm came too near to a singular position during the weld; move the workpiece or the seam."
+        )
     if seen.servo.phase == "DONE" and seen.seam.q_retract is not None:
         return _move(
             dc.replace(state, command=dc.replace(state.command, process_on=False, streaming=False)),
@@ -292,13 +297,15 @@ class JobSequencer(LeafSystem):
         - planned_seam
         - servo_report
         - hold
+        - arm_stopped
         output_ports:
         - job
         - job_state
         - scan_trigger
         - streaming
 
-    `hold` (1) is a person's wish to stop. `job` carries the `JobCommand`, `job_state` the whole
+    `hold` (1) is a person's wish to stop, `arm_stopped` (1) the ProcessSwitch's word that the guard stopped a weld.
+    `job` carries the `JobCommand`, `job_state` the whole
     `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station.
     """
 
@@ -313,6 +320,7 @@ class JobSequencer(LeafSystem):
         self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
         self._servo = self.DeclareAbstractInputPort("servo_report", AbstractValue.Make(ServoReport()))
         self._hold = self.DeclareVectorInputPort("hold", 1)
+        self._arm_stopped = self.DeclareVectorInputPort("arm_stopped", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(JobState()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job_out, ticket)
@@ -337,6 +345,7 @@ class JobSequencer(LeafSystem):
             seam=self._seam.Eval(context),
             servo=self._servo.Eval(context),
             hold_requested=bool(self._hold.Eval(context)[0] > 0.5),
+            arm_stopped=bool(self._arm_stopped.Eval(context)[0] > 0.5),
         )
         old = self.job_state(context)
         new = next_job_state(old, seen, self._plan)

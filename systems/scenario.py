@@ -15,6 +15,7 @@ from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.welding.process import WeldProcess
 
 SLOWEST_FACTOR = 0.05
 SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
@@ -74,6 +75,21 @@ class WorkpieceConfig:
 
 
 @dc.dataclass
+class ProcessConfig:
+    """The arc as set at the power source, for the weld log; what is not given is not guessed."""
+
+    name: str | None = None  # MAG, MIG, FCAW, MMA, SAW, TIG or plasma
+    current_A: float | None = None
+    voltage_V: float | None = None
+    efficiency: float | None = None  # thermal efficiency k; without it the process's own of EN 1011-1
+    wire_feed_m_min: float | None = None
+
+    def process(self) -> WeldProcess:
+        """The same, checked (WeldProcessError)."""
+        return WeldProcess(self.name, self.current_A, self.voltage_V, self.efficiency, self.wire_feed_m_min)
+
+
+@dc.dataclass
 class WeldingConfig:
     """The welding job."""
 
@@ -82,6 +98,7 @@ class WeldingConfig:
     axial_deflection_mm: float = 3.0
     clearance_mm: float = 25.0  # height above the seam where the approach ends
     seam_length_mm: float | None = None  # weld only this much of the seam
+    process: ProcessConfig = dc.field(default_factory=ProcessConfig)
 
 
 @dc.dataclass
@@ -176,6 +193,7 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     check_numbers(scenario)
+    scenario.welding.process.process()
     if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
         raise InputError(
             f"job.speed_factor must be from {SLOWEST_FACTOR:g} to 1, and it is {scenario.job.speed_factor:g}."

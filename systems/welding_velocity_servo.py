@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
@@ -18,8 +19,12 @@ from weldcal.welding.servo_state import Phase, ServoConfig, ServoSample, Welding
 
 TELEMETRY = (
     "phase", "torch_on", "s_tip", "s_torch", "e_t", "e_height", "n_d_dot_n_t", "conditioning", "omega",
-    "delta_n", "delta_axial", "torch_speed", "tip_speed", "gain", "n_points",
+    "delta_n", "delta_axial", "torch_speed", "tip_speed", "gain", "n_points", "tick_time",
+    "p_BT_x", "p_BT_y", "p_BT_z", "q_BT_w", "q_BT_x", "q_BT_y", "q_BT_z",
+    "tip_x", "tip_y", "tip_z", "target_x", "target_y", "target_z",
 )  # fmt: skip
+_FIGURES = TELEMETRY[2 : TELEMETRY.index("tick_time")]
+_NOWHERE = np.full(3, np.nan)
 PHASE_CODES = {phase: float(k) for k, phase in enumerate(Phase)}
 
 
@@ -32,6 +37,8 @@ class ServoReport(Message):
     reason: str | None = None
     command: WeldingCommand | None = None
     state: WeldingState | None = None
+    time: float = np.nan  # of the tick, on the robot's clock
+    X_BT: RigidTransform | None = None  # as measured, at that tick
 
 
 class WeldingVelocityServo(LeafSystem):
@@ -52,8 +59,8 @@ class WeldingVelocityServo(LeafSystem):
         - telemetry
         - torch_on
 
-    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B; `telemetry` as named in TELEMETRY (SI); `torch_on` (1) is the
-    process output: it needs the job's consent as well as the servo's.
+    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
+    (1) is the wish for the process: it needs the job's consent as well as the servo's, and passes the ProcessSwitch.
     """
 
     def __init__(self, arm: ArmModel, tool: WeldingTool, config: ServoConfig) -> None:
@@ -85,7 +92,9 @@ class WeldingVelocityServo(LeafSystem):
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample)
         memory = old.state if old.state is not None else WeldingState()
         memory, command = welding_step(memory, sample, planned.seam, self._config)
-        report = ServoReport(str(command.phase), command.torch_on, command.reason, command, memory)
+        report = ServoReport(
+            str(command.phase), command.torch_on, command.reason, command, memory, sample.time, sample.X_BT
+        )
         state.get_mutable_abstract_state(self._state).set_value(report)
 
     def _velocity(self, context: Context, output: BasicVector) -> None:
@@ -99,10 +108,16 @@ class WeldingVelocityServo(LeafSystem):
         report: ServoReport = context.get_abstract_state(self._state).get_value()
         values = np.full(len(TELEMETRY), np.nan)
         values[:2] = (-1.0, 0.0)
-        if report.command is not None:
+        if report.command is not None and report.X_BT is not None:
             d = report.command.diagnostics
             values[:2] = (PHASE_CODES[report.command.phase], float(report.torch_on))
-            values[2:] = [float(getattr(d, name)) for name in TELEMETRY[2:]]
+            n = 2 + len(_FIGURES)
+            values[2:n] = [float(getattr(d, name)) for name in _FIGURES]
+            values[n] = report.time
+            values[n + 1 : n + 4] = report.X_BT.translation()
+            values[n + 4 : n + 8] = report.X_BT.rotation().ToQuaternion().wxyz()
+            values[n + 8 : n + 11] = _NOWHERE if d.p_BTip is None else d.p_BTip
+            values[n + 11 :] = _NOWHERE if d.p_BTorch_target is None else d.p_BTorch_target
         output.SetFromVector(values)
 
     def _torch(self, context: Context, output: BasicVector) -> None:

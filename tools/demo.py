@@ -25,7 +25,7 @@ from weldcal.tools.outcome import (
 from weldcal.tools.report.demo_report import demo_pictures, demo_report
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.robots import chosen_robot
-from weldcal.tools.run_files import error_summary, write_calibration, write_scans, write_weld_csv
+from weldcal.tools.run_files import error_summary, weld_record, write_calibration, write_scans, write_weld_log
 from weldcal.tools.simulation import Progress, Run, no_progress, run_cell
 
 
@@ -193,13 +193,14 @@ def measure(run: Run, options: DemoOptions, robot: str = "simulated") -> DemoRes
 
 
 def write_result(result: DemoResult, meshcat: Meshcat | None) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv, plots/, recording.html, report.html; each whole or not at all."""
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, report.html; each whole or not at all."""
     folder, run = result.folder, result.run
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(run.cell, result.status, result.options.seed, folder)
     write_scans(run, result.status, folder / "scans", result.robot)
     if result.weld is not None:
-        write_weld_csv(result.weld.log, folder)
+        record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
+        write_weld_log(record, folder)
     if meshcat is not None:
         write_atomic(folder / "recording.html", meshcat.StaticHtml())
     pictures = demo_pictures(result)

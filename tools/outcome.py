@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
-from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
@@ -22,13 +22,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class WeldLog:
-    """The weld's time series, one row per log period; (N,) and (N, 3) arrays in B, SI units."""
+    """The weld's time series, one row per servo tick; (N,) and (N, 3) arrays in B, SI units."""
 
     time: Array
     telemetry: dict[str, Array]
     torch_on: NDArray[np.bool_]
     p_BTip: Array  # the tip as the servo felt it: pose of the arm and tag
     p_BRobot: Array  # origin of T: the "robot end effector" of the paper
+    R_BT: Array  # (N, 3, 3)
     p_BTorch: Array
     deflection_T: Array
     sigma_min: Array
@@ -105,23 +106,35 @@ def weld_log(cell: Cell, root: Context) -> WeldLog | None:
         return None
     series = {name: sink.FindLog(root) for name, sink in cell.logs.items()}
     telemetry = series["telemetry"].data()
+    ticks = telemetry[TELEMETRY.index("tick_time")]
     keep = (telemetry[0] >= 0.0) & (telemetry[0] != PHASE_CODES[Phase.DONE])
+    # After a fault the last report stands: one row of each tick.
+    keep &= np.concatenate([[True], ~(ticks[1:] == ticks[:-1])])
     if keep.sum() < 3:
         return None
     tool = cell.station.tool
     assert tool is not None
-    X_BT = [forward_kinematics(cell.station.arm, q) @ tool.X_FT for q in series["position"].data()[:, keep].T]
+    named = {name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)}
+    p_BRobot = columns(named, "p_BT")
+    q = columns(named, "q_BT", "wxyz")
+    R_BT = np.array([RotationMatrix(Quaternion(w / np.linalg.norm(w))).matrix() for w in q])
     deflection = series["deflection"].data()[:3, keep].T
     return WeldLog(
-        time=np.array(series["telemetry"].sample_times()[keep]),
-        telemetry={name: np.array(telemetry[k, keep]) for k, name in enumerate(TELEMETRY)},
+        time=named["tick_time"],
+        telemetry=named,
         torch_on=np.array(series["torch_on"].data()[0, keep] > 0.5),
-        p_BTip=np.array([X @ d for X, d in zip(X_BT, deflection, strict=True)]),
-        p_BRobot=np.array([X.translation() for X in X_BT]),
+        p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
+        p_BRobot=p_BRobot,
+        R_BT=R_BT,
         p_BTorch=np.array(series["torch"].data()[:, keep].T),
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"].data()[0, keep]),
     )
+
+
+def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
+    """The columns name_x, name_y ... side by side, (N, len(axes))."""
+    return np.column_stack([table[f"{name}_{axis}"] for axis in axes])
 
 
 def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:

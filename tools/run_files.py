@@ -1,24 +1,25 @@
-"""What a run leaves on disk: calibration.yaml, weld.csv and the scans as a dataset that `weldcal calibrate` reads again."""
+"""What a run leaves on disk: calibration.yaml, the weld log and the scans as a dataset that `weldcal calibrate` reads again."""
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 import numpy as np
 
 from weldcal.calibration.dataset import save_dataset
 from weldcal.calibration.dataset_header import DatasetHeader, Feature, ScannerGuess
-from weldcal.calibration.result import CalibrationResult, PoseRecord, export_all, save_result
+from weldcal.calibration.result import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.solve import CalibrationEstimate
 from weldcal.systems.cell import Cell, feature_standard
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.tools.outcome import WeldLog
+from weldcal.systems.welding_velocity_servo import PHASE_CODES
+from weldcal.tools.outcome import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.simulation import Run
+from weldcal.welding.process import speed_along, torch_angles
 from weldcal.welding.servo_state import Phase
+from weldcal.welding.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 
 PHASE_NAMES = [str(phase) for phase in Phase]
 
@@ -118,20 +119,55 @@ def _numbers(values: np.ndarray) -> list[float]:
     return [float(v) for v in values]
 
 
-def write_weld_csv(log: WeldLog, folder: Path) -> Path:
-    """Write weld.csv: one row per log period; metres and seconds, positions in the base frame B."""
-    names = ["time_s", "phase", "torch_on"]
-    names += [f"{point}_{axis}_m" for point in ("tip", "torch", "robot") for axis in "xyz"]
-    names += [f"deflection_{axis}_m" for axis in ("tangential", "normal", "axial")]
-    extra = [name for name in log.telemetry if name not in ("phase", "torch_on")]
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow([*names, *extra, "sigma_min"])
-    for k, time in enumerate(log.time):
-        row: list[object] = [f"{time:.4f}", PHASE_NAMES[int(log.telemetry["phase"][k])], int(log.torch_on[k])]
-        numbers = [*log.p_BTip[k], *log.p_BTorch[k], *log.p_BRobot[k], *log.deflection_T[k]]
-        numbers += [log.telemetry[name][k] for name in extra] + [log.sigma_min[k]]
-        writer.writerow(row + [f"{v:.7g}" for v in numbers])
-    path = folder / "weld.csv"
-    write_atomic(path, table.getvalue())
-    return path
+def weld_record(run: Run, weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
+    """The weld as its log tells it: nothing in it is known from the simulation alone."""
+    log, cell, config = weld.log, run.cell, run.cell.servo_config
+    process = cell.scenario.welding.process.process()
+    p_BW = log.p_BRobot + log.R_BT @ config.p_TW
+    speed = speed_along(log.time, p_BW)
+    up = np.full((len(log.time), 3), np.nan)
+    if weld.planned is not None:
+        up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
+    moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
+    work, travel = torch_angles(log.R_BT, up, config.work_angle_rad)
+    named = log.telemetry
+    table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
+    table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
+    table |= {name: named[name] for name in ("n_d_dot_n_t", "conditioning", "gain", "n_points")}
+    table |= {f"q_B{frame}_{axis}": named[f"q_BT_{axis}"] for frame in "TW" for axis in "wxyz"}
+    tip, target = columns(named, "tip"), columns(named, "target")
+    vectors = {"p_BW": p_BW, "p_BT": log.p_BRobot, "deflection": log.deflection_T, "p_BTip": tip, "p_BSeam": target}
+    table |= {f"{name}_{axis}_m": v[:, k] for name, v in vectors.items() for k, axis in enumerate("xyz")}
+    table |= {
+        "torch_speed_m_s": speed,
+        "torch_speed_commanded_m_s": named["torch_speed"],
+        "tip_speed_m_s": named["tip_speed"],
+        "omega_rad_s": named["omega"],
+        "work_angle_rad": np.where(moving, work, np.nan),
+        "travel_angle_rad": np.where(moving, travel, np.nan),
+        "heat_input_J_m": process.heat_input(np.where(log.torch_on, speed, np.nan)),
+    }
+    settings = {
+        "software": software_version(),
+        "scenario": scenario,
+        "seed": seed,
+        "robot": robot,
+        "servo_period_s": config.period_s,
+        "weld_speed_m_s": config.weld_speed_m_s,
+        "delta_d_m": config.delta_d_m,
+        "axial_d_m": config.axial_d_m,
+        "omega_max_rad_s": config.omega_max_rad_s,
+        "chord_m": config.tool.torch_offset_m,
+        "law": config.law,
+        "ended": run.reason or "done",
+    }
+    phase = np.array([PHASE_NAMES[int(k)] for k in named["phase"]], dtype=np.str_)
+    return WeldRecord(table, phase, process, settings)
+
+
+def write_weld_log(record: WeldRecord, folder: Path) -> Path:
+    """Write weld.csv and weld.json (docs/weld_log.md); the header last, so that it never describes a table not yet there."""
+    table, header = weld_log_texts(record)
+    write_atomic(folder / CSV_NAME, table)
+    write_atomic(folder / HEADER_NAME, header)
+    return folder / CSV_NAME

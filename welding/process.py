@@ -1,7 +1,8 @@
-"""What the weld was: where the arc burned, how fast the torch went, and how far its path lay off the true seam."""
+"""What the weld was: the process, where the arc burned, how fast the torch went, its heat, how far it lay off the seam."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,80 @@ from weldcal.welding.vectors import Array
 _BAND = 0.25  # a travel speed beyond +-25 % is commonly taken as another welding procedure
 
 
+# Thermal efficiency k by process, EN 1011-1:2009, table 1.
+EFFICIENCY = {"MAG": 0.8, "MIG": 0.8, "FCAW": 0.8, "MMA": 0.8, "SAW": 1.0, "TIG": 0.6, "plasma": 0.6}
+
+
 class ProcessLogError(InputError):
     """A weld log that cannot be evaluated."""
+
+
+class WeldProcessError(InputError):
+    """A welding process that cannot be."""
+
+
+@dataclass(frozen=True)
+class WeldProcess:
+    """The arc as it is set at the power source: nominal values, not measured ones; None is not known, and never guessed.
+
+    Attributes:
+        name: a key of EFFICIENCY; current_A, voltage_V: both or neither.
+        efficiency: thermal efficiency k, 0 to 1; None takes the process's from EFFICIENCY.
+        wire_feed_m_min: for the record.
+
+    Raises:
+        WeldProcessError: unknown process, a number that is not positive, or half of what a heat input needs.
+    """
+
+    name: str | None = None
+    current_A: float | None = None
+    voltage_V: float | None = None
+    efficiency: float | None = None
+    wire_feed_m_min: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.name is not None and self.name not in EFFICIENCY:
+            raise WeldProcessError(f"The welding process must be one of {', '.join(EFFICIENCY)}, not '{self.name}'.")
+        for key in ("current_A", "voltage_V", "efficiency", "wire_feed_m_min"):
+            value = getattr(self, key)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise WeldProcessError(f"The welding process's {key} must be a positive number, not {value:g}.")
+        if self.efficiency is not None and self.efficiency > 1.0:
+            raise WeldProcessError(f"The welding process's efficiency is at most 1, and it is {self.efficiency:g}.")
+        if (self.current_A is None) != (self.voltage_V is None):
+            raise WeldProcessError("Give both current_A and voltage_V of the welding process, or neither.")
+        if self.current_A is not None and self.k is None:
+            raise WeldProcessError(
+                "Give the welding process's name or its efficiency: without it there is no heat input."
+            )
+
+    @property
+    def k(self) -> float | None:
+        """The thermal efficiency in use."""
+        if self.efficiency is not None:
+            return self.efficiency
+        return None if self.name is None else EFFICIENCY[self.name]
+
+    @property
+    def missing(self) -> str | None:
+        """Why no heat input can be stated, as one sentence; None where it can."""
+        if self.current_A is not None:
+            return None
+        return "No welding current and voltage were given, so the log states the torch speed and no heat input."
+
+    def heat_input(self, speed_m_s: ArrayLike) -> Array:
+        """Heat brought in per length of weld, k U I / v, in J/m; NaN without current and voltage, infinite at rest.
+
+        Args:
+            speed_m_s: torch speed, any shape; NaN where the arc is off.
+
+        Source: EN 1011-1:2009, section 19, and ISO/TR 18491 (direct current or mean values: no pulses are resolved).
+        """
+        v = np.asarray(speed_m_s, dtype=float)
+        if self.current_A is None or self.voltage_V is None or self.k is None:
+            return np.full(v.shape, math.nan)
+        with np.errstate(divide="ignore"):
+            return np.asarray(self.k * self.voltage_V * self.current_A / np.abs(v))
 
 
 @dataclass(frozen=True)
@@ -127,3 +200,36 @@ def speed_statistics(
     return SpeedStatistics(
         mean, float(speed.min()), float(speed.max()), spread / mean, outside, total, float(t_on[-1] - t_on[0])
     )
+
+
+def speed_along(time: ArrayLike, p_B: ArrayLike, window_s: float = 0.05) -> Array:
+    """Speed (N,) m/s of a point at each sample: its path over the window around it, so that a robot's noise is no speed.
+
+    Args:
+        time: (N,) s, rising; p_B: (N,3) m.
+        window_s: at the ends, half of it.
+
+    Raises:
+        ProcessLogError: the lengths differ, there are fewer than two samples, or time does not rise.
+    """
+    t, p = np.asarray(time, dtype=float), np.asarray(p_B, dtype=float)
+    if len(t) != len(p) or len(t) < 2 or not (np.diff(t) > 0.0).all():
+        raise ProcessLogError("A speed needs at least two points, and a time for each that rises.")
+    first, last = np.maximum(t - 0.5 * window_s, t[0]), np.minimum(t + 0.5 * window_s, t[-1])
+    ends = [np.column_stack([np.interp(at, t, p[:, k]) for k in range(3)]) for at in (first, last)]
+    return np.asarray(np.linalg.norm(ends[1] - ends[0], axis=1) / (last - first))
+
+
+def torch_angles(R_BT: ArrayLike, up_B: ArrayLike, work_angle_rad: float = 0.0) -> tuple[Array, Array]:
+    """Work and travel angle (N,), rad: how far the tool leans across and along its chord from the surface's normal.
+
+    Args:
+        R_BT: (N,3,3) orientation of T, x_T from torch to tip; up_B: (N,3) unit normals of the surface beside the torch.
+        work_angle_rad: the wanted work angle, which the first answer is measured from.
+
+    Positive travel: the tip is higher than the torch; positive work: the tool's left is.
+    """
+    R, up = np.asarray(R_BT, dtype=float), np.asarray(up_B, dtype=float)
+    along = np.clip(np.einsum("ni,ni->n", R[:, :, 0], up), -1.0, 1.0)
+    across = np.clip(np.einsum("ni,ni->n", R[:, :, 1], up), -1.0, 1.0)
+    return np.arcsin(across) - work_angle_rad, np.arcsin(along)

@@ -24,6 +24,7 @@ from weldcal.tools.calibrate import calibrate_dataset
 from weldcal.tools.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.outcome import calibration_error
 from weldcal.tools.simulation import run_cell
+from weldcal.welding.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
 TOLD = """
@@ -85,6 +86,20 @@ def test_the_torch_burns_only_while_the_servo_tracks_or_finishes(short_job: Demo
     assert set(np.unique(log.telemetry["phase"][log.torch_on])) <= {1.0, 2.0, 3.0}
 
 
+def test_the_weld_log_says_what_was_done(short_job: DemoResult) -> None:
+    assert short_job.weld is not None
+    record, config = load_weld_log(short_job.folder), short_job.run.cell.servo_config
+    assert np.diff(record["time_s"]) == pytest.approx(np.full(len(record) - 1, config.period_s)), "a row per servo tick"
+    assert (record.torch_on == short_job.weld.log.torch_on).all()
+    # The wire point from measured joints against the body in the plant, which shows the step before: 2 ms at 8 mm/s.
+    assert record.points("p_BW") == pytest.approx(short_job.weld.log.p_BTorch, abs=0.1e-3)
+    burning = record.torch_on
+    assert record["torch_speed_m_s"][burning].mean() == pytest.approx(config.weld_speed_m_s, rel=0.02)
+    assert np.abs(np.degrees(record["work_angle_rad"][burning])).max() < 3.0
+    assert np.isnan(record["heat_input_J_m"]).all(), "the scenario says nothing of current and voltage"
+    assert record.settings["seed"] == short_job.options.seed
+
+
 def test_the_scans_of_a_run_give_the_same_calibration_again(short_job: DemoResult, tmp_path: Path) -> None:
     report = calibrate_dataset(short_job.folder / "scans", tmp_path / "again")
     assert short_job.status.estimate is not None
@@ -135,6 +150,12 @@ def assert_at_rest_with_torch_off(result: DemoResult) -> None:
     assert result.weld is not None
     on = result.weld.log.torch_on
     assert on.any(), "the weld had begun"
+    record = load_weld_log(result.folder)
+    last = int(np.flatnonzero(record.torch_on)[-1])
+    assert last < len(record) - 3
+    assert record["torch_speed_m_s"][last : last + 3].min() > 1e-3, (
+        "the arm was still on its way when the torch went off"
+    )
     simulator.clear_monitor()
     simulator.AdvanceTo(simulator.get_context().get_time() + 1.0)
     station = cell.station.diagram

@@ -206,6 +206,7 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         "The robot stopped: PROTECTIVE",
     ),
     "robot fault": ("park", 0.1, {"robot": UrStatus(fault="WALL: it hit a wall.")}, "^WALL: it hit a wall.$"),
+    "a singular arm": ("weld", 0.1, {"arm_stopped": True}, "too near to a singular position"),
     "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person held the job, in the phase 'weld'"),
     "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
     "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),
@@ -309,6 +310,7 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
     system.GetInputPort("position_measured").FixValue(context, Q_HOME)
     system.GetInputPort("settled_goal").FixValue(context, [0.0])
     system.GetInputPort("hold").FixValue(context, [0.0])
+    system.GetInputPort("arm_stopped").FixValue(context, [0.0])
     simulator.AdvanceTo(0.05)
     job: JobCommand = system.GetOutputPort("job").Eval(context)
     assert (job.phase, job.goal_id) == ("park", 1)

@@ -44,6 +44,7 @@ from weldcal.systems.messages import (
 )
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
+from weldcal.systems.process_switch import ProcessSwitch
 from weldcal.systems.scenario import VisualizationConfig
 from weldcal.systems.seam_planner import SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
@@ -75,6 +76,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
+    ProcessSwitch: ProcessSwitch,
     CommandArbiter: CommandArbiter,
     FlangeMover: FlangeMover,
     SlewLimiter: lambda: SlewLimiter(SlewLimits()),
@@ -142,6 +144,15 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "torch_on": 1,
     },
     SingularityGuard: {"V_BT": 6, "position_measured": 6, "velocity": 6, "margin": 2, "guarded": 8},
+    ProcessSwitch: {
+        "torch_wanted": 1,
+        "job": JobCommand,
+        "robot_status": UrStatus,
+        "margin": 2,
+        "hold": 1,
+        "process_on": 1,
+        "arm_stopped": 1,
+    },
     CommandArbiter: {
         "job": JobCommand,
         "robot_status": UrStatus,
@@ -166,6 +177,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,
         "hold": 1,
+        "arm_stopped": 1,
         "job": JobCommand,
         "job_state": JobState,
         "scan_trigger": 1,
@@ -189,6 +201,8 @@ FEEDTHROUGH: dict[type[LeafSystem], set[tuple[str, str]]] = {
     SingularityGuard: {(i, o) for i in ("V_BT", "position_measured") for o in ("velocity", "margin", "guarded")},
     CommandArbiter: {(i, "velocity_wanted") for i in ("job", "robot_status", "mover_velocity", "servo_velocity")},
     WeldingVelocityServo: {("job", "torch_on")},  # the process goes off in the very tick in which the job says so
+    # whoever stops the arm turns the process off in the same tick
+    ProcessSwitch: {(i, "process_on") for i in ("torch_wanted", "job", "robot_status", "margin", "hold")},
     CheatPoses: {("body_poses", "contact"), ("body_poses", "torch")},
 }
 

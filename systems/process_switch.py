@@ -1,0 +1,69 @@
+"""ProcessSwitch: the process output; whatever is about to stop the arm turns the torch off first, and it stays off."""
+
+from __future__ import annotations
+
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+
+from weldcal.systems.messages import JobCommand, UrStatus
+
+
+class ProcessSwitch(LeafSystem):
+    """Passes on the servo's wish to weld while nothing speaks against it.
+
+    .. pydrake_system::
+
+        name: ProcessSwitch
+        input_ports:
+        - torch_wanted
+        - job
+        - robot_status
+        - margin
+        - hold
+        output_ports:
+        - process_on
+        - arm_stopped
+
+    `torch_wanted` (1) of the servo; `margin` (2) of the SingularityGuard, whose second number is 1 while it stops the arm;
+    `hold` (1) a person's. `process_on` (1) follows all inputs at once: the arm's own command passes through the arbiter and
+    the slew limiter after it, so the torch is off no later than the first tick in which the arm is told to stop.
+    A burning torch that was turned off here stays off for the rest of that weld. `arm_stopped` (1): it was the guard that
+    did it, for the JobSequencer to hold the job.
+    """
+
+    def __init__(self, period_s: float = 0.002) -> None:
+        super().__init__()
+        self._wanted = self.DeclareVectorInputPort("torch_wanted", 1)
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
+        self._margin = self.DeclareVectorInputPort("margin", 2)
+        self._hold = self.DeclareVectorInputPort("hold", 1)
+        state = self.DeclareDiscreteState([0.0, 0.0])  # turned off for this weld; by the guard
+        self.DeclareVectorOutputPort("process_on", 1, self._process)
+        self.DeclareVectorOutputPort("arm_stopped", 1, self._arm_stopped, {self.discrete_state_ticket(state)})
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._latch)
+
+    def _stopped(self, context: Context) -> bool:
+        return bool(self._margin.Eval(context)[1] > 0.5)
+
+    def _free(self, context: Context) -> bool:
+        """Whether robot, guard and person all let the process run."""
+        ready = self._status.Eval(context).ready
+        return bool(ready and not self._stopped(context) and self._hold.Eval(context)[0] < 0.5)
+
+    def _latch(self, context: Context, discrete: DiscreteValues) -> None:
+        off, stopped = context.get_discrete_state_vector().value()
+        if self._job.Eval(context).mode != "weld":
+            off = stopped = 0.0
+        elif self._wanted.Eval(context)[0] > 0.5 and not self._free(context):
+            off, stopped = 1.0, max(stopped, float(self._stopped(context)))
+        discrete.set_value([off, stopped])
+
+    def _process(self, context: Context, output: BasicVector) -> None:
+        job: JobCommand = self._job.Eval(context)
+        off = context.get_discrete_state_vector().value()[0] > 0.5
+        consent = job.process_on and not job.held and self._wanted.Eval(context)[0] > 0.5
+        output.SetAtIndex(0, float(consent and not off and self._free(context)))
+
+    def _arm_stopped(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, context.get_discrete_state_vector().value()[1])

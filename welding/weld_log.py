@@ -1,0 +1,221 @@
+"""The weld log on disk: a CSV with one row per servo tick and a JSON header that says what each column is, and in what unit."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.models.errors import InputError
+from weldcal.welding.process import WeldProcess
+from weldcal.welding.vectors import Array
+
+SCHEMA, VERSION = "weldcal weld log", 1
+CSV_NAME, HEADER_NAME = "weld.csv", "weld.json"
+
+
+class WeldLogError(InputError):
+    """A weld log that cannot be read."""
+
+
+class Column(NamedTuple):
+    """A column of the CSV: its name (unit included), unit, frame ("" for a scalar) and meaning."""
+
+    name: str
+    unit: str
+    frame: str
+    meaning: str
+
+
+def _vector(name: str, axes: str, unit: str, frame: str, meaning: str, suffix: str) -> tuple[Column, ...]:
+    return tuple(Column(f"{name}_{axis}{suffix}", unit, frame, meaning) for axis in axes)
+
+
+COLUMNS: tuple[Column, ...] = (
+    Column("time_s", "s", "", "servo tick, on the robot's clock"),
+    Column("phase", "", "", "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT"),
+    Column("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and person all agree"),
+    Column("s_tip_m", "m", "planned seam", "arc length beside the tip"),
+    Column("s_torch_m", "m", "planned seam", "arc length beside the torch; negative before the seam"),
+    *_vector("p_BW", "xyz", "m", "B", "torch (wire) point, from the measured joints", "_m"),
+    *_vector("q_BW", "wxyz", "", "B", "orientation of the torch frame W, whose axes are those of T", ""),
+    *_vector("p_BT", "xyz", "m", "B", "origin of T, the tip's rest point: the robot end effector of the paper", "_m"),
+    *_vector("q_BT", "wxyz", "", "B", "orientation of T: x from torch to tip, z up from the work", ""),
+    *_vector("deflection", "xyz", "m", "T", "the tip's displacement from rest, as the tag shows it", "_m"),
+    Column("delta_n_m", "m", "seam", "lateral deflection that the servo acts on, gain corrected"),
+    Column("delta_axial_m", "m", "seam", "axial deflection that the servo acts on, gain corrected"),
+    *_vector("p_BTip", "xyz", "m", "B", "newest felt point of the tip, at its picture's own time", "_m"),
+    *_vector("p_BSeam", "xyz", "m", "B", "point of the refined seam beside the torch, which the torch is led to", "_m"),
+    Column("e_t_m", "m", "seam", "torch off the refined seam, positive to the left of travel"),
+    Column("e_height_m", "m", "seam", "torch off the refined seam, positive upwards"),
+    Column("torch_speed_m_s", "m/s", "B", "speed of the torch point, its path over 50 ms"),
+    Column("torch_speed_commanded_m_s", "m/s", "B", "torch speed that the servo asked for"),
+    Column("tip_speed_m_s", "m/s", "B", "speed along the seam that the servo asked of the tip"),
+    Column("omega_rad_s", "rad/s", "T", "commanded turning rate about the tool's up axis"),
+    Column("n_d_dot_n_t", "", "", "the measure by which the published law divides"),
+    Column("conditioning", "", "", "of the guarded law's equations, 0 to sqrt 2"),
+    Column("work_angle_rad", "rad", "planned seam", "lean across the chord, from the wanted work angle"),
+    Column("travel_angle_rad", "rad", "planned seam", "lean along the chord, positive where the tip is higher"),
+    Column("heat_input_J_m", "J/m", "", "k U I / v while the arc burns (1 kJ/mm = 1e6 J/m); nan where not known"),
+    Column("gain", "", "", "gain of the tag in use, from the touch-on calibration"),
+    Column("n_points", "", "", "committed tactile points so far"),
+    Column("sigma_min", "", "", "least singular value of the arm's length-scaled Jacobian"),
+)
+NAMES = tuple(c.name for c in COLUMNS)
+_NUMBERS = tuple(name for name in NAMES if name != "phase")
+
+
+@dataclass(frozen=True, eq=False)
+class WeldRecord:
+    """A weld, row by row.
+
+    Attributes:
+        columns: (N,) arrays by the names in COLUMNS, SI units; NaN where a phase has no such thing.
+        phase: (N,) words.
+        process: the arc as it was set.
+        settings: what the weld was asked for (weld_speed_m_s, delta_d_m ...) and where it is from (scenario, seed, robot ...).
+    """
+
+    columns: Mapping[str, Array]
+    phase: NDArray[np.str_]
+    process: WeldProcess = field(default_factory=WeldProcess)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.phase)
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    @property
+    def torch_on(self) -> NDArray[np.bool_]:
+        """Where the arc burned, (N,)."""
+        return np.asarray(self.columns["torch_on"] > 0.5)
+
+    def points(self, name: str) -> Array:
+        """A point or displacement (N,3) m: "p_BW", "p_BT", "p_BTip", "p_BSeam" or "deflection"."""
+        return np.column_stack([self.columns[f"{name}_{axis}_m"] for axis in "xyz"])
+
+    def pose(self, name: str, row: int) -> RigidTransform:
+        """X_BW ("BW") or X_BT ("BT") at a row."""
+        q = np.array([self.columns[f"q_{name}_{axis}"][row] for axis in "wxyz"])
+        return RigidTransform(RotationMatrix(Quaternion(q / np.linalg.norm(q))), self.points(f"p_{name}")[row])
+
+
+def weld_log_texts(record: WeldRecord) -> tuple[str, str]:
+    """The record as (CSV, JSON header), to be written side by side as weld.csv and weld.json.
+
+    Raises:
+        WeldLogError: a column is missing or has another length.
+    """
+    for name in _NUMBERS:
+        if name not in record.columns or len(record.columns[name]) != len(record):
+            raise WeldLogError(f"The weld log lacks the column '{name}', or it has not {len(record)} rows.")
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(NAMES)
+    for k in range(len(record)):
+        writer.writerow(
+            str(record.phase[k]) if name == "phase" else f"{float(record.columns[name][k]):.8g}" for name in NAMES
+        )
+    text = table.getvalue()
+    header = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "units": "SI; each column names its own",
+        "rows": len(record),
+        "sha256": hashlib.sha256(text.encode()).hexdigest(),
+        "settings": dict(record.settings),
+        "process": {
+            **asdict(record.process),
+            "efficiency_in_use": record.process.k,
+            "values": "as set, not measured",
+            "heat_input": record.process.missing or "k U I / v, EN 1011-1",
+        },
+        "columns": [c._asdict() for c in COLUMNS],
+    }
+    return text, json.dumps(header, indent=1, allow_nan=False) + "\n"
+
+
+def load_weld_log(path: Path | str) -> WeldRecord:
+    """Read a weld log back.
+
+    Args:
+        path: the folder, its weld.csv or its weld.json.
+
+    Raises:
+        WeldLogError: one sentence that says what is missing, damaged or of another version.
+    """
+    given = Path(path)
+    folder = given if given.is_dir() else given.parent
+    stem = CSV_NAME.removesuffix(".csv") if given.is_dir() else given.stem
+    header_path, csv_path = folder / f"{stem}.json", folder / f"{stem}.csv"
+    header = _header(_text(header_path), header_path)
+    text = _text(csv_path)
+    if hashlib.sha256(text.encode()).hexdigest() != header["sha256"]:
+        raise WeldLogError(
+            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; take the original."
+        )
+    rows = list(csv.reader(io.StringIO(text)))
+    if len(rows) != header["rows"] + 1:
+        raise WeldLogError(f"{csv_path} has {len(rows) - 1} rows, and {header_path.name} says {header['rows']}.")
+    names = rows[0]
+    missing = [name for name in NAMES if name not in names]
+    if missing:
+        raise WeldLogError(f"{csv_path} lacks the column '{missing[0]}'.")
+    columns = {name: np.empty(len(rows) - 1) for name in _NUMBERS}
+    for k, row in enumerate(rows[1:]):
+        for name in _NUMBERS:
+            try:
+                columns[name][k] = float(row[names.index(name)])
+            except (ValueError, IndexError):
+                raise WeldLogError(f"{csv_path}: line {k + 2} has no number in the column '{name}'.") from None
+    phase = np.array([row[names.index("phase")] for row in rows[1:]], dtype=np.str_)
+    keys = ("name", "current_A", "voltage_V", "efficiency", "wire_feed_m_min")
+    process = WeldProcess(**{key: header["process"].get(key) for key in keys})
+    return WeldRecord(columns, phase, process, header["settings"])
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise WeldLogError(f"There is no {path}: a weld log is {CSV_NAME} and {HEADER_NAME} side by side.") from None
+    except (OSError, UnicodeDecodeError) as problem:
+        raise WeldLogError(f"{path} cannot be read as text ({type(problem).__name__}); take the original.") from None
+
+
+def _header(text: str, path: Path) -> dict[str, Any]:
+    try:
+        header = json.loads(text)
+    except json.JSONDecodeError as problem:
+        raise WeldLogError(f"{path} is not whole JSON (line {problem.lineno}); take the original.") from None
+    if not isinstance(header, dict) or header.get("schema") != SCHEMA:
+        raise WeldLogError(f"{path} is not the header of a weld log: its schema is not '{SCHEMA}'.")
+    if header.get("version") != VERSION:
+        raise WeldLogError(f"{path} has version {header.get('version')}; this weldcal reads version {VERSION}.")
+    wanted = {"rows": int, "sha256": str, "settings": dict, "process": dict}
+    for key, kind in wanted.items():
+        if not isinstance(header.get(key), kind):
+            raise WeldLogError(f"{path} has no usable '{key}'; take the original.")
+    return header
+
+
+def heat_summary(record: WeldRecord) -> tuple[float, float] | None:
+    """Mean and largest heat input in kJ/mm over the weld, by time; None where it is not known."""
+    heat = record["heat_input_J_m"][record.torch_on]
+    good = heat[np.isfinite(heat)]
+    if record.process.missing is not None or not len(good):
+        return None
+    return 1e-6 * float(good.mean()), 1e-6 * float(good.max()) if len(good) == len(heat) else math.inf
