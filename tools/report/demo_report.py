@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
-from weldcal.tools.report import plots_demo
+from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
+from weldcal.welding.process import speed_along
 
 if TYPE_CHECKING:
     from weldcal.tools.demo import DemoResult
@@ -40,9 +41,10 @@ def demo_pictures(result: DemoResult) -> dict[str, bytes]:
         required = cell.scenario.calibration.required_error_mm * 1e-3
         pictures["convergence"] = plots_demo.convergence(status, required)
     if weld is not None:
-        pictures["seam"] = plots_demo.seam_paths(weld)
-        pictures["errors"] = plots_demo.error_along_seam(weld)
-        pictures["along"] = plots_demo.along_the_weld(weld, cell.servo_config.weld_speed_m_s)
+        trace = plots_demo.weld_trace(weld, cell.servo_config)
+        if len(trace.s) > 1:
+            pictures["seam"] = plots_weld.paths(trace)
+            pictures["along"] = plots_weld.along_the_weld(trace)
     return pictures
 
 
@@ -70,6 +72,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         weld=weld,
         tip_error_mm=None if weld is None else 1e3 * plots_demo.tip_error(weld),
         pictures=pictures,
+        heat=_process(result),
         pose=pose,
         observations=_observations(result),
         timing=_timing(result),
@@ -96,6 +99,25 @@ def _observations(result: DemoResult) -> list[tuple[str, ...]]:
         for v in status.verifications
     ]
     return rows + [(label, f"refused: {reason}", "", "") for label, reason in status.refused]
+
+
+def _process(result: DemoResult) -> list[tuple[str, str]]:
+    """The arc as it was set, and the heat it brought in where that can be said."""
+    weld, process = result.weld, result.run.cell.scenario.welding.process.process()
+    if weld is None or not weld.log.torch_on.any():
+        return []
+    if process.missing is not None:
+        return [("heat input", f"not known: {process.missing}")]
+    log = weld.log
+    heat = 1e-6 * process.heat_input(speed_along(log.time, log.p_BTorch)[log.torch_on])
+    least, mean, most = (fixed(float(f(heat)), 3) for f in (np.min, np.mean, np.max))
+    return [
+        (
+            "process",
+            f"{process.name or 'not named'}, {process.current_A:g} A, {process.voltage_V:g} V as set; k = {process.k:g}",
+        ),
+        ("heat input", f"{mean} kJ/mm (mean; from {least} to {most})"),
+    ]
 
 
 def _timing(result: DemoResult) -> list[tuple[str, ...]]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from weldcal.calibration.result import software_version
+from weldcal.tools.report.plots_weld import along_the_weld, paths
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.studies.plots import along_the_weld, paths
+from weldcal.tools.studies.plots import weld_trace
 from weldcal.tools.studies.weld_files import FIGURE_NAMES, compared_lines, table_lines
+from weldcal.tools.studies.weld_study import study_config
 
 if TYPE_CHECKING:
     from weldcal.tools.studies.weld_command import Study
@@ -30,10 +32,11 @@ def study_report(study: Study) -> str:
             "title": TITLES.get(case.seam, case.seam.replace("_", " ")),
             "sentence": f"{case.name}, seed {study.options.first_seed}: mean {fixed(m.mean_mm, 3)} mm, largest "
             f"{fixed(m.max_mm, 3)} mm, torch speed CV {fixed(m.cv_percent, 1)} %, turning rate up to {fixed(m.omega_rad_s, 2)} rad/s.",
-            "paths": paths(run),
-            "along": along_the_weld(run, case.speed_m_s),
+            "paths": paths(trace),
+            "along": along_the_weld(trace),
+            "bent": trace.work is not None,
         }
-        for case, run, m in study.pictured
+        for case, trace, m in ((case, weld_trace(run, study_config(case)), m) for case, run, m in study.pictured)
     ]
     usual = any(row.row.key == key for row in study.rows for key, _ in _CARDS)
     cards = [

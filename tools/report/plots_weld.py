@@ -1,0 +1,284 @@
+"""The pictures of a weld: who went where (the paper's Fig. 13), and how it went along the seam."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+OURS, THEIRS, TRUTH, PLANNED, TORCH, ROBOT = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab", "#d9700f", "#5b7d4e"
+_SMALL = 8
+_DOTTED = (0, (1.2, 0.7))
+
+
+@dataclass(frozen=True, eq=False)
+class WeldTrace:
+    """A weld as the pictures need it, SI units; N rows from the first contact on.
+
+    Attributes:
+        s: (N,) the torch along the seam, m, negative before it; torch_on, felt: (N,) arc burning, tip in contact.
+        tip, torch, robot: (N,3) paths; planned, true: (M,3) lines, as far as they are known.
+        plan_error, torch_error: (arc length, lateral, height) off the true seam, m; None where there is no truth.
+        delta_n, delta_axial, speed, omega, n_d_dot_n_t: (N,); speed is the torch's, m/s.
+        e_t: (N,) the servo's own estimate of the torch off the refined seam, m; drawn where there is no truth.
+        weld_speed, delta_d, axial_d, omega_max: what the weld was asked for.
+        work, travel: (N,) rad; foretold: (N,) travel angle that the seam foretells; windows: their (work, travel) limits.
+        axes: which coordinates are drawn to the right and up, and their names.
+    """
+
+    s: Array
+    torch_on: NDArray[np.bool_]
+    felt: NDArray[np.bool_]
+    tip: Array
+    torch: Array
+    robot: Array
+    planned: Array | None
+    true: Array | None
+    plan_error: tuple[Array, Array, Array] | None
+    torch_error: tuple[Array, Array, Array] | None
+    delta_n: Array
+    delta_axial: Array
+    speed: Array
+    omega: Array
+    n_d_dot_n_t: Array
+    weld_speed: float
+    delta_d: float
+    axial_d: float
+    omega_max: float
+    e_t: Array | None = None
+    work: Array | None = None
+    travel: Array | None = None
+    foretold: Array | None = None
+    windows: tuple[float, float] = (np.inf, np.inf)
+    axes: tuple[int, int] = (0, 1)
+    names: tuple[str, str] = field(default=("x, mm", "y, mm"))
+
+
+def svg(figure: Figure) -> bytes:
+    """The figure as SVG bytes, the same for the same figure."""
+    stream = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "weldcal"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue()
+
+
+def plain(axes: Axes, x: str, y: str) -> None:
+    """Axis labels, no box, a faint grid."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25)
+
+
+def paths(trace: WeldTrace) -> bytes:
+    """Planned and true seam, tip, torch and robot from above, the piece where they differ most, and the lateral errors."""
+    i, j = trace.axes
+    reach = np.ptp(np.vstack([trace.robot, trace.torch]), axis=0)
+    wide = reach[i] > 1.8 * reach[j]
+    if wide:
+        height = float(np.clip(6.6 * reach[j] / max(reach[i], 1e-6) + 0.75, 1.15, 3.6))
+        picture = Figure(figsize=(7.4, height + 3.2), layout="constrained")
+        panes = picture.subplot_mosaic([["above", "above"], ["zoom", "error"]], height_ratios=[height, 2.5])
+    else:
+        picture = Figure(figsize=(7.4, 5.6), layout="constrained")
+        panes = picture.subplot_mosaic([["above", "zoom"], ["above", "error"]], width_ratios=[1.15, 1.0])
+    above, zoom, error = panes["above"], panes["zoom"], panes["error"]
+    for axes in (above, zoom):
+        _lines(axes, trace)
+        axes.set_aspect("equal")
+        plain(axes, *trace.names)
+    low, size = _closest_look(trace)
+    zoom.set_xlim(1e3 * low[0], 1e3 * (low[0] + size))
+    zoom.set_ylim(1e3 * low[1], 1e3 * (low[1] + size))
+    zoom.set_title("the framed piece", fontsize=_SMALL + 1)
+    above.add_patch(
+        Rectangle((1e3 * low[0], 1e3 * low[1]), 1e3 * size, 1e3 * size, fill=False, edgecolor="black", linewidth=0.8)
+    )
+    above.margins(0.06)
+    _lateral(error, trace)
+    picture.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    return svg(picture)
+
+
+def _lines(axes: Axes, trace: WeldTrace) -> None:
+    """Each told from the others by width and dash as well as by colour."""
+    i, j = trace.axes
+    felt, on = trace.felt, trace.torch_on
+    drawn: Iterable[tuple[Array | None, dict[str, object]]] = (
+        (trace.planned, {"color": PLANNED, "lw": 3.5, "ls": _DOTTED, "label": "planned seam"}),
+        (trace.tip[felt], {"color": OURS, "lw": 4.5, "alpha": 0.45, "label": "tip, as felt"}),
+        (trace.torch[on], {"color": TORCH, "lw": 2.0, "label": "torch, arc on"}),
+        (trace.robot, {"color": ROBOT, "lw": 1.2, "ls": "-.", "label": "robot (the tip's rest point)"}),
+        (trace.true, {"color": "black", "lw": 0.9, "ls": (0, (4, 3)), "label": "true seam (simulation only)"}),
+    )
+    for line, style in drawn:
+        if line is not None and len(line):
+            axes.plot(1e3 * line[:, i], 1e3 * line[:, j], **style)  # type: ignore[arg-type]
+
+
+def _closest_look(trace: WeldTrace) -> tuple[Array, float]:
+    """Lower left corner (2,) m and side of the square piece to look at: where the seam turns most beside the torch."""
+    i, j = trace.axes
+    burning = np.flatnonzero(trace.torch_on & np.isfinite(trace.n_d_dot_n_t))
+    at = burning[np.argmin(trace.n_d_dot_n_t[burning])] if len(burning) else len(trace.torch) // 2
+    centre = trace.torch[at][[i, j]]
+    size = 0.016
+    return centre - 0.5 * size, size
+
+
+def _lateral(axes: Axes, trace: WeldTrace) -> None:
+    if trace.plan_error is not None:
+        s, lateral, _ = trace.plan_error
+        axes.plot(1e3 * s, 1e3 * lateral, color=PLANNED, lw=3.0, ls=_DOTTED, label="plan")
+    if trace.torch_error is not None:
+        s, lateral, height = trace.torch_error
+        axes.plot(1e3 * s, 1e3 * lateral, color=TORCH, lw=1.6, label="torch")
+        axes.plot(1e3 * s, 1e3 * height, color=OURS, lw=1.0, ls=":", label="torch, height")
+    axes.axhline(0.0, color="black", lw=0.6)
+    plain(axes, "true seam, mm", "off the true seam, mm")
+    axes.margins(y=0.25)
+    if trace.plan_error is None and trace.torch_error is None:
+        if trace.e_t is not None:
+            axes.plot(1e3 * trace.s, 1e3 * np.where(trace.torch_on, trace.e_t, np.nan), color=TORCH, lw=1.6)
+        plain(axes, "planned seam, mm", "torch off the seam\nas it was felt, mm")
+        return
+    axes.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="upper center", columnspacing=1.0, handlelength=1.5)
+
+
+def along_the_weld(trace: WeldTrace) -> bytes:
+    """Deformation of the tip, torch speed, turning rate and n_d . n_t over the torch's place, each with what it is held to."""
+    angles = trace.work is not None and trace.travel is not None
+    rows = 5 if angles else 4
+    picture = Figure(figsize=(7.4, 1.95 * rows), layout="constrained")
+    panes = picture.subplots(rows, 1, sharex=True)
+    _deformation(panes[0], trace)
+    _speed(panes[1], trace)
+    _turning(panes[2], trace)
+    _measure(panes[3], trace)
+    if angles:
+        _angles(panes[4], trace)
+    for axes in panes:
+        _silences(axes, trace)
+    panes[-1].set_xlabel("torch along the seam, mm (negative: before it, arc off)")
+    picture.align_ylabels(panes)
+    return svg(picture)
+
+
+def _note(axes: Axes, text: str, height: float, hangs: str) -> None:
+    """A word at the left edge, where the arc is still off, for a line or band at that height."""
+    place = {"xycoords": ("axes fraction", "data"), "fontsize": _SMALL, "in_layout": False}
+    axes.annotate(text, (0.004, height), va=hangs, **place)  # type: ignore[arg-type]
+
+
+def _deformation(axes: Axes, trace: WeldTrace) -> None:
+    s = 1e3 * trace.s
+    for value, wanted, colour, style, name in (
+        (trace.delta_axial, trace.axial_d, ROBOT, "--", "axial"),
+        (trace.delta_n, trace.delta_d, OURS, "-", "lateral"),
+    ):
+        axes.axhspan(0.9e3 * wanted, 1.1e3 * wanted, color=colour, alpha=0.16, lw=0)
+        axes.plot(s, 1e3 * value, color=colour, lw=1.2, ls=style, label=f"{name}, wanted {1e3 * wanted:g} mm ±10 %")
+    top = 1.5e3 * max(trace.axial_d, trace.delta_d, 0.8 * float(np.nanmax(trace.delta_axial, initial=0.0)))
+    axes.set_ylim(min(0.0, 1.1e3 * float(np.nanmin(trace.delta_n, initial=0.0))), top)
+    axes.legend(frameon=False, fontsize=_SMALL, ncols=2, loc="upper right")
+    plain(axes, "", "deformation of\nthe tip, mm")
+
+
+def _speed(axes: Axes, trace: WeldTrace) -> None:
+    wanted = 1e3 * trace.weld_speed
+    axes.axhspan(0.75 * wanted, 1.25 * wanted, color=TORCH, alpha=0.12, lw=0)
+    axes.axhspan(0.99 * wanted, 1.01 * wanted, color=TORCH, alpha=0.45, lw=0)
+    v = np.where(trace.torch_on, 1e3 * trace.speed, np.nan)
+    axes.plot(1e3 * trace.s, v, color="black", lw=1.0)
+    low, high = (float(f(v)) if np.isfinite(v).any() else wanted for f in (np.nanmin, np.nanmax))
+    axes.set_ylim(min(0.65 * wanted, low - 0.05 * wanted), max(1.35 * wanted, high + 0.05 * wanted))
+    _note(axes, "±25 %", 1.25 * wanted, "top")
+    _note(axes, "±1 %", 1.01 * wanted, "bottom")
+    plain(axes, "", "torch speed,\nmm/s")
+
+
+def _turning(axes: Axes, trace: WeldTrace) -> None:
+    axes.plot(1e3 * trace.s, trace.omega, color=OURS, lw=1.2)
+    for sign in (-1.0, 1.0):
+        axes.axhline(sign * trace.omega_max, color="black", lw=0.9, ls="--")
+    _note(axes, f"limit {trace.omega_max:g} rad/s", 0.97 * trace.omega_max, "top")
+    axes.set_ylim(-1.15 * trace.omega_max, 1.15 * trace.omega_max)
+    plain(axes, "", "turning rate,\nrad/s")
+
+
+def _measure(axes: Axes, trace: WeldTrace) -> None:
+    s, n = 1e3 * trace.s, trace.n_d_dot_n_t
+    axes.plot(s, n, color=TRUTH, lw=1.2)
+    axes.axhline(0.0, color="black", lw=0.9, ls="--")
+    good = np.isfinite(n)
+    low = min(0.0, float(np.nanmin(n))) if good.any() else 0.0
+    axes.set_ylim(low - 0.12, 1.16)
+    _note(axes, "0: here the published law divides by zero", 0.02, "bottom")
+    through = zero_crossings(s, n)
+    axes.plot(through, np.zeros(len(through)), "x", color="black", ms=7, mew=1.6)
+    for k, at in enumerate(through[:3]):
+        text = {
+            "xytext": (0, 9 + 10 * (k % 2)),
+            "textcoords": "offset points",
+            "fontsize": _SMALL,
+            "in_layout": False,
+            "ha": "center",
+        }
+        axes.annotate(f"{at:.0f} mm", (at, 0.0), **text)  # type: ignore[arg-type]
+    if good.any() and not len(through):
+        at = int(np.nanargmin(n))
+        axes.plot(s[at], n[at], "o", color="black", ms=4)
+        text = {"xytext": (6, -4), "textcoords": "offset points", "fontsize": _SMALL, "in_layout": False, "va": "top"}
+        axes.annotate(f"least {n[at]:.2f}, at {s[at]:.0f} mm", (s[at], n[at]), **text)  # type: ignore[arg-type]
+    plain(axes, "", "n$_d$ · n$_t$")
+
+
+def zero_crossings(s: Array, value: Array) -> Array:
+    """Where a value that is sampled at s passes through zero, linearly between samples; NaN breaks the line."""
+    a, b = value[:-1], value[1:]
+    with np.errstate(invalid="ignore"):
+        k = np.flatnonzero((a * b < 0.0) | ((b == 0.0) & (a != 0.0)))
+    k = k[np.isfinite(a[k]) & np.isfinite(b[k])]
+    return np.asarray(s[k] + (s[k + 1] - s[k]) * a[k] / (a[k] - b[k]))
+
+
+def _angles(axes: Axes, trace: WeldTrace) -> None:
+    assert trace.work is not None
+    assert trace.travel is not None
+    s = 1e3 * trace.s
+    values = [trace.work, trace.travel]
+    axes.plot(s, np.degrees(trace.work), color=OURS, lw=1.2, label="work")
+    axes.plot(s, np.degrees(trace.travel), color=TORCH, lw=1.6, ls="--", label="travel")
+    if trace.foretold is not None:
+        axes.plot(s, np.degrees(trace.foretold), color="black", lw=0.9, ls=":", label="travel, foretold by the seam")
+        values.append(trace.foretold)
+    top = 1.6 * max(2.0, float(np.nanmax(np.abs(np.degrees(np.concatenate(values))), initial=0.0)))
+    for limit, name, colour in zip(np.degrees(trace.windows), ("work", "travel"), (OURS, TORCH), strict=True):
+        if limit < top:
+            for sign in (-1.0, 1.0):
+                axes.axhline(sign * limit, color=colour, lw=0.8, ls="--")
+            _note(axes, f"window of the {name} angle", float(limit), "top")
+    axes.set_ylim(-top, top)
+    axes.axhline(0.0, color="black", lw=0.6)
+    axes.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="upper left")
+    plain(axes, "", "angle of\nthe torch, deg")
+
+
+def _silences(axes: Axes, trace: WeldTrace) -> None:
+    """Grey where the tip felt nothing, and a line where the arc was lit and put out."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], ~trace.felt, [False]]).astype(int)))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        axes.axvspan(1e3 * trace.s[a], 1e3 * trace.s[min(b, len(trace.s) - 1)], color="black", alpha=0.07, lw=0)
+    on = np.flatnonzero(trace.torch_on)
+    for k in on[[0, -1]] if len(on) else ():
+        axes.axvline(1e3 * trace.s[k], color="black", lw=0.7, ls=":")
