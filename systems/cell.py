@@ -264,9 +264,9 @@ def _make_cell(scenario: Scenario, station: Station, seed: int, meshcat: Meshcat
             "scan": out("scanner.scan"),
             "planned_seam": welding.seam,
             "servo_report": welding.report,
-            "position_measured": q_measured,
         }
-        add_visualizer(builder, meshcat, station, 0.5 * standard.outer_m, X_BC_guess, scenario.visualization, ports)
+        view, radius = scenario.visualization, 0.5 * standard.outer_m
+        add_visualizer(builder, meshcat, station, radius, X_BC_guess, view, config.weld_speed_m_s, ports)
     logs = {name: LogVectorOutput(port, builder, LOG_PERIOD_S) for name, port in welding.logged.items()}
     diagram = builder.Build()
     diagram.set_name("cell")

@@ -9,20 +9,26 @@ import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat, MeshcatParams
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
+from scipy.spatial import ConvexHull
 
 from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.models.mesh import TriMesh
+from weldcal.models.outline import outline
+from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.cell import Cell, make_cell
 from weldcal.systems.cell_visualizer import ALL_PHASES, ROOT, CellVisualizer
 from weldcal.systems.job_sequencer import PHASES, JobState
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
 from weldcal.systems.phase_labels import TEXT, label_image
 from weldcal.systems.scenario import VisualizationConfig
+from weldcal.systems.weld_gauge import gauge_picture
 from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.welding.seam import SeamCurve
+from weldcal.welding.servo_state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
 
-from .cells import Q_HOME, TOOL, scenario, the_arm
+from .cells import TOOL, scenario
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +92,9 @@ def test_every_phase_has_words_and_a_board_that_shows_them() -> None:
         assert bright[:, 1].max() < 1015
 
 
+PLATE = make_workpiece("straight")
+
+
 class Viewer:
     """The visualizer alone, shown messages by hand."""
 
@@ -93,7 +102,7 @@ class Viewer:
         meshcat.Delete(ROOT)
         self.meshcat = meshcat
         guess = RigidTransform([0.65, 0.0, 0.95])
-        self.system = CellVisualizer(meshcat, the_arm(), TOOL, guess, 0.0315, VisualizationConfig(cloud_points=50))
+        self.system = CellVisualizer(meshcat, TOOL, guess, 0.0315, VisualizationConfig(cloud_points=50), PLATE.mesh)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
         self.show(
@@ -104,7 +113,6 @@ class Viewer:
             planned_seam=PlannedSeam(),
             servo_report=ServoReport(),
         )
-        self.system.GetInputPort("position_measured").FixValue(self.context, Q_HOME)
         self.simulator.Initialize()
 
     def show(self, **messages: object) -> None:
@@ -157,9 +165,81 @@ def test_a_fitted_circle_appears_and_a_refused_one_does_not(viewer: Viewer) -> N
     assert viewer.has("circle/02")
 
 
-def test_the_planned_seam_appears(viewer: Viewer) -> None:
-    seam = SeamCurve.from_points(np.column_stack([np.full(30, 0.65), np.linspace(-0.1, 0.1, 30), np.zeros(30)]))
-    viewer.show(planned_seam=PlannedSeam(1, seam), job_state=JobState(JobCommand(phase="approach_above")))
+SEAM = SeamCurve.from_points(np.column_stack([np.full(30, 0.65), np.linspace(-0.1, 0.1, 30), np.zeros(30)]))
+
+
+def test_the_planned_seam_appears_with_the_drawing_where_it_was_found(viewer: Viewer) -> None:
+    viewer.show(planned_seam=PlannedSeam(1, SEAM), job_state=JobState(JobCommand(phase="approach_above")))
     viewer.run(0.15)
     assert viewer.has("seam/planned")
+    assert not viewer.has("cad"), "no registration, no drawing"
+    viewer.show(planned_seam=PlannedSeam(2, SEAM, RigidTransform([0.65, 0.0, 0.02])))
+    viewer.run(0.15)
+    assert viewer.has("cad")
     assert not viewer.has("seam/torch/000")
+    assert not viewer.has("gauge/000")
+
+
+def tracking(time: float, s: float, torch_on: bool) -> ServoReport:
+    """A report from the middle of a weld along the seam: the torch at arc length s, the tip 2 mm off its rest."""
+    figures = Diagnostics(s_torch=s, n_d_dot_n_t=0.9, p_BTip=SEAM.position(s + 0.06))
+    command = WeldingCommand(np.zeros(6), torch_on, Phase.TRACK, None, figures)
+    delta = np.array([-0.002, 0.0, -0.003])
+    p_BT = SEAM.position(s + 0.06) + delta
+    felt = Measurement(time, SEAM.position(s + 0.06), delta, p_BT)
+    state = WeldingState(phase=Phase.TRACK, measurement=felt)
+    return ServoReport(
+        "TRACK", torch_on, None, command, state, time, RigidTransform(RollPitchYaw(0, 0, np.pi / 2), p_BT)
+    )
+
+
+def test_the_weld_grows_piece_by_piece_with_its_gauge_and_the_arrow_of_the_deflection(viewer: Viewer) -> None:
+    viewer.show(planned_seam=PlannedSeam(1, SEAM, RigidTransform()))
+    for k in range(25):
+        viewer.show(servo_report=tracking(0.1 * k, 0.0008 * k, k > 3))
+        viewer.run(0.1)
+    assert viewer.has("deflection/arrow/unit/head")
+    for path in ("seam/torch/001", "seam/tip/001", "gauge/001"):
+        assert viewer.has(path), path
+    assert not viewer.has("gauge/005"), "a piece a second, and not one a frame"
+    assert not viewer.has("seam/refined/000"), "no point was committed"
+
+
+def test_a_viewer_that_is_only_looked_at_changes_nothing(viewer: Viewer) -> None:
+    viewer.run(0.15)
+    assert viewer.context.num_abstract_states() == 0
+    assert viewer.context.num_total_states() == 0
+
+
+def test_the_gauge_shows_the_speed_where_the_arc_burned() -> None:
+    s = np.linspace(-0.06, 0.1, 80)
+    speed, measure = np.where(s > 0.0, 0.008, np.nan), np.cos(8.0 * s)
+    board = gauge_picture(s, speed, measure, 0.2, 0.008)
+    orange = (np.abs(board.astype(int) - [66, 145, 242]).max(axis=2) < 30).nonzero()
+    blue = (np.abs(board.astype(int) - [235, 190, 110]).max(axis=2) < 30).nonzero()
+    width = board.shape[1]
+    # 0.26 m of seam on the board: the arc burns from 23 % of it to 62 %, the other curve begins at its left edge.
+    assert 0.24 < orange[1].min() / width < 0.30
+    assert 0.60 < orange[1].max() / width < 0.66
+    assert blue[1].min() / width < 0.08
+    assert orange[0].max() < blue[0].min(), "speed above, measure below"
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_a_gauge_of_nothing_is_a_board_all_the_same(n: int) -> None:
+    assert gauge_picture(np.zeros(n), np.full(n, np.nan), np.zeros(n), 0.2, 0.008).std() > 1.0
+
+
+def test_the_outline_of_a_box_is_its_twelve_edges() -> None:
+    corners = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)])
+    faces = ConvexHull(corners)
+    inside = corners.mean(axis=0)
+    triangles = [
+        t if np.cross(*(corners[t[1:]] - corners[t[0]])) @ (corners[t[0]] - inside) > 0 else t[::-1]
+        for t in faces.simplices
+    ]
+    starts, ends = outline(TriMesh(corners, np.array(triangles)))
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    assert sorted(lengths) == pytest.approx([1.0] * 4 + [2.0] * 4 + [3.0] * 4)
+    one = TriMesh(corners[:3], np.array([[0, 1, 2]]))
+    assert len(outline(one)[0]) == 3, "an open face ends at its edges"

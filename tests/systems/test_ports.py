@@ -82,7 +82,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SlewLimiter: lambda: SlewLimiter(SlewLimits()),
     JobSequencer: lambda: JobSequencer(JOB),
     CellVisualizer: lambda: CellVisualizer(
-        Meshcat(MeshcatParams(host="localhost", port=0)), the_arm(), TOOL, X, 0.03, VisualizationConfig()
+        Meshcat(MeshcatParams(host="localhost", port=0)), TOOL, X, 0.03, VisualizationConfig()
     ),
     OperatorPanel: lambda: OperatorPanel(Meshcat(MeshcatParams(host="localhost", port=0))),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
@@ -190,7 +190,6 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "scan": Scan,
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,
-        "position_measured": 6,
     },
     OperatorPanel: {"hold": 1, "pace": 1},
     CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},
