@@ -56,10 +56,10 @@ def _strip(
     colour: tuple[int, int, int],
 ) -> None:
     cv2.rectangle(board, (_LEFT, top + 45), (_RIGHT, top + 165), _BAND, -1)
-    cv2.putText(board, heading, (_LEFT, top + 30), _FONT, 1.0, _INK, 2, cv2.LINE_AA)
+    cv2.putText(board, heading, (_LEFT, top + 33), _FONT, 1.35, _INK, 2, cv2.LINE_AA)
     good = np.isfinite(x) & np.isfinite(y)
     if good.sum() > 1:
-        cv2.polylines(board, [_place(x[good], y[good], span, reach, top)], False, colour, 4, cv2.LINE_AA)
+        cv2.polylines(board, [_place(x[good], y[good], span, reach, top)], False, colour, 6, cv2.LINE_AA)
 
 
 def _dashed(board: Picture, top: int, span: tuple[float, float], reach: tuple[float, float], level: float) -> None:

@@ -20,6 +20,7 @@ from weldcal.tools.outcome import (
     WeldOutcome,
     calibration_error,
     calibration_status,
+    heat_input_kJ_mm,
     weld_outcome,
 )
 from weldcal.tools.report.demo_report import demo_pictures, demo_report
@@ -96,6 +97,8 @@ class DemoResult:
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
             found["torch_speed_cv"] = self.weld.speed.cv
             found["welded_mm"] = 1e3 * self.weld.speed.welded_m
+            heat = heat_input_kJ_mm(self.weld, self.run.cell.scenario.welding.process.process())
+            found["heat_input_kJ_mm"] = None if heat is None else float(heat.mean())
         if self.weld is not None:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m

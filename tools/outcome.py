@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
-from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
+from weldcal.welding.process import PathError, SpeedStatistics, WeldProcess, path_error, speed_along, speed_statistics
 from weldcal.welding.seam import SeamCurve
 from weldcal.welding.servo_state import Phase
 
@@ -108,8 +108,7 @@ def weld_log(cell: Cell, root: Context) -> WeldLog | None:
     telemetry = series["telemetry"].data()
     ticks = telemetry[TELEMETRY.index("tick_time")]
     keep = (telemetry[0] >= 0.0) & (telemetry[0] != PHASE_CODES[Phase.DONE])
-    # After a fault the last report stands: one row of each tick.
-    keep &= np.concatenate([[True], ~(ticks[1:] == ticks[:-1])])
+    keep &= new_ticks(ticks)
     if keep.sum() < 3:
         return None
     tool = cell.station.tool
@@ -130,6 +129,15 @@ def weld_log(cell: Cell, root: Context) -> WeldLog | None:
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"].data()[0, keep]),
     )
+
+
+def new_ticks(ticks: Array) -> NDArray[np.bool_]:
+    """Which of the ticks' times (N,) s, NaN outside a weld, are later than all before.
+
+    After a fault the last report stands, and a robot's clock may stand still for a moment or start anew.
+    """
+    newest = np.fmax.accumulate(np.nan_to_num(ticks, nan=-np.inf))
+    return np.asarray(ticks > np.concatenate([[-np.inf], newest[:-1]]))
 
 
 def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
@@ -154,3 +162,10 @@ def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
         return WeldOutcome(log, seam, plan, None, None, plan_error)
     speed = speed_statistics(log.time, log.p_BTorch, log.torch_on, cell.servo_config.weld_speed_m_s)
     return WeldOutcome(log, seam, plan, path_error(log.p_BTorch[log.torch_on], seam), speed, plan_error)
+
+
+def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:
+    """Heat input at each row at which the arc burned, kJ/mm as welders read it; None where it is not known."""
+    if process.missing is not None or not weld.log.torch_on.any():
+        return None
+    return 1e-6 * process.heat_input(speed_along(weld.log.time, weld.log.p_BTorch)[weld.log.torch_on])

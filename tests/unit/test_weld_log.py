@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
+from weldcal.tools.outcome import new_ticks
 from weldcal.welding.process import WeldProcess
 from weldcal.welding.weld_log import (
     COLUMNS,
@@ -144,3 +145,8 @@ def test_every_column_is_in_the_document_with_its_unit_and_frame(repository: Pat
     document = (repository / "docs" / "weld_log.md").read_text()
     for c in COLUMNS:
         assert re.search(rf"^\| `{c.name}` \| {re.escape(c.unit) or '-'} \| {c.frame or '-'} \| {re.escape(c.meaning)} \|$", document, re.M), c.name  # fmt: skip
+
+
+def test_a_row_is_written_once_for_each_tick() -> None:
+    ticks = np.array([np.nan, 1.0, 1.008, 1.008, np.nan, 1.016, 0.5, 1.024])
+    assert new_ticks(ticks).tolist() == [False, True, True, False, False, True, False, True]

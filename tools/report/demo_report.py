@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
+from weldcal.tools.outcome import heat_input_kJ_mm
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
-from weldcal.welding.process import speed_along
 
 if TYPE_CHECKING:
     from weldcal.tools.demo import DemoResult
@@ -104,12 +104,13 @@ def _observations(result: DemoResult) -> list[tuple[str, ...]]:
 def _process(result: DemoResult) -> list[tuple[str, str]]:
     """The arc as it was set, and the heat it brought in where that can be said."""
     weld, process = result.weld, result.run.cell.scenario.welding.process.process()
-    if weld is None or not weld.log.torch_on.any():
+    if weld is None:
         return []
     if process.missing is not None:
         return [("heat input", f"not known: {process.missing}")]
-    log = weld.log
-    heat = 1e-6 * process.heat_input(speed_along(log.time, log.p_BTorch)[log.torch_on])
+    heat = heat_input_kJ_mm(weld, process)
+    if heat is None:
+        return []
     least, mean, most = (fixed(float(f(heat)), 3) for f in (np.min, np.mean, np.max))
     return [
         (
