@@ -74,6 +74,7 @@ welding:
   axial_deflection_mm: 2.5
   clearance_mm: 30.0
   seam_length_mm: 100.0
+  process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
 job:
   calibrate: false
   weld: false

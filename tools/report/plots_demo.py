@@ -64,7 +64,7 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
         travel=travel,
         windows=(config.windows.work_rad, config.windows.travel_rad),
         axes=(1, 0),
-        names=("y of the base, mm", "x of the base, mm"),
+        names=("y, mm", "x, mm"),
     )
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 OURS, THEIRS, TRUTH, PLANNED, TORCH, ROBOT = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab", "#d9700f", "#5b7d4e"
 _SMALL = 8
+_ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
 _DOTTED = (0, (1.2, 0.7))
 
 
@@ -83,7 +84,8 @@ def plain(axes: Axes, x: str, y: str) -> None:
 def paths(trace: WeldTrace) -> bytes:
     """Planned and true seam, tip, torch and robot from above, the piece where they differ most, and the lateral errors."""
     i, j = trace.axes
-    reach = np.ptp(np.vstack([trace.robot, trace.torch]), axis=0)
+    drawn = [line for line in (trace.robot, trace.torch, trace.planned, trace.true) if line is not None]
+    reach = np.ptp(np.vstack(drawn), axis=0)
     wide = reach[i] > 1.8 * reach[j]
     if wide:
         height = float(np.clip(6.6 * reach[j] / max(reach[i], 1e-6) + 0.75, 1.15, 3.6))
@@ -235,7 +237,7 @@ def _measure(axes: Axes, trace: WeldTrace) -> None:
             "ha": "center",
         }
         axes.annotate(f"{at:.0f} mm", (at, 0.0), **text)  # type: ignore[arg-type]
-    if good.any() and not len(through):
+    if good.any() and not len(through) and float(np.nanmin(n)) < _ALONG:
         at = int(np.nanargmin(n))
         axes.plot(s[at], n[at], "o", color="black", ms=4)
         text = {"xytext": (6, -4), "textcoords": "offset points", "fontsize": _SMALL, "in_layout": False, "va": "top"}
@@ -275,7 +277,7 @@ def _angles(axes: Axes, trace: WeldTrace) -> None:
 
 
 def _silences(axes: Axes, trace: WeldTrace) -> None:
-    """Grey where the tip felt nothing, and a line where the arc was lit and put out."""
+    """Grey where the tip does not steer, and a line where the arc was lit and put out."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~trace.felt, [False]]).astype(int)))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         axes.axvspan(1e3 * trace.s[a], 1e3 * trace.s[min(b, len(trace.s) - 1)], color="black", alpha=0.07, lw=0)
