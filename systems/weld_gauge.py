@@ -35,8 +35,8 @@ def gauge_picture(s: Array, speed: Array, n_d_dot_n_t: Array, s_end: float, weld
     _dashed(board, 210, span, (-0.25, 1.25), 0.0)
     zero = _place(np.array([span[0], span[1]]), np.zeros(2), span, (-0.25, 1.25), 210)[0]
     cv2.putText(board, "0", (_LEFT - 28, int(zero[1]) + 8), _FONT, 0.7, _INK, 1, cv2.LINE_AA)
-    # Fewer shades along its soft edges: a recording holds a board a second, and each is half as large so.
-    return (np.minimum(board, 240) + 12) // 24 * 24
+    # Fewer shades along its soft edges: a recording holds a board a second, and each is smaller so.
+    return (np.minimum(board, 243) + 6) // 12 * 12
 
 
 def _place(x: Array, y: Array, span: tuple[float, float], reach: tuple[float, float], top: int) -> NDArray[np.int32]:
