@@ -109,7 +109,7 @@ def test_equation_10_read_literally_loses_the_camera() -> None:
 
 def test_the_published_error_is_taken_at_the_camera_where_a_turn_of_the_flange_is_a_shift() -> None:
     X_CF = RigidTransform(RollPitchYaw(3.1, 0.1, 0.4), [0.02, -0.03, 0.6])
-    v = PublishedVerification(face_at(X_CF, 3), X_BC @ X_CF, published_model(STANDARD, 4000), max_distance_m=0.01)
+    v = PublishedVerification(face_at(X_CF, 3), X_BC @ X_CF, *published_model(STANDARD, 4000), max_distance_m=0.01)
     tilt = np.radians(0.3)
     X_FC = X_CF.inverse()
     wrong = X_BC @ X_CF @ RigidTransform(RollPitchYaw(tilt, 0, 0), [0, 0, 0]) @ X_FC
@@ -141,7 +141,7 @@ def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -
     assert "s7" not in {o.id for o in state.pool}
     compensated = found.X_BC_compensated
     assert compensated is not None
-    v = PublishedVerification(clouds["s7"], poses["s7"], published_model(STANDARD), "point_to_point", 0.01, 1.0)
+    v = PublishedVerification(clouds["s7"], poses["s7"], *published_model(STANDARD), "point_to_point", 0.01, 1.0)
     assert np.linalg.norm(v(compensated).value[3:]) < 0.2 * state.cost
     truth = X_BC.inverse()
     errors = [np.linalg.norm(compensated @ (truth @ X.translation()) - X.translation()) for X in poses.values()]
