@@ -133,8 +133,11 @@ def study_clouds(
     splits: int,
     seed: int,
     progress: Progress,
+    circles: int | None = None,
 ) -> CloudsOutcome:
-    """Everything of one folder of segmented scans. Raises InputError when fewer than ten show a flange to both methods."""
+    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on scans kept
+    aside, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
+    flange to both methods."""
     progress("circles and edges", 0.0)
     material = read_material(data, standard, seed)
     ids = [o.id for o in material.circles]
@@ -144,7 +147,7 @@ def study_clouds(
     held = min(material.circles, key=lambda o: (float(np.linalg.norm(o.p_BR - middle)), o.id)).id
     rows = []
     R_BC = estimate_eye_on_base(list(material.good.values()), SolveConfig(leave_one_out=False)).X_BC.rotation().matrix()
-    for k, id in enumerate(ids):
+    for k, id in enumerate(ids[:circles]):
         progress("repeating circles", 0.2 + 0.2 * k / len(ids))
         rows.append(_circle_row(material, id, R_BC, seed))
     progress("registrations", 0.4)
@@ -265,10 +268,10 @@ def _sights(material: Material, held: str) -> tuple[SightRow, ...]:
     points, normals = published_model(material.standard, 8000)
     sharp = replace(chamfered, model_R=points, model_normals_R=normals, standard=None)
     kinds: list[tuple[str, Verification]] = [
-        ("point to point, sharp CAD", sharp),
-        ("point to plane, sharp CAD", replace(sharp, method="point_to_plane")),
-        ("point to point, chamfered", chamfered),
-        ("point to plane, chamfered", replace(chamfered, method="point_to_plane")),
+        ("to points, sharp CAD", sharp),
+        ("to planes, sharp CAD", replace(sharp, method="point_to_plane")),
+        ("to points, chamfered", chamfered),
+        ("to planes, chamfered", replace(chamfered, method="point_to_plane")),
     ]
     rows = []
     for title, v in kinds:

@@ -93,6 +93,7 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
                 get_flange(data.header.flange),
                 orders=2 if quick else 50,
                 splits=3 if quick else 60,
+                circles=4 if quick else None,
                 seed=seed,
                 progress=part(progress, begin, width),
             )

@@ -154,6 +154,7 @@ def circles(c: CloudsOutcome) -> bytes:
     halves.bar(k - 0.2, [1e3 * r.halves_published_m for r in c.circles], 0.4, color=THEIRS, label="published circle")
     halves.bar(k + 0.2, [1e3 * r.halves_ours_m for r in c.circles], 0.4, color=OURS, label="weldcal's edges")
     halves.legend(frameon=False, fontsize=8)
+    halves.set_xticks(k[::3], [str(v) for v in k[::3] + 1])
     _plain(halves, "scan", "between two halves, mm")
     for row in c.circles:
         x, y = 1e3 * row.offset_R[:2]

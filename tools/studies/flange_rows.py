@@ -34,7 +34,7 @@ SHORT = {
     "in the flange plane, x": "plane x",
     "in the flange plane, y": "plane y",
 }
-SIGHT_HEADER = ("registration", "tilt x", "tilt y", "turn", "plane x", "plane y", "normal", "says mm", "blind")
+SIGHT_HEADER = ("registration", "tilt x", "tilt y", "turn", "in x", "in y", "normal", "says mm", "blind")
 
 
 def statistics(errors_m: Array) -> dict[str, float]:
@@ -114,10 +114,12 @@ def pairs_rows(study: Study) -> list[tuple[str, ...]]:
 
 def sight_rows(outcome: CloudsOutcome) -> list[tuple[str, ...]]:
     """Share of a known error that each registration reports, and what it says of a good calibration."""
-    return [
-        (r.title, *(fixed(float(v), 2) for v in r.share), ", ".join(SHORT.get(b, b) for b in r.blind) or "nothing")
-        for r in outcome.sights
-    ]
+    rows: list[tuple[str, ...]] = []
+    for r in outcome.sights:
+        shares = [fixed(float(v), 2) for v in r.share]
+        says = fixed(1e3 * float(np.linalg.norm(r.value[3:])), 2)
+        rows.append((r.title, *shares, says, ", ".join(SHORT.get(b, b) for b in r.blind) or "nothing"))
+    return rows
 
 
 def kinect_rows(study: Study) -> list[tuple[str, ...]]:
@@ -146,6 +148,9 @@ def summary(study: Study) -> dict[str, object]:
         "simulation": {
             "std_ratio_all_over_algorithm1": dict(
                 zip(("roll", "pitch", "yaw", "x", "y", "z"), map(float, sim.ratio), strict=True)
+            ),
+            "std_ratio_best_of_three": dict(
+                zip(("roll", "pitch", "yaw", "x", "y", "z"), map(float, sim.best_ratio), strict=True)
             ),
             "at_1mm": {
                 name: {

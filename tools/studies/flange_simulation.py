@@ -51,7 +51,7 @@ class Errors:
 class Simulation:
     """``levels_m`` (L,) noise; standard deviations (L, 6) and means (L, 6) of all pairs and of Algorithm 1 judged by the truth
     (Fig. 9); ``history`` (75 - 3, K, 6) of it at 1 mm (Fig. 10) with ``history_tcp`` (75 - 3, K) m, the mean true error;
-    ``costs`` at 1 mm, by name of COSTS."""
+    ``costs`` at 1 mm, by name of COSTS; ``best_of_three`` the best, by the truth, of three shuffled runs at 1 mm."""
 
     levels_m: Array
     all_mean: Array
@@ -61,6 +61,12 @@ class Simulation:
     history: Array
     history_tcp: Array
     costs: dict[str, Errors]
+    best_of_three: Errors
+
+    @property
+    def best_ratio(self) -> Array:
+        """All pairs over the best of three shuffled runs of Algorithm 1 (6,), standard deviations, at 1 mm."""
+        return np.asarray(self.costs["all"].e.std(axis=0) / self.best_of_three.e.std(axis=0))
 
     @property
     def ratio(self) -> Array:
@@ -154,6 +160,13 @@ def simulate(*, levels: int = 50, realisations: int = 100, seed: int = 0, progre
     R, t, steps = algorithm1_batch(p_B, p_C, orders, by_truth, keep_history=True)
     path = [errors_of(Rk, tk, p_B) for Rk, tk in steps]
     costs = {"truth": errors_of(R, t, p_B), "all": errors_of(*_all_pairs(p_B, p_C), p_B)}
+    three = [(R, t)]
+    for _ in range(2):
+        R, t, _ = algorithm1_batch(p_B, p_C, _orders(realisations, len(p_B), rng), by_truth)
+        three.append((R, t))
+    chosen = np.argmin([by_truth(*run) for run in three], axis=0)
+    R_three, t_three = (np.array([run[k] for run in three])[chosen, np.arange(realisations)] for k in (0, 1))
+    best_of_three = errors_of(R_three, t_three, p_B)
     R_v, t_v = _measured_camera(realisations, 1e-3, rng)
 
     def by_verification(R: Array, t: Array) -> Array:
@@ -180,6 +193,7 @@ def simulate(*, levels: int = 50, realisations: int = 100, seed: int = 0, progre
         np.array([x.e for x in path]),
         np.array([x.at_tcp.mean(axis=1) for x in path]),
         {name: costs[name] for name in COSTS},
+        best_of_three,
     )
 
 
