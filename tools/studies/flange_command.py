@@ -24,6 +24,7 @@ NO_DATA = (
 TITLES = {"aubo_i5": "AUBO i5", "franka": "Franka Emika", "azure_kinect": "Azure Kinect"}
 _SHARE_SIMULATION = 0.3
 _LEAST_CLOUDS = 10
+_USUAL_CLOUDS = 18  # more scans make each run of Algorithm 1 longer: fewer runs then, and the same time
 
 
 @dataclass(frozen=True)
@@ -84,15 +85,17 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
                 runs = load_runs(data.folder)
                 pairs.append(study_pairs(name, title(data), observations, runs, repeats=2 if quick else 10, seed=seed))
         elif len(data.clouds) < _LEAST_CLOUDS:
-            notes.append(f"{name} holds {len(data.clouds)} scan(s), too few to hold any back: it takes no part.")
+            scans = "1 scan" if len(data.clouds) == 1 else f"{len(data.clouds)} scans"
+            notes.append(f"{name} holds {scans}, too few to hold any back: it takes no part.")
         else:
+            effort = min(1.0, (_USUAL_CLOUDS - 5) / (len(data.clouds) - 5))
             outcome = study_clouds(
                 name,
                 title(data),
                 data,
                 get_flange(data.header.flange),
-                orders=2 if quick else 50,
-                splits=3 if quick else 60,
+                orders=2 if quick else max(5, round(50 * effort)),
+                splits=3 if quick else max(5, round(60 * effort)),
                 circles=4 if quick else None,
                 seed=seed,
                 progress=part(progress, begin, width),

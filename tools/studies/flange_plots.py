@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from weldcal.tools.report.plots_demo import OURS, PLANNED, THEIRS, TRUTH, svg
@@ -55,6 +56,7 @@ def fig10(s: Simulation) -> bytes:
     true.legend(frameon=False, fontsize=7)
     _plain(at_camera, "scans", "translation at the camera, mm")
     _plain(turns, "scans", "rotation, degrees")
+    _whole_steps(true)
     _plain(true, "scans", "true error at the flanges, mm")
     return svg(picture)
 
@@ -98,6 +100,7 @@ def fig11_rerun(c: CloudsOutcome) -> bytes:
     true.legend(frameon=False, fontsize=7)
     _plain(at_camera, "scans", "reported translation, mm")
     _plain(turns, "scans", "reported rotation, degrees")
+    _whole_steps(true)
     _plain(true, "scans", "error, mm")
     return svg(picture)
 
@@ -198,6 +201,7 @@ def _bands(axes: Axes, x: NDArray[np.int64], values: Array, panels: tuple[tuple[
         axes.plot(x, mean, color=colour, lw=1.2, label=name)
     axes.axhline(0.0, color="black", lw=0.6, ls=":")
     axes.legend(frameon=False, fontsize=7, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    _whole_steps(axes)
 
 
 def _boxes(axes: Axes, rows: list[tuple[str, Array, str]]) -> None:
@@ -211,6 +215,10 @@ def _boxes(axes: Axes, rows: list[tuple[str, Array, str]]) -> None:
     axes.set_yticks(y, [name for name, _, _ in rows])
     axes.set_xlim(0.0, None)
     _plain(axes, "error at the flange, mm", "")
+
+
+def _whole_steps(axes: Axes) -> None:
+    axes.xaxis.set_major_locator(MaxNLocator(nbins=5, integer=True))
 
 
 def _plain(axes: Axes, x: str, y: str) -> None:
