@@ -25,8 +25,14 @@ def translation_cost(error: Array) -> float:
     return float(np.linalg.norm(error[3:]))
 
 
+def work_radius_cost(work_radius_m: float) -> Cost:
+    """Section 4.2: norm of (dx, dy, dz, r droll, r dpitch, r dyaw), r the work radius, m."""
+    return axes_cost((0, 1, 2, 3, 4, 5), work_radius_m)
+
+
 def translation_and_rotation_cost(work_radius_m: float) -> Cost:
-    """Translation norm plus the rotation's displacement at ``work_radius_m`` from the flange centre, m."""
+    """Translation norm plus the rotation's displacement at ``work_radius_m`` from the flange centre, m: a bound on the
+    error there, where the paper's work_radius_cost is a norm of all six."""
 
     def cost(error: Array) -> float:
         return float(np.linalg.norm(error[3:]) + work_radius_m * np.linalg.norm(error[:3]))
@@ -35,7 +41,10 @@ def translation_and_rotation_cost(work_radius_m: float) -> Cost:
 
 
 def axes_cost(axes: tuple[int, ...], work_radius_m: float) -> Cost:
-    """Norm over chosen components of the error (0-2 rotation times ``work_radius_m``, 3-5 translation), m."""
+    """Norm over chosen components of the error (0-2 rotation times ``work_radius_m``, 3-5 translation), m.
+
+    Section 4.2's choice of axes: (3, 4) is its pick-and-place example, with an end-effector that gives way along z.
+    """
     if not axes or any(not 0 <= a < 6 for a in axes):
         raise InputError("The axes of a cost are numbers from 0 to 5: 0-2 rotation, 3-5 translation.")
 
@@ -82,12 +91,19 @@ def algorithm1_start(e_required: float = 2e-4, k_max: int = 100) -> Algorithm1St
 
 
 def algorithm1_step(
-    state: Algorithm1State, observation: Observation, verification: Verifier, cost: Cost = translation_cost
+    state: Algorithm1State,
+    observation: Observation,
+    verification: Verifier,
+    cost: Cost = translation_cost,
+    *,
+    as_printed: bool = False,
 ) -> Algorithm1State:
     """One new pair (paper, Algorithm 1, lines 5 to 15); the first four fill the pool (lines 2 and 3).
 
     Each of the four is replaced in turn by the new pair; a replacement stays only if the cost falls. The new pair
-    enters at most once: with it twice, three distinct points would be left. A finished state is returned unchanged.
+    enters at most once, as in the authors' program: with it twice, three distinct points would be left. ``as_printed``
+    follows lines 6 to 15 to the letter, where a replacement that stays is there when the next one is tried, so that the
+    pool may come to hold the same pair two or three times. A finished state is returned unchanged.
     """
     if state.done:
         return state
@@ -99,7 +115,8 @@ def algorithm1_step(
         return replace(state, pool=pool, X_BC=X, error=error, cost=value, history=((POOL_SIZE, value),))
     best = (state.pool, state.X_BC, state.error, state.cost)
     for i in range(POOL_SIZE):
-        pool = (*state.pool[:i], observation, *state.pool[i + 1 :])
+        old = best[0] if as_printed else state.pool
+        pool = (*old[:i], observation, *old[i + 1 :])
         X, error, value = _score(pool, verification, cost)
         if value < best[3]:
             best = (pool, X, error, value)

@@ -29,13 +29,18 @@ def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidT
 def fit_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array]:
     """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid; collinear sets are left
     out (k <= s)."""
+    R, t, good = fit_all_rigid_sets(p_B, p_C)
+    return R[good], t[good]
+
+
+def fit_all_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Rotations (s, 3, 3), translations (s, 3) and whether they are fixed (s,) of s point sets (s, n, 3), as fit_rigid."""
     mean_B, mean_C = p_B.mean(axis=1), p_C.mean(axis=1)
     U, D, Vt = np.linalg.svd(np.swapaxes(p_B - mean_B[:, None], 1, 2) @ (p_C - mean_C[:, None]))
     good = (D[:, 1] >= 1e-12 * np.maximum(D[:, 0], 1e-30)) & (D[:, 0] > 0.0)
-    U, Vt = U[good], Vt[good]
     U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
     R = U @ Vt
-    return R, mean_B[good] - np.einsum("kij,kj->ki", R, mean_C[good])
+    return R, mean_B - np.einsum("kij,kj->ki", R, mean_C), good
 
 
 def fit_rotation(u_B: Array, u_C: Array) -> RotationMatrix:

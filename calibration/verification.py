@@ -10,6 +10,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.blindness import COMPONENTS, blind_components, information, sigmas, surface_normals
 from weldcal.calibration.flange_fit import FlangeFit
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.rigid import exp_rotation, rotation_vector
@@ -19,14 +20,6 @@ from weldcal.models.flanges import FlangeStandard, flange_mesh
 Array = NDArray[np.float64]
 Method = Literal["point_to_point", "point_to_plane"]
 
-COMPONENTS = (
-    "tilt about x",
-    "tilt about y",
-    "rotation about the flange axis",
-    "in the flange plane, x",
-    "in the flange plane, y",
-    "along the flange normal",
-)
 _MIN_FITNESS = 0.3
 _BLIND = 0.5  # a component of which less than half shows is called unseen
 
@@ -37,18 +30,32 @@ class VerificationError:
 
     ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature
     frame R; all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or
-    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance.
+    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance. ``blind`` names the
+    components (of COMPONENTS) for which nothing was seen that could show them: they count as zero in ``value`` and in
+    ``X_CpC``, and `components` gives no number for them. ``sigma`` (6,) rad and m is what noise alone does to each,
+    infinite where blind.
     """
 
     value: Array
     X_CpC: RigidTransform | None
     fitness: float
     rmse_m: float
+    blind: tuple[str, ...] = ()
+    sigma: Array | None = None
 
     @property
     def found(self) -> bool:
         """False where the registration failed and the error is infinite."""
         return bool(np.isfinite(self.value).all())
+
+    @property
+    def components(self) -> tuple[tuple[str, float, bool], ...]:
+        """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre; NaN where it
+        could not."""
+        seen = [n not in self.blind for n in COMPONENTS]
+        return tuple(
+            (n, float(v) if s else float("nan"), s) for n, v, s in zip(COMPONENTS, self.value, seen, strict=True)
+        )
 
 
 FAILED = VerificationError(np.full(6, np.inf), None, 0.0, float("inf"))
@@ -64,7 +71,10 @@ class Verifier(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Verification:
-    """A verification scan: face points (N, 3) m in C, the feature's pose X_BR, and the model in R (points, normals)."""
+    """A verification scan: face points (N, 3) m in C, the feature's pose X_BR, and the model in R (points, normals).
+
+    ``standard`` is what the model was made from; without it the blind components are judged by the model's normals.
+    """
 
     points_C: Array
     X_BR: RigidTransform
@@ -72,6 +82,7 @@ class Verification:
     model_normals_R: Array
     method: Method = "point_to_point"
     max_distance_m: float = 0.01
+    standard: FlangeStandard | None = None
 
     def __call__(self, X_BC: RigidTransform) -> VerificationError:
         """See icp_error."""
@@ -90,7 +101,8 @@ class CentreVerification:
         error_B = X_BC @ o.p_CR - o.p_BR
         in_R = o.X_BR.rotation().inverse() @ error_B
         correction = RigidTransform(-(X_BC.rotation().inverse() @ error_B))
-        return VerificationError(np.concatenate([np.zeros(3), in_R]), correction, 1.0, float(np.linalg.norm(error_B)))
+        value = np.concatenate([np.zeros(3), in_R])
+        return VerificationError(value, correction, 1.0, float(np.linalg.norm(error_B)), COMPONENTS[:3])
 
 
 def make_verification(
@@ -116,7 +128,9 @@ def make_verification(
         points = points[np.sort(rng.choice(len(points), max_points, replace=False))]
     model, normals = flange_mesh(standard).sample(12 * max_points, rng)
     up = (normals[:, 2] > 0.2) & (model[:, 2] > -1.5 * standard.chamfer_m - 1e-6)
-    return Verification(points, X_BR, model[up][: 4 * max_points], normals[up][: 4 * max_points], method)
+    return Verification(
+        points, X_BR, model[up][: 4 * max_points], normals[up][: 4 * max_points], method, standard=standard
+    )
 
 
 def face_cloud(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Array:
@@ -136,7 +150,10 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     Iterations and stop rule are Open3D's defaults (30, relative change 1e-6), as in the paper's code. A registration
     that matches less than 30 % of the points has failed: the error is then infinite, never the identity. The six
     numbers are taken at the flange centre, not at the camera origin, where rotation and translation mix over the
-    working distance.
+    working distance. A component along which the matched surface does not change is named blind, from the information
+    that the points carry along its normals: the turn about the flange's axis always (the model is one of revolution but for
+    its holes), the plane of a face whose chamfers were not scanned. Point-to-point registration sees less than that:
+    `sight` measures how much.
     """
     X_RC = verification.X_BR.inverse() @ X_BC
     source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((X_RC @ verification.points_C.T).T))
@@ -153,9 +170,20 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     if result.fitness < _MIN_FITNESS or not np.isfinite(result.transformation).all():
         return FAILED
     E_R = RigidTransform(np.asarray(result.transformation))
+    pairs = np.asarray(result.correspondence_set)
+    matched = (E_R @ X_RC @ verification.points_C[pairs[:, 0]].T).T
+    standard = verification.standard
+    normals = verification.model_normals_R[pairs[:, 1]] if standard is None else surface_normals(matched, standard)
+    matrix = information(matched, normals)
+    off = ((matched - verification.model_R[pairs[:, 1]]) * verification.model_normals_R[pairs[:, 1]]).sum(axis=1)
+    noise = 1.4826 * float(np.median(np.abs(off)))
+    blind = blind_components(matrix)
     seen = E_R.inverse()
     value = np.concatenate([rotation_vector(seen.rotation()), seen.translation()])
-    return VerificationError(value, X_RC.inverse() @ E_R @ X_RC, float(result.fitness), float(result.inlier_rmse))
+    value[[name in blind for name in COMPONENTS]] = 0.0
+    correction = X_RC.inverse() @ RigidTransform(exp_rotation(value[:3]), value[3:]).inverse() @ X_RC
+    fitness, rmse = float(result.fitness), float(result.inlier_rmse)
+    return VerificationError(value, correction, fitness, rmse, blind, sigmas(matrix, noise))
 
 
 @dataclass(frozen=True)

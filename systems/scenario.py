@@ -18,6 +18,7 @@ from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.welding.process import WeldProcess
 
 SLOWEST_FACTOR = 0.05
+DRAWN_ARMS = ("ur10e",)
 SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
 
 
@@ -186,6 +187,10 @@ def check_scenario(scenario: Scenario) -> None:
     Raises:
         InputError: one sentence that says what to change.
     """
+    if scenario.arm not in DRAWN_ARMS:
+        raise InputError(
+            f"The cell is built round the {' or '.join(DRAWN_ARMS)}, whose shape its clearances are made for, not '{scenario.arm}'."
+        )
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):

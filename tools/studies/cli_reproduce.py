@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.studies.cli_flange import flange
 
 reproduce = typer.Typer(help="Figures against their targets.", no_args_is_help=True)
 
@@ -15,6 +16,9 @@ reproduce = typer.Typer(help="Figures against their targets.", no_args_is_help=T
 @reproduce.callback()
 def _group() -> None:
     """Figures against their targets."""
+
+
+reproduce.command("flange")(flange)
 
 
 @reproduce.command("weld")

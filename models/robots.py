@@ -1,0 +1,89 @@
+"""Robots by name: which flange they carry, what they may do, and how far their kinematics are known here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard, get_flange
+
+ISO_50 = "iso9409-1-50-4-m6"
+CLOSED_FORM, NUMERIC = "closed form", "numeric"
+"""How joint angles are found: every solution (arms.inverse), or one by iteration (arms.chain)."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """One robot. ``flange`` is its ISO 9409-1 designation, the dowel at ``pin_angle_rad``; payload kg, reach m (the maker's
+    working radius), repeatability m; ``inverse`` says how its joint angles are found; ``source`` where the numbers are from.
+    Joint limits and kinematics are the arm's own files (`chain`)."""
+
+    name: str
+    title: str
+    joints: int
+    flange: str
+    pin_angle_rad: float
+    payload_kg: float
+    reach_m: float
+    repeatability_m: float
+    inverse: str
+    source: str
+
+    @property
+    def standard(self) -> FlangeStandard:
+        """The flange to look for."""
+        return get_flange(self.flange, pin_angle_rad=self.pin_angle_rad)
+
+    @property
+    def chain(self) -> Chain:
+        """Kinematics and limits."""
+        return load_chain(self.name)
+
+
+_UR_E = "user manual, e-Series, technical specifications; kinematics: Universal Robots, DH parameters"
+_UR_CB3 = "user manual, CB3, technical specifications; kinematics: Universal Robots, DH parameters (series 3)"
+_RIGHT_ANGLE = math.pi / 2
+
+
+def _ur(name: str, title: str, payload: float, reach: float, repeatability: float, source: str) -> Robot:
+    return Robot(name, title, 6, ISO_50, _RIGHT_ANGLE, payload, reach, repeatability, CLOSED_FORM, source)
+
+
+ROBOTS: dict[str, Robot] = {
+    robot.name: robot
+    for robot in (
+        _ur("ur3e", "Universal Robots UR3e", 3.0, 0.500, 3e-5, _UR_E),
+        _ur("ur5", "Universal Robots UR5", 5.0, 0.850, 1e-4, _UR_CB3),
+        _ur("ur5e", "Universal Robots UR5e", 5.0, 0.850, 3e-5, _UR_E),
+        _ur("ur10", "Universal Robots UR10", 10.0, 1.300, 1e-4, _UR_CB3),
+        _ur("ur10e", "Universal Robots UR10e", 12.5, 1.300, 5e-5, _UR_E),
+        _ur("ur16e", "Universal Robots UR16e", 16.0, 0.900, 5e-5, _UR_E),
+        Robot(
+            "franka_panda", "Franka Emika Panda", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
+            "Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the recorded scans' CAD",
+        ),
+        Robot(
+            "franka_fr3", "Franka Research 3", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
+            "Franka Research 3 data sheet; limits and kinematics: franka_description; dowel as on the Panda",
+        ),
+        Robot(
+            "aubo_i5", "AUBO i5", 6, ISO_50, _RIGHT_ANGLE, 5.0, 0.8865, 5e-5, NUMERIC,
+            "AUBO i5 user manual (not confirmed by a second source); kinematics: AUBO's aubo_i5.urdf",
+        ),
+    )
+}  # fmt: skip
+"""Every robot known by name; the ISO 9409-1 designation of each in one place."""
+
+ALIASES = {"franka": "franka_panda", "panda": "franka_panda", "fr3": "franka_fr3", "aubo": "aubo_i5"}
+"""Shorter names that datasets use."""
+
+
+def get_robot(name: str) -> Robot:
+    """The robot of that name (`franka` is the Panda of the recorded data). Raises InputError naming the known ones."""
+    key = name.strip().lower().replace("-", "_").replace(" ", "_")
+    robot = ROBOTS.get(ALIASES.get(key, key))
+    if robot is None:
+        raise InputError(f"Robot '{name}' is not known: use one of {', '.join(ROBOTS)}.")
+    return robot

@@ -1,0 +1,178 @@
+"""The paper's own pipeline, kept as it is: what each step gives, and where it fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.iterative import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.published_circle import CircleParameters, circumcircles, search_circle
+from weldcal.calibration.published_pipeline import (
+    PublishedParameters,
+    PublishedVerification,
+    all_pairs,
+    at_flange,
+    equation_10_as_printed,
+    published_calibration,
+    published_model,
+)
+from weldcal.calibration.published_segmentation import SegmentationParameters, segment_flange
+from weldcal.calibration.verification import VerificationError
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import face_points, get_flange
+
+STANDARD = get_flange("iso9409-1-50-4-m6")
+X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
+
+
+def face_at(X_CR: RigidTransform, seed: int, spacing: float = 0.0008, noise: float = 5e-5) -> np.ndarray:
+    face = face_points(STANDARD, spacing)
+    face = face + noise * np.random.default_rng(seed).standard_normal(face.shape) * [0.0, 0.0, 1.0]
+    return (X_CR @ face.T).T
+
+
+def test_a_circle_through_three_points_of_it_is_that_circle() -> None:
+    rng = np.random.default_rng(0)
+    X = RigidTransform(RollPitchYaw(0.4, 0.9, -0.3), [0.1, 0.2, 0.5])
+    angles = rng.uniform(0, 2 * np.pi, (20, 3))
+    on = 0.031 * np.stack([np.cos(angles), np.sin(angles), np.zeros((20, 3))], axis=-1)
+    centers, radii = circumcircles(np.einsum("ij,knj->kni", X.rotation().matrix(), on) + X.translation())
+    # three points may lie within a degree of each other: rounding times the square of that
+    assert np.allclose(radii, 0.031, rtol=1e-6)
+    assert np.allclose(centers, X.translation(), atol=1e-7)
+    line = np.array([[[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]]])
+    assert np.isnan(circumcircles(line)[1][0])
+
+
+def test_the_circle_search_finds_the_flange_to_a_millimetre_and_differs_from_seed_to_seed() -> None:
+    X_CR = RigidTransform(RollPitchYaw(3.1, 0.1, 0.4), [0.02, -0.03, 0.6])
+    face = face_at(X_CR, 0)
+    found = [search_circle(face, seed=k) for k in range(6)]
+    errors = np.array([f.center_C - X_CR.translation() for f in found])
+    assert np.linalg.norm(errors, axis=1).max() < 2e-3
+    # the failing of note: the same cloud, another draw, another centre; an edge fit repeats to zero
+    assert np.linalg.norm(errors.std(axis=0)) > 5e-5
+    again = search_circle(face, seed=3)
+    assert np.array_equal(again.center_C, found[3].center_C)
+    assert all(abs(f.radius - 0.031) <= 0.001 and 0 < f.n_verified < 10_000 for f in found)
+
+
+def test_any_face_gives_a_circle_of_31_mm_and_only_few_points_on_it_tell() -> None:
+    # slim triangles have any radius: the check of the radius does not refuse a face half as large, its count shows it
+    X_CR = RigidTransform(RollPitchYaw(3.1, 0.1, 0.4), [0.02, -0.03, 0.6])
+    whole = face_at(X_CR, 0)
+    small = (X_CR @ face_points(get_flange("iso9409-1-31.5-4-m5"), 0.0008).T).T
+    found, wrong = search_circle(whole, seed=0), search_circle(small, seed=0)
+    assert abs(wrong.radius - 0.031) <= 0.001
+    assert wrong.n_inliers < 0.5 * found.n_inliers
+
+
+def test_no_circle_is_refused_by_name() -> None:
+    corner = np.array([[0.0, 0.0, 0.5], [0.001, 0.0, 0.5], [0.0, 0.001, 0.5]])
+    with pytest.raises(FlangeNotFound, match="random circles has a radius from 30 to 32 mm"):
+        search_circle(corner, seed=0)
+    with pytest.raises(InputError, match="e_r"):
+        CircleParameters(e_r=0.1)
+
+
+def test_segmentation_leaves_the_flange_of_a_scene_and_says_where_nothing_was_left() -> None:
+    X_CR = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.03, 0.02, 0.7])
+    flange = face_at(X_CR, 1, spacing=0.0007)
+    x, y = np.meshgrid(np.arange(-0.07, 0.07, 0.001), np.arange(-0.07, 0.07, 0.001))
+    table = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.95)])
+    few = SegmentationParameters(neighbours=20, link_m=0.0015, cluster_points=(2000, 20_000), plane_draws=100)
+    found = segment_flange(np.vstack([flange, table]), parameters=few)
+    assert np.abs(found[:, 2] - 0.7).max() < 0.002
+    assert len(found) > 0.8 * len(flange)
+    with pytest.raises(FlangeNotFound, match=r"pass-through from 0\.4 to 1 m"):
+        segment_flange(flange + np.array([0.0, 0.0, 1.0]))
+    with pytest.raises(FlangeNotFound, match="the largest has"):
+        segment_flange(flange)
+    with pytest.raises(FlangeNotFound, match="as wide as the flange"):
+        segment_flange(table, parameters=few)
+
+
+def test_equation_10_read_literally_loses_the_camera() -> None:
+    rng = np.random.default_rng(2)
+    p_C = rng.uniform([-0.2, -0.15, 0.5], [0.2, 0.15, 0.9], (30, 3))
+    p_B = (X_BC @ p_C.T).T
+    pairs = [Observation(str(k), RigidTransform(b), c) for k, (b, c) in enumerate(zip(p_B, p_C, strict=True))]
+    assert np.abs(all_pairs(pairs).GetAsMatrix34() - X_BC.GetAsMatrix34()).max() < 1e-12
+    R, t = equation_10_as_printed(p_B, p_C)
+    assert np.allclose(R, X_BC.rotation().matrix(), atol=1e-12)
+    # t = mu_B - c R mu_C with c the variance in square metres: off by (1 - c) of the camera's mean distance
+    assert np.linalg.norm(t - X_BC.translation()) > 0.6
+
+
+def test_the_published_error_is_taken_at_the_camera_where_a_turn_of_the_flange_is_a_shift() -> None:
+    X_CF = RigidTransform(RollPitchYaw(3.1, 0.1, 0.4), [0.02, -0.03, 0.6])
+    v = PublishedVerification(face_at(X_CF, 3), X_BC @ X_CF, *published_model(STANDARD, 4000), max_distance_m=0.01)
+    tilt = np.radians(0.3)
+    X_FC = X_CF.inverse()
+    wrong = X_BC @ X_CF @ RigidTransform(RollPitchYaw(tilt, 0, 0), [0, 0, 0]) @ X_FC
+    error = v(wrong)
+    there = at_flange(error, wrong, v.X_BF)
+    # most of the tilt shows, and puts its lever of 0.6 m into the paper's translation, but hardly moves the flange
+    assert np.linalg.norm(error.value[3:]) > 0.5 * 0.6 * tilt
+    assert np.linalg.norm(there[3:]) < 0.1 * 0.6 * tilt
+    far = v(X_BC @ RigidTransform([0, 0, 0.2]))
+    assert not far.found
+    assert np.isinf(at_flange(far, X_BC, v.X_BF)).all()
+
+
+def test_the_pipeline_runs_as_a_whole_and_compensation_flatters_its_own_pose() -> None:
+    rng = np.random.default_rng(4)
+    clouds, poses = {}, {}
+    for k in range(8):
+        p = [rng.uniform(-0.15, 0.15), rng.uniform(-0.1, 0.1), rng.uniform(0.5, 0.8)]
+        X_CF = RigidTransform(RollPitchYaw(3.1, 0.1, 0.0), p)
+        clouds[f"s{k}"], poses[f"s{k}"] = face_at(X_CF, k), X_BC @ X_CF
+    clouds["blank"], poses["blank"] = clouds["s0"][:2], poses["s0"]
+    parameters = PublishedParameters(unit_m=1.0, max_distance_m=0.01, e_required=1e-9)
+    found = published_calibration(clouds, poses, STANDARD, "s7", parameters=parameters, segmented=True)
+    assert [id for id, _ in found.refused] == ["blank"]
+    assert found.error_all.found
+    state = found.algorithm1
+    assert state.X_BC is not None
+    assert state.cost <= state.history[0][1]
+    assert "s7" not in {o.id for o in state.pool}
+    compensated = found.X_BC_compensated
+    assert compensated is not None
+    v = PublishedVerification(clouds["s7"], poses["s7"], *published_model(STANDARD), "point_to_point", 0.01, 1.0)
+    assert np.linalg.norm(v(compensated).value[3:]) < 0.2 * state.cost
+    truth = X_BC.inverse()
+    errors = [np.linalg.norm(compensated @ (truth @ X.translation()) - X.translation()) for X in poses.values()]
+    # the figure is now next to nothing; the flanges are where they were, as far off as the circles are
+    assert np.median(errors) > 2.0 * np.linalg.norm(v(compensated).value[3:])
+    with pytest.raises(InputError, match="'blank' shows no flange"):
+        published_calibration(clouds, poses, STANDARD, "blank", segmented=True)
+
+
+def test_as_printed_a_new_pair_may_enter_more_than_once() -> None:
+    def pair(k: int) -> Observation:
+        p = np.random.default_rng(k).uniform(0.1, 0.5, 3)
+        return Observation(f"p{k}", RigidTransform(p), p)
+
+    calls = iter(range(100, 0, -1))
+
+    def ever_better(X: RigidTransform) -> VerificationError:
+        return VerificationError(np.array([0, 0, 0, next(calls) * 1e-4, 0, 0]), RigidTransform(), 1.0, 0.0)
+
+    pools = {}
+    for printed in (True, False):
+        state = algorithm1_start(1e-9, 10)
+        for k in range(5):
+            state = algorithm1_step(state, pair(k), ever_better, as_printed=printed)
+        pools[printed] = [o.id for o in state.pool].count("p4")
+    # with the pair in twice or more too few points are left for the last fits, which the collinear ones are refused
+    assert pools[False] == 1
+    assert pools[True] >= 2
+
+
+def test_costs_of_section_4_2() -> None:
+    error = np.array([0.01, 0.0, 0.02, 3e-3, 0.0, 4e-3])
+    assert work_radius_cost(0.1)(error) == pytest.approx(np.sqrt(0.001**2 + 0.002**2 + 0.003**2 + 0.004**2))
+    assert axes_cost((3, 4), 0.1)(error) == pytest.approx(3e-3)

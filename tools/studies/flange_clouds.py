@@ -1,0 +1,297 @@
+"""Both methods on the same real scans: circles, registrations, Algorithm 1 run again, and errors on scans kept aside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.dataset import Dataset
+from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.iterative import Algorithm1State, algorithm1_start, algorithm1_step
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.published_circle import search_circle
+from weldcal.calibration.published_pipeline import (
+    Method,
+    PublishedVerification,
+    all_pairs,
+    at_flange,
+    find_centres,
+    published_model,
+    published_pairs,
+)
+from weldcal.calibration.scanner_model import ScannerCorrection
+from weldcal.calibration.self_calibration import apply_self_calibration
+from weldcal.calibration.sightings import Sightings, see_flanges
+from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.validation import position_errors
+from weldcal.calibration.verification import Verification, icp_error, make_verification, sight
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard
+from weldcal.tools.console import Progress
+
+Array = NDArray[np.float64]
+
+ICP_POINTS = 2_500
+"""Points of a face that the repeated registrations use, of some 12 000: they differ by less than what they cannot see."""
+METHODS = {
+    "algorithm1": "Alg. 1, circles, point-to-point",
+    "compensated": "the same, compensated (Eq. 21)",
+    "plane": "Alg. 1, circles, point-to-plane",
+    "edges": "Alg. 1 on weldcal's centres",
+    "svd": "all circles, SVD (Table 1)",
+    "rigid": "weldcal, scanner as it is",
+    "ours": "weldcal, scanner corrected",
+}
+RUNS_OF_ALGORITHM1 = ("algorithm1", "plane", "edges")
+
+
+@dataclass(frozen=True, eq=False)
+class CircleRow:
+    """The circle of one cloud: 3-D rms (m) of the published centre over seeds, its offset (3,) m in R from the edges' centre,
+    and how far apart the centres from the two random halves of the cloud are, both methods (m)."""
+
+    id: str
+    repeat_m: float
+    offset_R: Array
+    halves_published_m: float
+    halves_ours_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class SightRow:
+    """A kind of registration against a good calibration: ``value`` (6,) it reports (rad, m, at the flange centre), ``share`` (6,) of
+    a known error it shows, the components it names blind."""
+
+    title: str
+    value: Array
+    share: Array
+    blind: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class SplitRow:
+    """One way to calibrate, over all splits: errors (m) on scans kept aside, and what it reports itself, by split (NaN: no
+    figure of its own)."""
+
+    name: str
+    held_out: Array
+    reported: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CloudsOutcome:
+    """A folder of scans. ``table1_camera``, ``table1_flange`` (n, 6): e_icp of the all-circles H with each scan as the
+    verification, at the camera (roll, pitch, yaw, x, y, z) and at the flange; ``path`` (orders, steps, 6) e_icp of Algorithm 1 (Fig. 11)
+    and ``path_true`` (orders, steps) m, the median error on scans outside its pool at that step."""
+
+    name: str
+    title: str
+    n: int
+    refused: tuple[tuple[str, str], ...]
+    verification: str
+    circles: tuple[CircleRow, ...]
+    table1_camera: Array
+    table1_flange: Array
+    sights: tuple[SightRow, ...]
+    path: Array
+    path_true: Array
+    splits: tuple[SplitRow, ...]
+    n_fit: int
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What both methods see of one folder: our sightings and the published circles of the same scans, and the CAD."""
+
+    data: Dataset
+    standard: FlangeStandard
+    seen: Sightings
+    faces: dict[str, Array]
+    circles: list[Observation]
+    good: dict[str, Observation]
+    model: tuple[Array, Array]
+
+    def verifier(self, id: str, method: str) -> PublishedVerification:
+        """Eq. (13) at that scan, thinned, in the unit of the authors' AUBO clouds (m)."""
+        face = self.faces[id]
+        keep = np.random.default_rng(0).permutation(len(face))[:ICP_POINTS]
+        kind: Method = "point_to_plane" if method == "plane" else "point_to_point"
+        return PublishedVerification(face[np.sort(keep)], self.data.poses[id], *self.model, kind, 0.01, 1.0)
+
+
+def study_clouds(
+    name: str,
+    title: str,
+    data: Dataset,
+    standard: FlangeStandard,
+    *,
+    orders: int,
+    splits: int,
+    seed: int,
+    progress: Progress,
+    circles: int | None = None,
+) -> CloudsOutcome:
+    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on scans kept
+    aside, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
+    flange to both methods."""
+    progress("circles and edges", 0.0)
+    material = read_material(data, standard, seed)
+    ids = [o.id for o in material.circles]
+    if len(ids) < 10:
+        raise InputError(f"'{data.folder.name}' shows a flange in {len(ids)} scans; the comparison needs at least ten.")
+    middle = np.median([o.p_BR for o in material.circles], axis=0)
+    held = min(material.circles, key=lambda o: (float(np.linalg.norm(o.p_BR - middle)), o.id)).id
+    rows = []
+    R_BC = estimate_eye_on_base(list(material.good.values()), SolveConfig(leave_one_out=False)).X_BC.rotation().matrix()
+    for k, id in enumerate(ids[:circles]):
+        progress("repeating circles", 0.2 + 0.2 * k / len(ids))
+        rows.append(_circle_row(material, id, R_BC, seed))
+    progress("registrations", 0.4)
+    camera, flange = _table1(material, ids)
+    sights = _sights(material, held)
+    path, path_true = [], []
+    for r in range(orders):
+        progress("Algorithm 1, order by order", 0.45 + 0.2 * r / orders)
+        steps, true = _path(material, held, np.random.default_rng([seed, r]))
+        path.append(steps)
+        path_true.append(true)
+    results: dict[str, list[tuple[Array, float]]] = {name: [] for name in METHODS}
+    n_fit = round(len(ids) * 2 / 3)
+    for r in range(splits):
+        progress("splits", 0.65 + 0.35 * r / splits)
+        order = np.random.default_rng([seed, 100 + r]).permutation(len(ids))
+        for name_, outcome in split_once(material, [ids[i] for i in order[:n_fit]], seed).items():
+            results[name_].append(outcome)
+    table = tuple(
+        SplitRow(m, np.concatenate([e for e, _ in found]), np.array([v for _, v in found]))
+        for m, found in results.items()
+    )
+    return CloudsOutcome(
+        name, title, len(ids), material.seen.refused, held, tuple(rows), camera, flange, sights, np.array(path),
+        np.array(path_true), table, n_fit,
+    )  # fmt: skip
+
+
+def read_material(data: Dataset, standard: FlangeStandard, seed: int) -> Material:
+    """Fit every cloud both ways; clouds that either method refuses are left out of the comparison."""
+    seen = see_flanges(data, standard, seed=seed)
+    good = {o.id: o for o in seen.observations}
+    clouds = {id: data.cloud(id) for id in data.clouds if id in good}
+    circles, faces, _ = find_centres(clouds, segmented=True, seed=seed)
+    return Material(
+        data, standard, seen, faces, published_pairs(circles, data.poses), good, published_model(standard, 8000)
+    )
+
+
+def split_once(material: Material, fit: list[str], seed: int) -> Mapping[str, tuple[Array, float]]:
+    """Every method of METHODS on the scans ``fit``: errors (m) on all others, at our centres, and its own figure (m).
+
+    Scored on weldcal's centres for all: they repeat to a fiftieth of what is judged. The scans that Algorithm 1 is verified with
+    are among ``fit``; nobody sees the others.
+    """
+    pairs = {o.id: o for o in material.circles}
+    rest = [material.good[id] for id in pairs if id not in fit]
+    middle = np.median([pairs[id].p_BR for id in fit], axis=0)
+    held = min(fit, key=lambda id: float(np.linalg.norm(pairs[id].p_BR - middle)))
+    pool = [id for id in fit if id != held]
+    out: dict[str, tuple[Array, float]] = {}
+    for method in RUNS_OF_ALGORITHM1:
+        source = material.good if method == "edges" else pairs
+        state = algorithm1_start(1e-12, 1000)
+        verifier = material.verifier(held, method)
+        for id in pool:
+            state = algorithm1_step(state, source[id], verifier)
+        out[method] = _judged(state, state.X_BC, rest)
+        if method == "algorithm1":
+            errors, _figure = _judged(state, state.X_BC_compensated, rest)
+            out["compensated"] = (errors, float("nan"))
+    out["svd"] = (position_errors(all_pairs([pairs[id] for id in fit]), rest), float("nan"))
+    ours = [material.good[id] for id in fit]
+    estimate = estimate_eye_on_base(ours, SolveConfig(seed=seed))
+    out["rigid"] = (position_errors(estimate.X_BC, rest), float(np.median(estimate.held_out.position_m)))
+    scanner, _, corrected = apply_self_calibration(ours, estimate, material.seen.patterns, seed=seed)
+    accepted = ScannerCorrection() if scanner is None or scanner.accepted is None else scanner.accepted
+    errors = position_errors(corrected.X_BC, [accepted.observation(o) for o in rest])
+    out["ours"] = (errors, float(np.median(corrected.held_out.position_m)))
+    return {name: out[name] for name in METHODS}
+
+
+def _judged(state: Algorithm1State, X: RigidTransform | None, rest: list[Observation]) -> tuple[Array, float]:
+    if X is None:
+        return np.full(len(rest), np.nan), float("inf")
+    return position_errors(X, rest), state.cost
+
+
+def _circle_row(material: Material, id: str, R_BC: Array, seed: int) -> CircleRow:
+    face, o = material.faces[id], material.good[id]
+    centres = np.array([search_circle(face, seed=seed + 1 + k).center_C for k in range(4)])
+    R_RC = o.X_BR.rotation().matrix().T @ R_BC
+    half = np.random.default_rng(seed).permutation(len(face)) < len(face) // 2
+    published = [search_circle(face[h], seed=seed).center_C for h in (half, ~half)]
+    halves = see_halves(face, half, material.standard)
+    return CircleRow(
+        id,
+        float(np.sqrt(centres.var(axis=0, ddof=1).sum())),
+        R_RC @ (centres.mean(axis=0) - o.p_CR),
+        float(np.linalg.norm(published[0] - published[1])),
+        float(np.linalg.norm(halves[0] - halves[1])),
+    )
+
+
+def see_halves(face: Array, half: NDArray[np.bool_], standard: FlangeStandard) -> tuple[Array, Array]:
+    """The edges' centres (3,) m from either half of a cloud."""
+    return fit_flange(face[half], standard).center_C, fit_flange(face[~half], standard).center_C
+
+
+def _table1(material: Material, ids: list[str]) -> tuple[Array, Array]:
+    camera, flange = [], []
+    for id in ids:
+        X = all_pairs([o for o in material.circles if o.id != id])
+        error = material.verifier(id, "algorithm1")(X)
+        camera.append(error.value)
+        flange.append(at_flange(error, X, material.data.poses[id]))
+    return np.array(camera), np.array(flange)
+
+
+def _sights(material: Material, held: str) -> tuple[SightRow, ...]:
+    """Four registrations of the same scan under our calibration, made without it."""
+    X = estimate_eye_on_base(
+        [o for id, o in material.good.items() if id != held], SolveConfig(leave_one_out=False)
+    ).X_BC
+    chamfered = make_verification(
+        material.seen.clouds[held], material.good[held].X_BR, material.standard, max_points=ICP_POINTS
+    )
+    points, normals = published_model(material.standard, 8000)
+    sharp = replace(chamfered, model_R=points, model_normals_R=normals, standard=None)
+    kinds: list[tuple[str, Verification]] = [
+        ("to points, sharp CAD", sharp),
+        ("to planes, sharp CAD", replace(sharp, method="point_to_plane")),
+        ("to points, chamfered", chamfered),
+        ("to planes, chamfered", replace(chamfered, method="point_to_plane")),
+    ]
+    rows = []
+    for title, v in kinds:
+        error = icp_error(X, v)
+        rows.append(SightRow(title, error.value, sight(X, v).share, error.blind))
+    return tuple(rows)
+
+
+def _path(material: Material, held: str, rng: np.random.Generator) -> tuple[Array, Array]:
+    """One shuffled run: e_icp (steps, 6) at the camera and the true median error (steps,) m after each scan from the fourth on."""
+    pairs = [o for o in material.circles if o.id != held]
+    state = algorithm1_start(1e-12, 1000)
+    verifier = material.verifier(held, "algorithm1")
+    steps, true = [], []
+    for i in rng.permutation(len(pairs)):
+        state = algorithm1_step(state, pairs[i], verifier)
+        if len(state.pool) < 4:
+            continue
+        steps.append(state.error.value)
+        inside = {o.id for o in state.pool}
+        rest = [o for id, o in material.good.items() if id not in inside and id != held]
+        true.append(np.nan if state.X_BC is None else float(np.median(position_errors(state.X_BC, rest))))
+    return np.array(steps), np.array(true)
