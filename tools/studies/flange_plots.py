@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from weldcal.tools.report.plots_demo import OURS, PLANNED, THEIRS, TRUTH, svg
+from weldcal.tools.report.plots_weld import OURS, PLANNED, THEIRS, TRUTH, svg
 from weldcal.tools.studies.flange_clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange_kinect import KinectOutcome
 from weldcal.tools.studies.flange_pairs import PairsOutcome
