@@ -11,7 +11,6 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U, RgbdSensor
 
 from weldcal.models.tool import FingerCamera
-from weldcal.systems.drivers.simulated_world import FINGER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Image, Message
 
@@ -115,24 +114,24 @@ class StreamingColourCamera(LeafSystem):
 def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None:
     """Mount a colour camera in the tool and stream it."""
     world, tool = build.simulated_world(), build.tool
-    if tool is None or world.tool is None:
+    view = world.finger_view
+    if tool is None or view is None:
         return
     camera = config.camera()
     K = camera.camera_matrix
     info = CameraInfo(
         config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
     )  # half pixel: VTK's convention
-    core = RenderCameraCore(FINGER_RENDERER, info, ClippingRange(0.005, 0.5), RigidTransform())
+    core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
     color, depth = ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.01, 0.4))
-    plate = world.plant.GetBodyByName("tool_plate", world.tool)
-    frame = world.plant.GetBodyFrameIdOrThrow(plate.index())
+    frame = view.frames[world.plant.GetBodyByName("tool_plate", world.tool).index()]
     sensor = build.builder.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
     sensor.set_name("finger_camera_colour")
     stream = build.builder.AddSystem(
         StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step())
     )
     stream.set_name("finger_camera")
-    build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.builder.Connect(sensor.color_image_output_port(), stream.GetInputPort("color_image"))
     build.inputs["finger_camera.streaming"] = stream.GetInputPort("streaming")
     build.outputs["finger_camera.image"] = stream.GetOutputPort("image")

@@ -16,11 +16,9 @@ from pydrake.geometry import (
     GeometryInstance,
     IllustrationProperties,
     InMemoryMesh,
-    MakeRenderEngineVtk,
     Mesh,
     PerceptionProperties,
     ProximityProperties,
-    RenderEngineVtkParams,
     SceneGraph,
     Shape,
     Sphere,
@@ -48,6 +46,7 @@ from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.picture_scene import PictureScene, add_picture_scene
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
 from weldcal.welding.deformation import TagModel, tag_cells
@@ -74,6 +73,8 @@ class SimulatedWorld(Message):
     arm: ModelInstanceIndex
     tool: ModelInstanceIndex | None
     tip_joints: tuple[PrismaticJoint, ...]
+    scanner_view: PictureScene
+    finger_view: PictureScene | None
 
 
 def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
@@ -238,8 +239,6 @@ def build_world(
         ),
         builder,
     )
-    for name in (SCANNER_RENDERER, FINGER_RENDERER):
-        scene_graph.AddRenderer(name, MakeRenderEngineVtk(RenderEngineVtkParams()))
     (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     _add_flange(plant, instance, flange)
@@ -267,4 +266,16 @@ def build_world(
         rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
         rest.set_name("tip_at_rest")
         builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
-    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints)
+    scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
+    finger_view = None
+    if tool_instance is not None:
+        finger_view = add_picture_scene(
+            builder,
+            plant,
+            scene_graph,
+            FINGER_RENDERER,
+            mount="tool_plate",
+            only=("tag_print", "tag_white"),
+            background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
+        )
+    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view)
