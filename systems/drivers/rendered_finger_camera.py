@@ -1,14 +1,17 @@
 """The finger camera in simulation: the tag rendered as it moves with the soft tip, with noise and latency."""
 
 import dataclasses as dc
+from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U, RgbdSensor
+from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
 from weldcal.systems.drivers.station_build import StationBuild
@@ -41,6 +44,18 @@ class _Stream(Message):
     started: float = -np.inf
     count: int = 0
     frames: tuple[Image, ...] = (Image(),)
+
+
+@lru_cache(maxsize=4)
+def _noise_table(sigma: float) -> np.ndarray:
+    """65536 equally likely values of Gaussian noise, cut to whole grey levels as a camera cuts: a draw is one look-up."""
+    return np.asarray(np.floor(sigma * ndtri((np.arange(65536) + 0.5) / 65536)), dtype=np.int16)
+
+
+def with_noise(grey: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """A picture (H, W) uint8 with Gaussian noise of `sigma` grey levels on each pixel, as uint8."""
+    drawn = np.frombuffer(rng.bytes(2 * grey.size), dtype=np.uint16).reshape(grey.shape)
+    return np.asarray(cv2.add(grey, np.take(_noise_table(sigma), drawn), dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 class StreamingColourCamera(LeafSystem):
@@ -82,15 +97,12 @@ class StreamingColourCamera(LeafSystem):
         started = stream.started if np.isfinite(stream.started) else now
         hidden = self._config.hidden_from_s is not None and now - started >= self._config.hidden_from_s
         rng = np.random.default_rng([self._seed, stream.count])
-        shape = (self._config.height, self._config.width)
         if hidden:
-            grey = np.full(shape, 25.0)
+            grey = np.full((self._config.height, self._config.width), 25, dtype=np.uint8)
         else:
-            rgba = self._color.Eval(context).data
-            grey = rgba[:, :, 1].astype(np.float32)  # the tag is black on white: one channel says it all
-        noisy = np.clip(grey + self._config.noise_grey * rng.standard_normal(shape, dtype=np.float32), 0, 255).astype(
-            np.uint8
-        )
+            # The tag is black on white: one channel says it all.
+            grey = np.asarray(cv2.extractChannel(self._color.Eval(context).data, 1))
+        noisy = with_noise(grey, self._config.noise_grey, rng)
         step = self._plant_period_s
         taken = (np.ceil(now / step - 1e-6) - 1.0) * step  # on a tick itself the plant still shows the step before
         frame = Image(stream.count + 1, taken, noisy, now)

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
+from pydrake.geometry import ClippingRange, ColorRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.sensors import ImageRgba8U
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation, measure_deformation
@@ -61,6 +62,24 @@ def drawn(deflection_T: np.ndarray, scale: int = 8) -> np.ndarray:
 
 def read(image: Image) -> Deformation:
     return measure_deformation(image, forward_kinematics(the_arm(), Q_HOME), TOOL, TAG, CAMERA.camera_matrix)
+
+
+def test_its_scene_is_the_cells_as_seen_from_the_tool() -> None:
+    """The finger camera's scene holds the tag alone: no pixel may be other than in the picture of the whole cell."""
+    drive = Drive(plain_station())
+    drive.place_arm(Q_HOME, MM * np.array([2.0, -3.0, 4.0]))
+    world = drive.station.world
+    assert world.finger_view is not None
+    c, K = CAMERA, CAMERA.camera_matrix
+    info = CameraInfo(c.width, c.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+    plate = world.plant.GetBodyByName("tool_plate", world.tool).index()
+    pictures = []
+    for view in (world.finger_view, world.scanner_view):
+        core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
+        query = view.scene_graph.get_query_output_port().Eval(view.scene_graph.GetMyContextFromRoot(drive.context))
+        pictures.append(query.RenderColorImage(ColorRenderCamera(core), view.frames[plate], TOOL.X_FK).data.copy())
+    assert np.array_equal(*pictures)
+    assert np.ptp(pictures[0][:, :, 1]) > 200, "the tag is in it"
 
 
 @pytest.mark.parametrize("push_mm", PUSHES_MM)
