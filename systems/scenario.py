@@ -15,6 +15,7 @@ from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.welding.laws import get_law
 
 SLOWEST_FACTOR = 0.05
 SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
@@ -82,6 +83,7 @@ class WeldingConfig:
     axial_deflection_mm: float = 3.0
     clearance_mm: float = 25.0  # height above the seam where the approach ends
     seam_length_mm: float | None = None  # weld only this much of the seam
+    law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/laws.py)
 
 
 @dc.dataclass
@@ -195,5 +197,6 @@ def check_scenario(scenario: Scenario) -> None:
         scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
+    get_law(scenario.welding.law)
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
         raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

@@ -145,8 +145,8 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
 
 def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Station:
     rng = np.random.default_rng(seed)
-    tool = WeldingTool() if scenario.tool == "welding" else None
     cad, real, X_BP = _workpieces(scenario, rng)
+    tool = _tool(scenario, cad) if scenario.tool == "welding" else None
     builder = DiagramBuilder()
     world = build_world(
         builder,
@@ -167,6 +167,17 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     diagram = builder.Build()
     diagram.set_name("station")
     return Station(diagram, robot, tool, cad, truth, world)
+
+
+def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
+    """The welding tool, as hard as it is pressed into the groove that it is for."""
+    tool, welding = WeldingTool(), scenario.welding
+    return dc.replace(
+        tool,
+        press_axial_m=welding.axial_deflection_mm * 1e-3,
+        press_lateral_m=welding.deflection_mm * 1e-3,
+        groove_half_angle_rad=tool.groove_half_angle_rad if cad is None else cad.half_angle_rad,
+    )
 
 
 def _workpieces(

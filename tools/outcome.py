@@ -46,6 +46,16 @@ class WeldOutcome:
     plan_error: PathError | None
 
 
+@dataclass(frozen=True, eq=False)
+class FeltSeam:
+    """The refined seam point by point, (N,) m: arc length on the true seam, and how far to the left of and above the line
+    on which, by the tool's numbers, a seated tip is felt."""
+
+    s: Array
+    lateral: Array
+    height: Array
+
+
 @dataclass(frozen=True)
 class CalibrationError:
     """X_BC against the truth: at the camera's origin, and for a point seen at the work point."""
@@ -97,6 +107,20 @@ def true_seam(cell: Cell) -> SeamCurve | None:
     line = truth.workpiece.seam_P + np.array([0.0, 0.0, TORCH_ABOVE_ROOT_M])
     R = truth.X_BP.rotation().matrix()
     return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=R[:, 2])
+
+
+def felt_seam(cell: Cell, root: Context) -> FeltSeam | None:
+    """The points that the tip felt and the servo kept, against the truth; None where it felt nothing."""
+    state, seam = servo_report(cell, root).state, true_seam(cell)
+    if state is None or seam is None or len(state.refined) < 10:
+        return None
+    assert cell.station.cad is not None
+    assert cell.station.tool is not None
+    tool = cell.station.tool
+    seat = cell.station.cad.tip_height(tool.tip_radius_m) - tool.seat_sink_m
+    line = seam.raised(seat - TORCH_ABOVE_ROOT_M, tool.seat_side_m)
+    found = path_error(state.refined.points, line)
+    return FeltSeam(found.s, found.lateral, found.height)
 
 
 def weld_log(cell: Cell, root: Context) -> WeldLog | None:

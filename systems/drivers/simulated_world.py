@@ -60,6 +60,9 @@ SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
 CELL_PX = 16  # texels of a tag cell: about those of the camera's picture of it, so that interpolation smooths the edges
 TIP_FRICTION = 0.2  # soft tip on steel
+# The contact model's ball is a polyhedron inside the ball it is asked for, with this share of its volume (at a resolution of half
+# the radius). It is asked for one as much larger, or the tip would sink by what the corners were cut off.
+CONTACT_MESH_VOLUME = 0.9114
 JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of the arm's joint servos
 JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
 
@@ -192,7 +195,8 @@ def _add_tool(
     AddCompliantHydroelasticProperties(
         resolution_hint=contact_hint_m, hydroelastic_modulus=tool.tip_modulus_Pa, properties=contact
     )
-    plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), "tip_contact", contact)
+    rounded = Sphere(radius * CONTACT_MESH_VOLUME ** (-1.0 / 3.0))
+    plant.RegisterCollisionGeometry(body, RigidTransform(), rounded, "tip_contact", contact)
     return instance, tuple(joints)
 
 
