@@ -274,6 +274,21 @@ def test_a_frame_from_before_the_arms_memory_is_not_used() -> None:
     assert estimator.at(0.05)[0].sample is None
 
 
+def test_images_wait_for_an_arm_whose_poses_come_later() -> None:
+    """Poses 0.1 s late, an image every 0.033 s: the newest image is always ahead of them, and the older ones are read."""
+    estimator = Estimator()
+    ages, read = [], []
+    for k in range(1, 13):
+        time = k / 30.0
+        estimator.feed("image", Image(k, time - 0.04, drawn(np.zeros(3))))
+        estimator.feed("history", PoseHistory(np.array([-1.0, time - 0.108, time - 0.1]), np.tile(Q_HOME, (3, 1))))
+        deformation, vector = estimator.at(time + 0.001)
+        ages.append(vector[4])
+        read.append(deformation.sequence)
+    assert read[4:] == list(range(3, 11)), "each, two images later"
+    assert max(ages[4:]) < 0.12
+
+
 def test_the_scenarios_camera_is_the_one_that_is_read() -> None:
     camera = scenario().finger_camera
     assert isinstance(camera, RenderedFingerCamera)
