@@ -16,7 +16,8 @@ class ClockMap:
     """host time = robot time / pace + offset + drift * robot time.
 
     A package can only be late, so the least of (host - robot) in each half second is the best sight of the offset; a
-    line through these least values, weighted to none, gives offset and drift, and its residual says how good that is.
+    line through these least values, weighted to none, gives offset and drift, and its residual says how good that is. Where
+    the line is steeper than two quartzes can differ, the controller does not keep its own pace, and the last bin counts.
     """
 
     def __init__(self, pace: float = 1.0) -> None:
@@ -50,8 +51,10 @@ class ClockMap:
             self._offset, self.drift = float(seen.min()), 0.0
         else:
             slope, at_origin = np.polyfit(t - self._origin, seen, 1)
-            self.drift = float(np.clip(slope, -DRIFT_LIMIT, DRIFT_LIMIT))
-            self._offset = float(at_origin)
+            self.drift, self._offset = float(slope), float(at_origin)
+            if abs(slope) > DRIFT_LIMIT:
+                # No quartz: a controller that lost time, and how much is in the newest packages alone.
+                self.drift, self._offset = 0.0, float(seen[-1])
         line = self._offset + self.drift * (t - self._origin)
         self.residual_s = float(np.sqrt(np.mean((seen - line) ** 2)))
 
