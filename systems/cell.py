@@ -30,7 +30,7 @@ from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.scenario import Scenario
-from weldcal.systems.seam_planner import SeamPlanner
+from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
@@ -318,9 +318,10 @@ def _add_welding(wiring: Wiring, sequencer: JobSequencer, status: OutputPort, hi
         )
     out, command, job = station.diagram.GetOutputPort, sequencer.GetOutputPort("job"), scenario.job
     welding = scenario.welding
+    kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
     planner = wiring.add(
         "seam_planner",
-        SeamPlanner(
+        kind(
             station.arm,
             tool,
             station.cad,

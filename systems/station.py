@@ -14,6 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
@@ -194,6 +195,8 @@ def _workpieces(
     if spec.hole_from_mm is not None:
         short = make_workpiece(spec.shape, length_m=length, X_PG=X_PG, end_cut_m=spec.hole_from_mm * 1e-3)
         real = dc.replace(real, groove_mesh=short.groove_mesh)
+    if spec.bend_radius_mm is not None:
+        cad, real = (bend(part, spec.bend_radius_mm * 1e-3) for part in (cad, real))
     placed = _lying_error(
         rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
     )

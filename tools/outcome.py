@@ -104,9 +104,10 @@ def true_seam(cell: Cell) -> SeamCurve | None:
     truth = cell.station.truth
     if truth.workpiece is None or truth.X_BP is None:
         return None
-    line = truth.workpiece.seam_P + np.array([0.0, 0.0, TORCH_ABOVE_ROOT_M])
+    ups = truth.workpiece.up_P
+    line = truth.workpiece.seam_P + TORCH_ABOVE_ROOT_M * ups
     R = truth.X_BP.rotation().matrix()
-    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=R[:, 2])
+    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
 
 
 def felt_seam(cell: Cell, root: Context) -> FeltSeam | None:
@@ -157,9 +158,8 @@ def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
     plan_error = None
     if plan is not None:
         seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m) - cell.station.tool.seat_sink_m  # type: ignore[union-attr]
-        line = plan.position(np.linspace(0.0, plan.length, 200)) - (seat - TORCH_ABOVE_ROOT_M) * np.array(
-            [0.0, 0.0, 1.0]
-        )
+        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seat)
+        line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
         return WeldOutcome(log, seam, plan, None, None, plan_error)
