@@ -148,7 +148,18 @@ def arm_waypoints(
 
 
 class DrawnSeamPlanner(SeamPlanner):
-    """A SeamPlanner that goes by the fixture's drawing: for parts whose shape a plate's registration does not know."""
+    """A SeamPlanner that goes by the fixture's drawing: for parts whose shape a plate's registration does not know.
+
+    .. pydrake_system::
+
+        name: DrawnSeamPlanner
+        input_ports:
+        - scan
+        - job
+        - calibration_status
+        output_ports:
+        - planned_seam
+    """
 
     def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
         try:
