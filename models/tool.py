@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from scipy.optimize import brentq
 
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
 LAST_LINK = len(LINKS)  # the flange's link, counted as in kinematics.link_frames (0 is the base)
 
 # z_F points out of the flange (down while welding); the ring, the tip frame and the torch all have their z up, against z_F.
 R_FLIPPED = RollPitchYaw(np.pi, 0.0, 0.0).ToRotationMatrix()
+
+
+class Seat(NamedTuple):
+    """A loaded tip against a hard ball in the same groove, m: how far towards the wall it leans on, and how far below."""
+
+    aside_m: float
+    below_m: float
 
 
 @dataclass(frozen=True)
@@ -32,10 +42,9 @@ class WeldingTool:
     tip_reach_m: float = 0.170  # p_FT along +z_F, tip at rest
     tip_radius_m: float = 0.0025
     tip_modulus_Pa: float = 1e7  # hydroelastic modulus of the soft tip
-    # Where the loaded tip is felt, by its tag, in the groove: below a hard ball's seat and towards the wall it leans on. Indentation
-    # and the tag's own bias are in it, so it is calibrated once, on a straight groove in a known place (test_soft_tip.py).
-    seat_sink_m: float = 0.00092
-    seat_side_m: float = 0.00005
+    press_axial_m: float = 0.003  # how hard it is pressed into the groove, and against its left wall
+    press_lateral_m: float = 0.002
+    groove_half_angle_rad: float = np.deg2rad(22.5)
     tip_mass_kg: float = 0.005
     lateral_stiffness_N_per_m: float = 600.0
     axial_stiffness_N_per_m: float = 300.0
@@ -48,6 +57,54 @@ class WeldingTool:
     chord_m: float = 0.060  # |d| of Eq. 14
     torch_height_m: float = -0.0015  # z of the wire point in T
     mass_kg: float = 1.4
+
+    def wall_force(self, depth_m: float) -> float:
+        """Force in N of a flat rigid wall that is pressed `depth_m` into the ball.
+
+        The pressure in the soft ball grows linearly from nothing at its surface to the modulus at its centre (hydroelastic
+        contact: Elandt et al., A pressure field model for fast, robust approximation of net contact force and moment
+        between nominally rigid objects, IROS 2019). Its integral over the disc that the wall cuts out is
+        2 pi E (d^2 / 2 - d^3 / (3 r)).
+        """
+        return 2.0 * np.pi * self.tip_modulus_Pa * (depth_m**2 / 2.0 - depth_m**3 / (3.0 * self.tip_radius_m))
+
+    def indentation(self, force_N: float) -> float:
+        """How deep that force presses a flat rigid wall into the ball, m, at most to its centre."""
+        if force_N >= self.wall_force(self.tip_radius_m):
+            return self.tip_radius_m
+        return float(brentq(lambda depth: self.wall_force(depth) - force_N, 0.0, self.tip_radius_m))
+
+    @property
+    def seat(self) -> Seat:
+        """Where the loaded tip rests in its V, against a hard ball in the same groove.
+
+        The springs press it down and to the left; each wall answers along its own normal, for in a weld friction points along
+        the groove. A soft ball gives way to each wall by its `indentation`.
+
+        Raises:
+            InputError: pressed aside so hard that the other wall holds nothing: it would climb out.
+        """
+        down = self.axial_stiffness_N_per_m * self.press_axial_m
+        left = self.lateral_stiffness_N_per_m * self.press_lateral_m
+        s, c = np.sin(self.groove_half_angle_rad), np.cos(self.groove_half_angle_rad)
+        on_left, on_right = 0.5 * (down / s + left / c), 0.5 * (down / s - left / c)
+        if on_right <= 0.0:
+            raise InputError(
+                f"A tip pressed {1e3 * self.press_lateral_m:.1f} mm aside and {1e3 * self.press_axial_m:.1f} mm down climbs out "
+                "of its groove: take less welding.deflection_mm or more welding.axial_deflection_mm."
+            )
+        into_left, into_right = self.indentation(on_left), self.indentation(on_right)
+        return Seat((into_left - into_right) / (2.0 * c), (into_left + into_right) / (2.0 * s))
+
+    @property
+    def seat_side_m(self) -> float:
+        """How far a loaded tip's centre lies to the left of the groove's middle, m."""
+        return self.seat.aside_m
+
+    @property
+    def seat_sink_m(self) -> float:
+        """How far a loaded tip's centre lies below a hard ball's in the same groove, m."""
+        return self.seat.below_m
 
     @property
     def X_FT(self) -> RigidTransform:

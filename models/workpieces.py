@@ -8,7 +8,7 @@ where the drawing says and the groove is not; `X_PG` moves the groove alone (G i
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -91,6 +91,7 @@ class Workpiece:
     seam_P       (N,3) the groove's root line from edge to edge, evenly spaced; tangents_P (N,3); arc_length_m (N,)
     outline_P    (4,2) corners of the top face, counter-clockwise; size_m (x, y, z) of the uncut plate
     X_PG         where the groove lies relative to its drawing; identity on the drawing itself
+    up_P         (N,3) or (1,3) the surface's normal along the seam; bend_radius_m of a plate bent over a cylinder
     """
 
     name: str
@@ -107,6 +108,8 @@ class Workpiece:
     path: PlanarPath
     X_PG: RigidTransform
     corner_radius_m: float
+    bend_radius_m: float = math.inf
+    up_P: Floats = field(default_factory=lambda: np.array([[0.0, 0.0, 1.0]]))
 
     @property
     def length_m(self) -> float:
@@ -130,7 +133,7 @@ class Workpiece:
 
     def tip_line_P(self, tip_radius_m: float) -> Floats:
         """(N,3) where the centre of a seated ball of that radius runs, m."""
-        return np.asarray(self.seam_P + np.array([0.0, 0.0, self.tip_height(tip_radius_m)]))
+        return np.asarray(self.seam_P + self.tip_height(tip_radius_m) * self.up_P)
 
 
 def seeded_groove_error(

@@ -17,6 +17,8 @@ from weldcal.systems.pose_recorder import PoseHistory
 from weldcal.welding.deformation import TagModel, deflection_from_tag, detect_tag
 from weldcal.welding.servo_state import DeflectionSample
 
+IMAGES_KEPT = 10  # a third of a second of them: later than that the servo has stopped
+
 
 @dc.dataclass(frozen=True, eq=False)
 class Deformation(Message):
@@ -26,6 +28,14 @@ class Deformation(Message):
     sample: DeflectionSample | None = None
     reason: str = "no image yet"
     reprojection_px: float = np.nan
+
+
+@dc.dataclass(frozen=True, eq=False)
+class _Work(Message):
+    """What was found last, and the images that wait for the arm's pose of their own time, oldest first."""
+
+    found: Deformation = dc.field(default_factory=Deformation)
+    waiting: tuple[Image, ...] = ()
 
 
 class ArucoDeformationEstimator(LeafSystem):
@@ -42,7 +52,8 @@ class ArucoDeformationEstimator(LeafSystem):
         - deflection
 
     `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age s.
-    A frame without a trustworthy tag is passed on as invalid with its reason, never as an old value.
+    A frame without a trustworthy tag is passed on as invalid with its reason, never as an old value. An arm whose poses come
+    later than the images has them wait: were only the newest image looked at, its pose would never be known.
     """
 
     def __init__(self, arm: ArmModel, tool: WeldingTool, camera: FingerCamera, period_s: float = 0.008) -> None:
@@ -51,7 +62,7 @@ class ArucoDeformationEstimator(LeafSystem):
         self._tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
         self._image = self.DeclareAbstractInputPort("image", AbstractValue.Make(Image()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(Deformation()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(_Work()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("deformation", lambda: AbstractValue.Make(Deformation()), self._output, ticket)
         self.DeclareVectorOutputPort("deflection", 5, self._vector, ticket | {self.time_ticket()})
@@ -59,22 +70,31 @@ class ArucoDeformationEstimator(LeafSystem):
 
     def _update(self, context: Context, state: State) -> None:
         image: Image = self._image.Eval(context)
-        newest: Deformation = context.get_abstract_state(self._state).get_value()
-        if image.sequence <= newest.sequence:
+        work: _Work = context.get_abstract_state(self._state).get_value()
+        waiting = work.waiting
+        if image.sequence > (waiting[-1].sequence if waiting else work.found.sequence):
+            waiting = (*waiting, image)[-IMAGES_KEPT:]
+        elif not waiting:
             return
-        X_BF = self._history.Eval(context).pose_at(self._arm, image.capture_time)
-        if X_BF is None:
-            return
-        state.get_mutable_abstract_state(self._state).set_value(
-            measure_deformation(image, X_BF, self._tool, self._tag, self._K)
-        )
+        found, history = work.found, self._history.Eval(context)
+        # The newest of which the pose is known; what is older than that one is not needed any more.
+        for k in reversed(range(len(waiting))):
+            X_BF = history.pose_at(self._arm, waiting[k].capture_time)
+            if X_BF is not None:
+                found = measure_deformation(waiting[k], X_BF, self._tool, self._tag, self._K)
+                waiting = waiting[k + 1 :]
+                break
+        state.get_mutable_abstract_state(self._state).set_value(_Work(found, waiting))
+
+    def _found(self, context: Context) -> Deformation:
+        work: _Work = context.get_abstract_state(self._state).get_value()
+        return work.found
 
     def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
+        output.set_value(self._found(context))
 
     def _vector(self, context: Context, output: BasicVector) -> None:
-        deformation: Deformation = context.get_abstract_state(self._state).get_value()
-        sample = deformation.sample
+        sample = self._found(context).sample
         if sample is None:
             output.SetFromVector([0.0, 0.0, 0.0, 0.0, np.inf])
             return

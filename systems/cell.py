@@ -31,13 +31,13 @@ from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.process_switch import ProcessSwitch
 from weldcal.systems.scenario import Scenario
-from weldcal.systems.seam_planner import SeamPlanner
+from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.welding_velocity_servo import ServoReport, WeldingVelocityServo
 from weldcal.welding.guard import SlewLimits
-from weldcal.welding.servo_state import ServoConfig, ToolGeometry
+from weldcal.welding.servo_state import ServoConfig, ToolGeometry, TouchConfig
 
 AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 LOG_PERIOD_S = 0.008  # a row per servo tick
@@ -45,6 +45,7 @@ SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two against refused
 MOVE_TIMEOUT_S = 20.0  # at speed_factor 1
 MOVE_SPEED, MOVE_ACCELERATION = 1.0, 2.5  # rad/s and rad/s^2 of the fastest joint, at speed_factor 1
 JERK_LIMIT = 150.0  # rad/s^3: 100 ms to the acceleration limit of the large joints
+ZERO_FRAMES = 10  # of the tag while the tip hangs free: a third of a second before it comes down
 TORCH_ABOVE_ROOT_M = 0.002  # where the wire point runs: this far above the root of the groove
 
 
@@ -130,9 +131,11 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
     )
     return ServoConfig(
         tool=geometry,
+        touch=TouchConfig(zero_frames=ZERO_FRAMES),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         delta_d_m=welding.deflection_mm * 1e-3,
         axial_d_m=welding.axial_deflection_mm * 1e-3,
+        law=welding.law,
     )
 
 
@@ -322,9 +325,10 @@ def _add_welding(
         )
     out, command, job = station.diagram.GetOutputPort, sequencer.GetOutputPort("job"), scenario.job
     welding = scenario.welding
+    kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
     planner = wiring.add(
         "seam_planner",
-        SeamPlanner(
+        kind(
             station.arm,
             tool,
             station.cad,

@@ -15,6 +15,7 @@ from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.welding.laws import get_law
 from weldcal.welding.process import WeldProcess
 
 SLOWEST_FACTOR = 0.05
@@ -68,6 +69,8 @@ class WorkpieceConfig:
     shape: str = "s"  # s, straight or l
     length_mm: float = 300.0
     pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BP as the fixture's drawing says
+    bend_radius_mm: float | None = None  # bent over a cylinder of this radius, its axis across the plate
+    located_by: str = "scan"  # scan: registered to its CAD; drawing: the fixture's drawing is believed
     placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the plate on the fixture
     groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the groove against the plate's datums
     hole_from_mm: float | None = (
@@ -100,6 +103,7 @@ class WeldingConfig:
     clearance_mm: float = 25.0  # height above the seam where the approach ends
     seam_length_mm: float | None = None  # weld only this much of the seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
+    law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/laws.py)
 
 
 @dc.dataclass
@@ -218,5 +222,10 @@ def check_scenario(scenario: Scenario) -> None:
         scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
+    get_law(scenario.welding.law)
+    if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
+        raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
+    if scenario.workpiece is not None and scenario.workpiece.bend_radius_mm and scenario.workpiece.located_by == "scan":
+        raise InputError("A bent workpiece cannot be registered to its scan yet: write workpiece.located_by: drawing.")
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
         raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

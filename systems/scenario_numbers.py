@@ -10,7 +10,15 @@ from weldcal.models.errors import InputError
 
 POSITIVE = {
     *("required_error_mm", "theta_max_deg", "guess_radius_mm", "verification_limit_mm", "clearance_m", "clearance_mm"),
-    *("speed_mm_s", "deflection_mm", "axial_deflection_mm", "seam_length_mm", "length_mm", "hole_from_mm"),
+    *(
+        "speed_mm_s",
+        "deflection_mm",
+        "axial_deflection_mm",
+        "seam_length_mm",
+        "length_mm",
+        "hole_from_mm",
+        "bend_radius_mm",
+    ),
     *("maximum_time_s", "control_period_s", "following_error_rad"),
     *("pace", "velocity_share"),
     *("rate_hz", "focal_px", "field_of_view_deg", "width", "height", "recording_fps", "cloud_points"),

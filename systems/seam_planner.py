@@ -108,11 +108,12 @@ class SeamOutOfReach(WeldcalError):
 
 def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
     """The line on which the seated tip's centre runs, in B, cut to `length_m` of arc where given."""
-    line = workpiece.tip_line_P(tool.tip_radius_m) - np.array([0.0, 0.0, tool.seat_sink_m])
+    line = workpiece.tip_line_P(tool.tip_radius_m) - tool.seat_sink_m * workpiece.up_P
+    ups = np.broadcast_to(workpiece.up_P, line.shape)
     if length_m is not None:
-        line = line[workpiece.arc_length_m <= length_m]
-    up = X_BP.rotation().matrix()[:, 2]
-    return SeamCurve.from_points(line @ X_BP.rotation().matrix().T + X_BP.translation(), up=up)
+        line, ups = line[workpiece.arc_length_m <= length_m], ups[workpiece.arc_length_m <= length_m]
+    R = X_BP.rotation().matrix()
+    return SeamCurve.from_points(line @ R.T + X_BP.translation(), up=ups @ R.T)
 
 
 def arm_waypoints(
@@ -144,3 +145,30 @@ def arm_waypoints(
         q = found
     q_above, q_start, q_retract = solutions
     return q_start, q_above, q_retract
+
+
+class DrawnSeamPlanner(SeamPlanner):
+    """A SeamPlanner that goes by the fixture's drawing: for parts whose shape a plate's registration does not know.
+
+    .. pydrake_system::
+
+        name: DrawnSeamPlanner
+        input_ports:
+        - scan
+        - job
+        - calibration_status
+        output_ports:
+        - planned_seam
+    """
+
+    def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
+        try:
+            seam = tip_seam(self._workpiece, self._X_BP_guess, self._tool, self._seam_length_m)
+            check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)
+            q_start, q_above, q_retract = arm_waypoints(
+                self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m
+            )
+        except WeldcalError as error:
+            return PlannedSeam(sequence=scan.sequence, reason=str(error))
+        points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
+        return PlannedSeam(scan.sequence, seam, self._X_BP_guess, 0.0, 1.0, q_start, q_above, q_retract, points_B)

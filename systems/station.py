@@ -14,6 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
@@ -145,8 +146,8 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
 
 def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Station:
     rng = np.random.default_rng(seed)
-    tool = WeldingTool() if scenario.tool == "welding" else None
     cad, real, X_BP = _workpieces(scenario, rng)
+    tool = _tool(scenario, cad) if scenario.tool == "welding" else None
     builder = DiagramBuilder()
     world = build_world(
         builder,
@@ -169,6 +170,17 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     return Station(diagram, robot, tool, cad, truth, world)
 
 
+def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
+    """The welding tool, as hard as it is pressed into the groove that it is for."""
+    tool, welding = WeldingTool(), scenario.welding
+    return dc.replace(
+        tool,
+        press_axial_m=welding.axial_deflection_mm * 1e-3,
+        press_lateral_m=welding.deflection_mm * 1e-3,
+        groove_half_angle_rad=tool.groove_half_angle_rad if cad is None else cad.half_angle_rad,
+    )
+
+
 def _workpieces(
     scenario: Scenario, rng: np.random.Generator
 ) -> tuple[Workpiece | None, Workpiece | None, RigidTransform | None]:
@@ -183,6 +195,8 @@ def _workpieces(
     if spec.hole_from_mm is not None:
         short = make_workpiece(spec.shape, length_m=length, X_PG=X_PG, end_cut_m=spec.hole_from_mm * 1e-3)
         real = dc.replace(real, groove_mesh=short.groove_mesh)
+    if spec.bend_radius_mm is not None:
+        cad, real = (bend(part, spec.bend_radius_mm * 1e-3) for part in (cad, real))
     placed = _lying_error(
         rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
     )

@@ -10,6 +10,7 @@ import typer
 
 from weldcal.tools import console
 from weldcal.tools.cli_robots import robots
+from weldcal.tools.studies.cli_cell import cell as reproduce_cell
 from weldcal.tools.studies.cli_reproduce import reproduce
 
 app = typer.Typer(
@@ -25,6 +26,7 @@ benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
 app.command("robots")(robots)
+reproduce.command("cell")(reproduce_cell)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

@@ -147,14 +147,23 @@ def run_calibration_live(options: DemoOptions, progress: Progress = no_progress)
 
 
 def run_weld(options: DemoOptions, progress: Progress = no_progress) -> DemoResult:
-    """The weld of a scenario alone: the scanner stands exactly where its drawing says, and the cell is told so."""
-    scenario = load_scenario(options.scenario)
+    """The weld of a scenario alone, with the scanner where the cell is told it stands."""
+    return run_scenario(known_camera(options.scenario), options, progress)
+
+
+def known_camera(name: str) -> Scenario:
+    """A scenario that only welds: the scanner stands exactly where its drawing says, and the cell is told so.
+
+    Raises:
+        InputError: the scenario is not one, or has nothing to weld.
+    """
+    scenario = load_scenario(name)
     scenario.job.calibrate, scenario.job.weld = False, True
     if isinstance(scenario.scanner, RenderedScanner):
         scenario.scanner.mounting_translation_mm = scenario.scanner.mounting_rotation_deg = 0.0
         scenario.job.X_BC = PoseConfig(list(scenario.scanner.xyz_m), list(scenario.scanner.rpy_deg))
     check_scenario(scenario)
-    return run_scenario(scenario, options, progress)
+    return scenario
 
 
 def run_scenario(scenario: Scenario, options: DemoOptions, progress: Progress = no_progress) -> DemoResult:

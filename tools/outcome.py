@@ -47,6 +47,16 @@ class WeldOutcome:
     plan_error: PathError | None
 
 
+@dataclass(frozen=True, eq=False)
+class FeltSeam:
+    """The refined seam point by point, (N,) m: arc length on the true seam, and how far to the left of and above the line
+    on which, by the tool's numbers, a seated tip is felt."""
+
+    s: Array
+    lateral: Array
+    height: Array
+
+
 @dataclass(frozen=True)
 class CalibrationError:
     """X_BC against the truth: at the camera's origin, and for a point seen at the work point."""
@@ -95,9 +105,24 @@ def true_seam(cell: Cell) -> SeamCurve | None:
     truth = cell.station.truth
     if truth.workpiece is None or truth.X_BP is None:
         return None
-    line = truth.workpiece.seam_P + np.array([0.0, 0.0, TORCH_ABOVE_ROOT_M])
+    ups = truth.workpiece.up_P
+    line = truth.workpiece.seam_P + TORCH_ABOVE_ROOT_M * ups
     R = truth.X_BP.rotation().matrix()
-    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=R[:, 2])
+    return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
+
+
+def felt_seam(cell: Cell, root: Context) -> FeltSeam | None:
+    """The points that the tip felt and the servo kept, against the truth; None where it felt nothing."""
+    state, seam = servo_report(cell, root).state, true_seam(cell)
+    if state is None or seam is None or len(state.refined) < 10:
+        return None
+    assert cell.station.cad is not None
+    assert cell.station.tool is not None
+    tool = cell.station.tool
+    seat = cell.station.cad.tip_height(tool.tip_radius_m) - tool.seat_sink_m
+    line = seam.raised(seat - TORCH_ABOVE_ROOT_M, tool.seat_side_m)
+    found = path_error(state.refined.points, line)
+    return FeltSeam(found.s, found.lateral, found.height)
 
 
 def weld_log(cell: Cell, root: Context) -> WeldLog | None:
@@ -154,9 +179,8 @@ def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
     plan_error = None
     if plan is not None:
         seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m) - cell.station.tool.seat_sink_m  # type: ignore[union-attr]
-        line = plan.position(np.linspace(0.0, plan.length, 200)) - (seat - TORCH_ABOVE_ROOT_M) * np.array(
-            [0.0, 0.0, 1.0]
-        )
+        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seat)
+        line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
         return WeldOutcome(log, seam, plan, None, None, plan_error)

@@ -38,6 +38,11 @@ SHARES = {
 }
 
 
+LOOKS = {
+    "job": 0.008,
+    "progress": 1.0,
+    "panel": 0.1,
+}  # seconds between looks; the sequencer's own period is longer than a look's
 AT_REST_RAD_S = 1e-3
 COMMANDED_RAD_S = 1e-6
 COMES_TO_REST_S = 1.0  # how long a run goes on after its job has ended, at most, until the arm is at rest
@@ -107,20 +112,29 @@ def run_cell(
     start = time.perf_counter()
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
-    finished_at = np.inf
+    finished_at, has_panel = np.inf, cell.diagram.HasSubsystemNamed("operator_panel")
+    next_at = dict.fromkeys(LOOKS, 0.0)
+
+    def due(what: str, now: float) -> bool:
+        if now < next_at[what] - 1e-9:
+            return False
+        next_at[what] = now + LOOKS[what]
+        return True
 
     def watch(root: Context) -> EventStatus:
         nonlocal finished_at
+        if run.clock is not None:
+            run.clock.wait_for(root.get_time(), _commanded(cell, root))
+        if not due("job", root.get_time()):
+            return EventStatus.DidNothing()
         command = cell.sequencer.job_state(cell.sequencer.GetMyContextFromRoot(root)).command
         if not run.phases or command.phase != run.phases[-1][0]:
             _keep_scan(run, root)
             run.phases.append((command.phase, root.get_time(), time.perf_counter() - start))
             progress(command.phase.replace("_", " "), _share(run, root, command.phase))
-        elif command.phase == "weld" and int(root.get_time() / 0.002) % 500 == 0:
+        elif command.phase == "weld" and due("progress", root.get_time()):
             progress("weld", _share(run, root, "weld"))
-        if run.clock is not None:
-            run.clock.wait_for(root.get_time(), _commanded(cell, root))
-        elif cell.diagram.HasSubsystemNamed("operator_panel") and int(root.get_time() / 0.002) % 50 == 0:
+        if run.clock is None and has_panel and due("panel", root.get_time()):
             _keep_pace(run, root)
         if command.finished:
             finished_at = min(finished_at, root.get_time())

@@ -26,6 +26,11 @@ def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
     )
 
 
+def freshness(state: WeldingState, time: float) -> float:
+    """How much the newest frame still says of the tip at a time s: 1 up to three periods of the camera, 0 from six on."""
+    return clip(2.0 - (time - max(state.frame_time, state.started)) / 0.1, 0.0, 1.0)
+
+
 def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config: ServoConfig) -> WeldingState:
     """The state after a new frame: tip point, delta = P_r - P_s (Eq. 15), its part along n and the axial part."""
     frame = sample.deflection

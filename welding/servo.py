@@ -10,6 +10,7 @@ import numpy as np
 from weldcal.welding.contact import (
     beyond_limit,
     contact_lost,
+    freshness,
     is_new_frame,
     turned,
     with_frame,
@@ -55,7 +56,8 @@ def welding_step(
         state = _begin(state, sample, plan, config)
     if not finite(sample.X_BT.translation()):
         state = _fault(state, sample.time, "The robot's pose is not a number; check the robot's connection.")
-    state = changed(state, time=sample.time)
+    stood = state.stood + config.period_s if state.time is not None and sample.time <= state.time else 0.0
+    state = changed(state, time=sample.time, stood=stood)
 
     is_new = state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
     before = state
@@ -105,6 +107,10 @@ def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Wel
     """What stops a weld at any moment: a hidden tag, or a tip pushed too far."""
     if state.phase in (Phase.DONE, Phase.FAULT):
         return state
+    if state.stood > config.contact.hidden_s:
+        # The arm goes on meanwhile, and by its clock no frame is ever late.
+        text = f"The robot's clock has stood still for {state.stood:.2f} s; check the robot's connection."
+        return _fault(state, sample.time, text)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
         return _fault(state, sample.time, text)
@@ -300,8 +306,8 @@ def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> st
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
     """The tip's wanted lateral and upward speed, m/s: by feel in TRACK, by the moved plan in COAST and FINISH."""
     if state.phase == Phase.TRACK:
-        # A frame later than two periods says where the tip was, not where it is: its correction fades out.
-        fresh = clip(2.0 - (sample.time - state.frame_time) / 0.1, 0.0, 1.0)
+        # A late frame says where the tip was, not where it is: its correction fades out.
+        fresh = freshness(state, sample.time)
         seek = config.delta_d_m if state.delta_wanted is None else state.delta_wanted
         lateral = config.k_p * (seek - state.delta_n)
         if state.sunk:

@@ -321,6 +321,7 @@ class WeldingState:
     phase: Phase = Phase.TOUCH
     reason: str | None = None
     time: float | None = None
+    stood: float = 0.0
     started: float = 0.0
     plan_fit: PlanFit | None = None
     refined: RefinedSeam = field(default_factory=RefinedSeam.empty)

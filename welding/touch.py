@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.contact import freshness
 from weldcal.welding.evolve import changed
 from weldcal.welding.seam import SeamCurve, SeamFrame
 from weldcal.welding.servo_state import GainFit, ServoConfig, ServoSample, WeldingState
@@ -49,10 +50,12 @@ def touch_step(
     touch, t = config.touch, state.touch
     gap = sample.X_BT.translation() - seam.position
     left, height = dot(gap, seam.normal), dot(gap, seam.up)
-    deep = state.delta_axial
-    depth_servo = clip(config.k_z * (deep - config.axial_d_m), -config.servo_speed_m_s, config.servo_speed_m_s)
-    if height < config.tool.tip_drop_m - touch.depth_m - config.axial_d_m:
-        return state, 0.0, 0.0, "Seam not found: the tip met no work; check the plan's height.", False
+    deep, fresh = state.delta_axial, freshness(state, sample.time)
+    depth_servo = fresh * clip(config.k_z * (deep - config.axial_d_m), -config.servo_speed_m_s, config.servo_speed_m_s)
+    # Once it has met the face it may come down by the groove's depth more.
+    floor = (config.tool.tip_drop_m if t.step == "descend" else 0.0) - touch.depth_m - config.axial_d_m
+    if height < floor:
+        return state, 0.0, 0.0, _no_work(state, sample, height, config), False
 
     if t.step == "descend":
         if state.zero is None and touch.zero_frames > 0:
@@ -62,7 +65,8 @@ def touch_step(
         speed = touch.fast_m_s if fast else touch.slow_m_s
         if is_new and deep > 0.9 * config.axial_d_m:
             return _next(state, "settle", sample.time), 0.0, 0.0, None, False
-        return state, 0.0, -min(speed, config.k_z * max(0.0, config.axial_d_m - deep) + 0.3e-3), None, False
+        down = min(speed, config.k_z * max(0.0, config.axial_d_m - deep) + 0.3e-3)
+        return state, 0.0, -fresh * down, None, False
 
     assert state.measurement is not None
     tip_height = dot(state.measurement.point - seam.position, seam.up)
@@ -73,8 +77,23 @@ def touch_step(
         return changed(state, touch=t), 0.0, depth_servo, None, False
 
     if t.step == "search":
-        return _search(state, is_new, left, tip_height, depth_servo, config, sample.time)
+        return _search(state, is_new, left, tip_height, depth_servo, fresh, config, sample.time)
     return _press(state, sample, is_new, left, seam, config)
+
+
+def _no_work(state: WeldingState, sample: ServoSample, height: float, config: ServoConfig) -> str:
+    """What is said of a tip that has come too deep: how deep, what it read last, and how old that is."""
+    below = 1e3 * (config.tool.tip_drop_m - height)
+    if state.measurement is None:
+        read = "without a look at its tag"
+    else:
+        age = sample.time - state.measurement.capture_time
+        read = f"and it read {1e3 * state.delta_axial:.1f} mm of deflection {age:.2f} s ago"
+    where = "met no work" if state.touch.step == "descend" else "lost the work"
+    return (
+        f"Seam not found: the tip {where} (its rest is {below:.1f} mm below where it should meet the face, {read}); "
+        "check the plan's height."
+    )
 
 
 def _zeroed(
@@ -101,6 +120,7 @@ def _search(
     left: float,
     tip_height: float,
     depth_servo: float,
+    fresh: float,
     config: ServoConfig,
     now: float,
 ) -> tuple[WeldingState, float, float, str | None, bool]:
@@ -130,7 +150,7 @@ def _search(
         text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the work again."
         return state, 0.0, 0.0, text, False
     # While the tip falls there is little holding it down: wait for the depth servo, or it climbs out over the far wall.
-    held = clip(2.0 * state.delta_axial / config.axial_d_m - 0.5, 0.0, 1.0)
+    held = fresh * clip(2.0 * state.delta_axial / config.axial_d_m - 0.5, 0.0, 1.0)
     lateral = clip(config.k_p * (config.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
     return state, held * lateral, depth_servo, None, False
 

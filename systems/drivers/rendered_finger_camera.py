@@ -1,17 +1,19 @@
 """The finger camera in simulation: the tag rendered as it moves with the soft tip, with noise and latency."""
 
 import dataclasses as dc
+from functools import lru_cache
 from typing import Any
 
+import cv2
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageRgba8U, RgbdSensor
+from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
-from weldcal.systems.drivers.simulated_world import FINGER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Image, Message
 
@@ -42,6 +44,18 @@ class _Stream(Message):
     started: float = -np.inf
     count: int = 0
     frames: tuple[Image, ...] = (Image(),)
+
+
+@lru_cache(maxsize=4)
+def _noise_table(sigma: float) -> np.ndarray:
+    """65536 equally likely values of Gaussian noise, cut to whole grey levels as a camera cuts: a draw is one look-up."""
+    return np.asarray(np.floor(sigma * ndtri((np.arange(65536) + 0.5) / 65536)), dtype=np.int16)
+
+
+def with_noise(grey: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """A picture (H, W) uint8 with Gaussian noise of `sigma` grey levels on each pixel, as uint8."""
+    drawn = np.frombuffer(rng.bytes(2 * grey.size), dtype=np.uint16).reshape(grey.shape)
+    return np.asarray(cv2.add(grey, np.take(_noise_table(sigma), drawn), dtype=cv2.CV_8U), dtype=np.uint8)
 
 
 class StreamingColourCamera(LeafSystem):
@@ -83,15 +97,12 @@ class StreamingColourCamera(LeafSystem):
         started = stream.started if np.isfinite(stream.started) else now
         hidden = self._config.hidden_from_s is not None and now - started >= self._config.hidden_from_s
         rng = np.random.default_rng([self._seed, stream.count])
-        shape = (self._config.height, self._config.width)
         if hidden:
-            grey = np.full(shape, 25.0)
+            grey = np.full((self._config.height, self._config.width), 25, dtype=np.uint8)
         else:
-            rgba = self._color.Eval(context).data
-            grey = rgba[:, :, 1].astype(np.float32)  # the tag is black on white: one channel says it all
-        noisy = np.clip(grey + self._config.noise_grey * rng.standard_normal(shape, dtype=np.float32), 0, 255).astype(
-            np.uint8
-        )
+            # The tag is black on white: one channel says it all.
+            grey = np.asarray(cv2.extractChannel(self._color.Eval(context).data, 1))
+        noisy = with_noise(grey, self._config.noise_grey, rng)
         step = self._plant_period_s
         taken = (np.ceil(now / step - 1e-6) - 1.0) * step  # on a tick itself the plant still shows the step before
         frame = Image(stream.count + 1, taken, noisy, now)
@@ -115,24 +126,24 @@ class StreamingColourCamera(LeafSystem):
 def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None:
     """Mount a colour camera in the tool and stream it."""
     world, tool = build.simulated_world(), build.tool
-    if tool is None or world.tool is None:
+    view = world.finger_view
+    if tool is None or view is None:
         return
     camera = config.camera()
     K = camera.camera_matrix
     info = CameraInfo(
         config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
     )  # half pixel: VTK's convention
-    core = RenderCameraCore(FINGER_RENDERER, info, ClippingRange(0.005, 0.5), RigidTransform())
+    core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
     color, depth = ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.01, 0.4))
-    plate = world.plant.GetBodyByName("tool_plate", world.tool)
-    frame = world.plant.GetBodyFrameIdOrThrow(plate.index())
+    frame = view.frames[world.plant.GetBodyByName("tool_plate", world.tool).index()]
     sensor = build.builder.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
     sensor.set_name("finger_camera_colour")
     stream = build.builder.AddSystem(
         StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step())
     )
     stream.set_name("finger_camera")
-    build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.builder.Connect(sensor.color_image_output_port(), stream.GetInputPort("color_image"))
     build.inputs["finger_camera.streaming"] = stream.GetInputPort("streaming")
     build.outputs["finger_camera.image"] = stream.GetOutputPort("image")

@@ -22,7 +22,7 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
-from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER, SimulatedWorld
+from weldcal.systems.drivers.simulated_world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 
@@ -152,19 +152,20 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
     k = drake_intrinsics(preset)
     _show_housing(world, X_BC)
+    view = world.scanner_view
     core = RenderCameraCore(
-        SCANNER_RENDERER,
+        view.renderer,
         CameraInfo(k.width, k.height, k.focal_x, k.focal_y, k.center_x, k.center_y),
         ClippingRange(0.05, 5.0),
         RigidTransform(),
     )
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
     colour = ColorRenderCamera(core, False)
-    sensor = build.builder.AddSystem(RgbdSensor(world.scene_graph.world_frame_id(), X_BC, colour, camera))
+    sensor = build.builder.AddSystem(RgbdSensor(view.scene_graph.world_frame_id(), X_BC, colour, camera))
     sensor.set_name("scanner_depth")
     scanner = build.builder.AddSystem(DepthSensor(preset, int(build.rng.integers(2**31)), config.exposure_s))
     scanner.set_name("scanner")
-    build.builder.Connect(world.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     build.builder.Connect(sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))
     build.builder.Connect(sensor.color_image_output_port(), scanner.GetInputPort("color_image"))
     build.inputs["scanner.trigger"] = scanner.GetInputPort("trigger")

@@ -16,11 +16,9 @@ from pydrake.geometry import (
     GeometryInstance,
     IllustrationProperties,
     InMemoryMesh,
-    MakeRenderEngineVtk,
     Mesh,
     PerceptionProperties,
     ProximityProperties,
-    RenderEngineVtkParams,
     SceneGraph,
     Shape,
     Sphere,
@@ -48,6 +46,7 @@ from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.picture_scene import PictureScene, add_picture_scene
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
 from weldcal.welding.deformation import TagModel, tag_cells
@@ -61,6 +60,9 @@ SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
 CELL_PX = 16  # texels of a tag cell: about those of the camera's picture of it, so that interpolation smooths the edges
 TIP_FRICTION = 0.2  # soft tip on steel
+# The contact model's ball is a polyhedron inside the ball it is asked for, with this share of its volume (at a resolution of half
+# the radius). It is asked for one as much larger, or the tip would sink by what the corners were cut off.
+CONTACT_MESH_VOLUME = 0.9114
 JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of the arm's joint servos
 JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
 
@@ -74,6 +76,8 @@ class SimulatedWorld(Message):
     arm: ModelInstanceIndex
     tool: ModelInstanceIndex | None
     tip_joints: tuple[PrismaticJoint, ...]
+    scanner_view: PictureScene
+    finger_view: PictureScene | None
 
 
 def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
@@ -191,7 +195,8 @@ def _add_tool(
     AddCompliantHydroelasticProperties(
         resolution_hint=contact_hint_m, hydroelastic_modulus=tool.tip_modulus_Pa, properties=contact
     )
-    plant.RegisterCollisionGeometry(body, RigidTransform(), Sphere(radius), "tip_contact", contact)
+    rounded = Sphere(radius * CONTACT_MESH_VOLUME ** (-1.0 / 3.0))
+    plant.RegisterCollisionGeometry(body, RigidTransform(), rounded, "tip_contact", contact)
     return instance, tuple(joints)
 
 
@@ -238,8 +243,6 @@ def build_world(
         ),
         builder,
     )
-    for name in (SCANNER_RENDERER, FINGER_RENDERER):
-        scene_graph.AddRenderer(name, MakeRenderEngineVtk(RenderEngineVtkParams()))
     (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     _add_flange(plant, instance, flange)
@@ -267,4 +270,16 @@ def build_world(
         rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
         rest.set_name("tip_at_rest")
         builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
-    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints)
+    scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
+    finger_view = None
+    if tool_instance is not None:
+        finger_view = add_picture_scene(
+            builder,
+            plant,
+            scene_graph,
+            FINGER_RENDERER,
+            mount="tool_plate",
+            only=("tag_print", "tag_white"),
+            background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
+        )
+    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view)

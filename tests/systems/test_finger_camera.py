@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
+from pydrake.geometry import ClippingRange, ColorRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.sensors import ImageRgba8U
+from pydrake.systems.sensors import CameraInfo, ImageRgba8U
 
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation, measure_deformation
@@ -61,6 +62,24 @@ def drawn(deflection_T: np.ndarray, scale: int = 8) -> np.ndarray:
 
 def read(image: Image) -> Deformation:
     return measure_deformation(image, forward_kinematics(the_arm(), Q_HOME), TOOL, TAG, CAMERA.camera_matrix)
+
+
+def test_its_scene_is_the_cells_as_seen_from_the_tool() -> None:
+    """The finger camera's scene holds the tag alone: no pixel may be other than in the picture of the whole cell."""
+    drive = Drive(plain_station())
+    drive.place_arm(Q_HOME, MM * np.array([2.0, -3.0, 4.0]))
+    world = drive.station.world
+    assert world.finger_view is not None
+    c, K = CAMERA, CAMERA.camera_matrix
+    info = CameraInfo(c.width, c.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
+    plate = world.plant.GetBodyByName("tool_plate", world.tool).index()
+    pictures = []
+    for view in (world.finger_view, world.scanner_view):
+        core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
+        query = view.scene_graph.get_query_output_port().Eval(view.scene_graph.GetMyContextFromRoot(drive.context))
+        pictures.append(query.RenderColorImage(ColorRenderCamera(core), view.frames[plate], TOOL.X_FK).data.copy())
+    assert np.array_equal(*pictures)
+    assert np.ptp(pictures[0][:, :, 1]) > 200, "the tag is in it"
 
 
 @pytest.mark.parametrize("push_mm", PUSHES_MM)
@@ -253,6 +272,21 @@ def test_a_frame_from_before_the_arms_memory_is_not_used() -> None:
     estimator.feed("history", PoseHistory(np.array([0.5, 0.6]), np.tile(Q_HOME, (2, 1))))
     estimator.feed("image", Image(1, 0.02, drawn(np.zeros(3))))
     assert estimator.at(0.05)[0].sample is None
+
+
+def test_images_wait_for_an_arm_whose_poses_come_later() -> None:
+    """Poses 0.1 s late, an image every 0.033 s: the newest image is always ahead of them, and the older ones are read."""
+    estimator = Estimator()
+    ages, read = [], []
+    for k in range(1, 13):
+        time = k / 30.0
+        estimator.feed("image", Image(k, time - 0.04, drawn(np.zeros(3))))
+        estimator.feed("history", PoseHistory(np.array([-1.0, time - 0.108, time - 0.1]), np.tile(Q_HOME, (3, 1))))
+        deformation, vector = estimator.at(time + 0.001)
+        ages.append(vector[4])
+        read.append(deformation.sequence)
+    assert read[4:] == list(range(3, 11)), "each, two images later"
+    assert max(ages[4:]) < 0.12
 
 
 def test_the_scenarios_camera_is_the_one_that_is_read() -> None:

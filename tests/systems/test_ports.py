@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_load
-from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.geometry import FramePoseVector, Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDataType
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
@@ -25,6 +25,7 @@ from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimato
 from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.cell_visualizer import CellVisualizer
 from weldcal.systems.command_arbiter import CommandArbiter
+from weldcal.systems.drivers.picture_scene import PicturePoses
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.drivers.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
@@ -46,7 +47,7 @@ from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.process_switch import ProcessSwitch
 from weldcal.systems.scenario import VisualizationConfig
-from weldcal.systems.seam_planner import SeamPlanner
+from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import CheatPoses
@@ -73,6 +74,10 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SeamPlanner: lambda: SeamPlanner(
         the_arm(), TOOL, make_workpiece("straight"), X, ServoConfig(), Q_HOME, 0.025, None
     ),
+    DrawnSeamPlanner: lambda: DrawnSeamPlanner(
+        the_arm(), TOOL, make_workpiece("straight"), X, ServoConfig(), Q_HOME, 0.025, None
+    ),
+    PicturePoses: lambda: PicturePoses(plain_station().world.plant, plain_station().world.scanner_view.frames),
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
@@ -131,6 +136,13 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "calibration_status": CalibrationStatus,
         "planned_seam": PlannedSeam,
     },
+    DrawnSeamPlanner: {
+        "scan": Scan,
+        "job": JobCommand,
+        "calibration_status": CalibrationStatus,
+        "planned_seam": PlannedSeam,
+    },
+    PicturePoses: {"body_poses": list, "frame_poses": FramePoseVector},
     ArucoDeformationEstimator: {"image": Image, "history": PoseHistory, "deformation": Deformation, "deflection": 5},
     WeldingVelocityServo: {
         "planned_seam": PlannedSeam,
@@ -202,6 +214,7 @@ FEEDTHROUGH: dict[type[LeafSystem], set[tuple[str, str]]] = {
     WeldingVelocityServo: {("job", "torch_on")},  # the process goes off in the very tick in which the job says so
     # whoever stops the arm turns the process off in the same tick
     ProcessSwitch: {(i, "process_on") for i in ("torch_wanted", "job", "robot_status", "margin", "hold")},
+    PicturePoses: {("body_poses", "frame_poses")},
     CheatPoses: {("body_poses", "contact"), ("body_poses", "torch")},
 }
 

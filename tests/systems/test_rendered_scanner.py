@@ -25,6 +25,7 @@ from pydrake.systems.sensors import ImageDepth32F
 
 from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
+from weldcal.systems.drivers.picture_scene import PictureScene
 from weldcal.systems.drivers.rendered_scanner import (
     ApplyDriverConfig,
     DepthSensor,
@@ -53,6 +54,7 @@ class _OnlyAScene:
     """As much of a simulated world as the scanner's driver touches."""
 
     scene_graph: SceneGraph
+    scanner_view: PictureScene
 
 
 def a_scene(builder: DiagramBuilder) -> SceneGraph:
@@ -72,7 +74,8 @@ def scan_of_the_plate(width: int = 824, height: int = 616) -> Scan:
     """What the driver's own chain of camera and scanner returns."""
     builder = DiagramBuilder()
     config = RenderedScanner("ideal", width, height, [0.0, 0.0, DISTANCE_M], [180.0, 0.0, 0.0], 0.0, 0.0, 0.0)
-    world: Any = _OnlyAScene(a_scene(builder))
+    scene = a_scene(builder)
+    world: Any = _OnlyAScene(scene, PictureScene(scene, SCANNER_RENDERER, {}))
     build = StationBuild(builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), world)
     assert ApplyDriverConfig(config, build).IsNearlyEqualTo(X_BC, 1e-12)
     builder.ExportInput(build.inputs["scanner.trigger"], "trigger")

@@ -68,6 +68,8 @@ workpiece:
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
   groove_error: {translation_mm: 1.5, rotation_deg: 0.3}
   hole_from_mm: 200.0
+  bend_radius_mm: 250.0
+  located_by: drawing
 welding:
   speed_mm_s: 6.0
   deflection_mm: 1.5
@@ -75,6 +77,7 @@ welding:
   clearance_mm: 30.0
   seam_length_mm: 100.0
   process: {name: TIG, current_A: 90.0, voltage_V: 11.0, efficiency: 0.55, wire_feed_m_min: 1.2}
+  law: fixed
 job:
   calibrate: false
   weld: false
@@ -285,3 +288,17 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
         load_scenario("moon")
     with pytest.raises(InputError, match=r"There is no scenario 'moon\.yaml'"):
         load_scenario("moon.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("welding: {law: magic}", "magic"),
+        ("workpiece: {located_by: luck}", "scan or drawing"),
+        ("workpiece: {bend_radius_mm: 200.0}", "located_by: drawing"),
+        ("workpiece: {bend_radius_mm: -1.0, located_by: drawing}", "bend_radius_mm must be a positive number"),
+    ],
+)
+def test_a_law_or_workpiece_that_is_not_to_be_had_is_refused(text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        load_scenario("s_groove", text)

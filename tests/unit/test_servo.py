@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -25,7 +26,7 @@ from weldcal.welding.servo_state import (
 )
 from weldcal.welding.touch import touch_start_pose
 
-from .weld_kinematics import HARD, NOMINAL, PERFECT, SEAT, Run, l_curve, s_curve, straight, weld
+from .weld_kinematics import DROP, HARD, NOMINAL, PERFECT, SEAT, Run, l_curve, s_curve, straight, weld
 
 CALIBRATED = ServoConfig(touch=TouchConfig(calibrate_gain=True))
 SPEED = CALIBRATED.weld_speed_m_s
@@ -193,7 +194,23 @@ def test_a_groove_that_is_not_there_is_said_not_to_be(shift: tuple[float, float,
     assert run.last.phase == Phase.FAULT
     assert "Seam not found" in (run.last.reason or "")
     assert text in (run.last.reason or "")
+    if shift[2]:
+        # Its rest went down by the 6 mm that are allowed and the deflection that there should have been.
+        assert re.search(r"9\.[01] mm below .* it read -?0\.\d mm of deflection 0\.[01]\d s ago", run.last.reason or "")
     assert not run.torch_on.any()
+
+
+def test_while_no_frame_comes_the_tool_presses_no_deeper() -> None:
+    """The worst moment is while it follows a tip that fell into the groove: the last frame asks for more depth."""
+    points = straight(0.1)
+    plan = SeamCurve.from_points(points)
+    seen = weld(points, NOMINAL, ServoConfig(), 1, plan=plan, time_limit=5.0)
+    fell = float(seen.time[np.argmax(seen.tip[:, 2] < SEAT + 0.8 * DROP)])
+    blind = weld(points, NOMINAL, ServoConfig(), 1, plan=plan, time_limit=6.0, hidden=(fell + 0.6, fell + 0.8))
+    assert Phase.TRACK in seen.phases()
+    assert Phase.TRACK in blind.phases()
+    lowest = [run.tool[: run.phase.index(Phase.TRACK), 2].min() for run in (seen, blind)]
+    assert lowest[1] > lowest[0] - 0.1 * MM
 
 
 def test_a_plan_that_no_trailing_torch_can_follow_is_refused_before_anything_moves() -> None:

@@ -175,6 +175,21 @@ def test_a_torch_that_stands_is_stopped_by_name(half_way: tuple[WeldingState, Ri
     assert 0.008 * k <= CONFIG.stall_s + 0.1
 
 
+def test_a_clock_that_stands_still_stops_the_weld(half_way: tuple[WeldingState, RigidTransform, SeamCurve]) -> None:
+    """By a clock that stands no frame is late, and the arm would go on blind."""
+    state, X, plan = half_way
+    time, torch = float(state.time or 0.0), []
+    for _ in range(100):
+        state, command = welding_step(state, ServoSample(time, X, None), plan, CONFIG)
+        bounded(command)
+        torch.append(command.torch_on)
+        if command.phase == Phase.FAULT:
+            break
+    assert "clock has stood still" in (command.reason or "")
+    assert 0.3 <= len(torch) * CONFIG.period_s < 0.33
+    assert not torch[-1]
+
+
 def test_the_tags_own_bias_goes_with_its_zero() -> None:
     biased = replace(NOMINAL, tag_bias_m=-0.23e-3, tag_gain=1.0)
     seam = straight(0.12)

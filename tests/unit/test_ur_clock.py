@@ -82,3 +82,14 @@ def test_a_controller_that_stood_still_is_on_the_map_again_within_a_second() -> 
         clock.update(robot, OFFSET + lost + robot + QUICKEST)
     assert clock.to_host(121.0) == pytest.approx(OFFSET + lost + 121.0 + QUICKEST, abs=1e-9)
     assert clock.drift == 0.0
+
+
+def test_a_controller_that_falls_behind_its_own_pace_is_followed() -> None:
+    """An emulated one on a busy computer: its clock loses a fiftieth, or half a second at once."""
+    # The earliest package of the newest whole bin is at most a second old: a fiftieth of that, where the line was 1.2 s off.
+    assert abs(error_s(fed(60.0, drift=0.02), 60.0, drift=0.02)) < 0.025
+    clock = fed(60.0)
+    for k in range(int(250 * 4.0)):
+        robot = 160.0 + 0.004 * k
+        clock.update(robot, OFFSET + robot + 0.5 + QUICKEST)
+    assert abs(clock.to_host(164.0) - (OFFSET + 164.0 + 0.5 + QUICKEST)) < 1e-3

@@ -10,7 +10,7 @@ BIN_S = 0.5
 BINS = 60  # half a minute of bins
 BINS_FOR_DRIFT = 8
 DRIFT_LIMIT = 5e-4  # quartz against quartz is below 1e-4
-STEP_S = 0.010  # more than this off the line for a whole bin: the controller stood still, or its clock was set
+STEP_S = 0.005  # more than this off the line for a whole bin: the controller stood still, or its clock was set
 
 
 class ClockMap:
@@ -18,7 +18,8 @@ class ClockMap:
 
     A package can only be late, so the least of (host - robot) in each half second is the best sight of the offset; a
     line through these least values, weighted to none, gives offset and drift, and its residual says how good that is.
-    Where a whole bin lies off the line by more than STEP_S, what was seen before it belongs to another clock and is dropped.
+    Where a whole bin lies off the line by more than STEP_S, what was seen before it belongs to another clock and is dropped;
+    where the line is steeper than two quartzes can differ, the controller does not keep its own pace, and the last bin counts.
     """
 
     def __init__(self, pace: float = 1.0) -> None:
@@ -55,8 +56,10 @@ class ClockMap:
             self._offset, self.drift = float(seen.min()), 0.0
         else:
             slope, at_origin = np.polyfit(t - self._origin, seen, 1)
-            self.drift = float(np.clip(slope, -DRIFT_LIMIT, DRIFT_LIMIT))
-            self._offset = float(at_origin)
+            self.drift, self._offset = float(slope), float(at_origin)
+            if abs(slope) > DRIFT_LIMIT:
+                # No quartz: a controller that lost time, and how much is in the newest packages alone.
+                self.drift, self._offset = 0.0, float(seen[-1])
         line = self._offset + self.drift * (t - self._origin)
         self.residual_s = float(np.sqrt(np.mean((seen - line) ** 2)))
 

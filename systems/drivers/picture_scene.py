@@ -1,0 +1,122 @@
+"""What a camera looks at: a scene of its own, in which nothing is moved until a picture is taken."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import (
+    FrameId,
+    FramePoseVector,
+    GeometryFrame,
+    GeometryInstance,
+    MakeRenderEngineVtk,
+    RenderEngineVtkParams,
+    Role,
+    SceneGraph,
+)
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import BodyIndex
+from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+
+from weldcal.systems.messages import Message
+
+
+@dataclass(frozen=True)
+class PictureScene(Message):
+    """A scene graph with one renderer, and the frames of the bodies that move in it."""
+
+    scene_graph: SceneGraph
+    renderer: str
+    frames: dict[BodyIndex, FrameId]
+
+
+class PicturePoses(LeafSystem):
+    """Where the bodies stand that a camera may see.
+
+    .. pydrake_system::
+
+        name: PicturePoses
+        input_ports:
+        - body_poses
+        output_ports:
+        - frame_poses
+
+    Calculated when a picture is taken and not before: a renderer whose scene is the contact model's own is told of every
+    step of it, 500 times a second, and that costs as much as the contact itself.
+    """
+
+    def __init__(self, plant: MultibodyPlant, frames: dict[BodyIndex, FrameId]) -> None:
+        super().__init__()
+        self._frames = frames
+        self._body_poses = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
+        self.DeclareAbstractOutputPort(
+            "frame_poses",
+            lambda: AbstractValue.Make(FramePoseVector()),
+            self._calculate,
+            {self._body_poses.ticket()},
+        )
+
+    def _calculate(self, context: Context, output: Any) -> None:
+        body_poses = self._body_poses.Eval(context)
+        found = FramePoseVector()
+        for body, frame in self._frames.items():
+            found.set_value(frame, body_poses[body])
+        output.set_value(found)
+
+
+def add_picture_scene(
+    builder: DiagramBuilder,
+    plant: MultibodyPlant,
+    drawn: SceneGraph,
+    renderer: str,
+    mount: str | None = None,
+    only: Collection[str] | None = None,
+    background: tuple[float, float, float] | None = None,
+) -> PictureScene:
+    """Add a scene with what the bodies of `plant` look like in the scene graph `drawn`.
+
+    Args:
+        plant: finalised.
+        renderer: name of the VTK renderer that is made for it.
+        mount: name of the body that carries the camera; None: it stands still.
+        only: names of the geometries that are seen; None: all.
+        background: red, green and blue, 0 to 1, of what lies behind; None: the renderer's own.
+    """
+    scene = builder.AddSystem(SceneGraph())
+    scene.set_name(f"{renderer}_scene")
+    parameters = RenderEngineVtkParams()
+    if background is not None:
+        parameters.default_clear_color = background
+    scene.AddRenderer(renderer, MakeRenderEngineVtk(parameters))
+    source = scene.RegisterSource("world")
+    inspector = drawn.model_inspector()
+    world = plant.world_body().index()
+    frames: dict[BodyIndex, FrameId] = {world: scene.world_frame_id()}
+
+    def frame_of(body: BodyIndex) -> FrameId:
+        if body not in frames:
+            frames[body] = scene.RegisterFrame(source, GeometryFrame(plant.get_body(body).name()))
+        return frames[body]
+
+    if mount is not None:
+        frame_of(plant.GetBodyByName(mount).index())
+    for geometry in inspector.GetAllGeometryIds(Role.kPerception):
+        name = inspector.GetName(geometry)
+        if only is not None and name.split("::")[-1] not in only:
+            continue
+        body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).index()
+        copy = GeometryInstance(inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry), name)
+        copy.set_perception_properties(inspector.GetPerceptionProperties(geometry))
+        if body == world:
+            scene.RegisterAnchoredGeometry(source, copy)
+        else:
+            scene.RegisterGeometry(source, frame_of(body), copy)
+    del frames[world]
+    poses = builder.AddSystem(PicturePoses(plant, frames))
+    poses.set_name(f"{renderer}_poses")
+    builder.Connect(plant.get_body_poses_output_port(), poses.GetInputPort("body_poses"))
+    builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
+    return PictureScene(scene, renderer, frames)
