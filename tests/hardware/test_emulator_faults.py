@@ -292,13 +292,15 @@ def test_local_mode_ignores_scripts_and_refuses_the_dashboard(robot: Emulator) -
 
 def test_the_speed_slider_ramps_and_scales_the_motion(robot: Emulator) -> None:
     move(robot)
-    with Rtde().watch("speed_scaling", "target_speed_fraction", "actual_qd") as client:
+    with Rtde().watch("timestamp", "speed_scaling", "target_speed_fraction", "actual_qd") as client:
+        client.next()
         robot.fault("speed_scaling", value=0.25, ramp=0.1, latch=False)
         rows = client.during(0.2)
     scaling = np.array([row["speed_scaling"] for row in rows])
     assert (scaling[0] > 0.9, scaling[-1]) == (True, 0.25)
-    # 0.75 over 50 frames
-    assert np.diff(scaling).min() == pytest.approx(-0.015)
+    assert np.diff([row["timestamp"] for row in rows]) == pytest.approx(FRAME_S)
+    # 0.75 over 50 frames, the first of them too
+    assert np.diff([1.0, *scaling]).min() == pytest.approx(-0.015)
     assert np.diff(scaling).max() <= 0.0
     assert rows[-1]["target_speed_fraction"] == 0.25
     assert rows[-1]["actual_qd"][0] == pytest.approx(0.25 * SPEED_RAD_S, rel=1e-3)

@@ -237,7 +237,7 @@ class ControlServer(Server):
             if i < steps:
                 self._controller.later(STEP_S, lambda: step(i + 1))
 
-        step(1)
+        self._controller.later(STEP_S, lambda: step(1))
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)
