@@ -72,3 +72,13 @@ def test_the_map_answers_from_the_first_package_on() -> None:
 
 def test_more_drift_than_any_quartz_has_is_not_believed() -> None:
     assert abs(fed(30.0, drift=0.01).drift) <= 5e-4
+
+
+def test_a_controller_that_stood_still_is_on_the_map_again_within_a_second() -> None:
+    # every sample thought 80 ms old is a pose of another place than the picture shows: 0.8 mm at 10 mm/s
+    clock, lost = fed(20.0), 0.080
+    for k in range(250):
+        robot = 120.0 + 0.004 * k
+        clock.update(robot, OFFSET + lost + robot + QUICKEST)
+    assert clock.to_host(121.0) == pytest.approx(OFFSET + lost + 121.0 + QUICKEST, abs=1e-9)
+    assert clock.drift == 0.0

@@ -10,6 +10,7 @@ BIN_S = 0.5
 BINS = 60  # half a minute of bins
 BINS_FOR_DRIFT = 8
 DRIFT_LIMIT = 5e-4  # quartz against quartz is below 1e-4
+STEP_S = 0.010  # more than this off the line for a whole bin: the controller stood still, or its clock was set
 
 
 class ClockMap:
@@ -17,6 +18,7 @@ class ClockMap:
 
     A package can only be late, so the least of (host - robot) in each half second is the best sight of the offset; a
     line through these least values, weighted to none, gives offset and drift, and its residual says how good that is.
+    Where a whole bin lies off the line by more than STEP_S, what was seen before it belongs to another clock and is dropped.
     """
 
     def __init__(self, pace: float = 1.0) -> None:
@@ -36,6 +38,9 @@ class ClockMap:
             self._origin, self._offset = robot_time, seen
             self._bin_end = robot_time + BIN_S
         if robot_time >= self._bin_end and self._least is not None:
+            at, least = self._least
+            if abs(least - self._offset - self.drift * (at - self._origin)) > STEP_S:
+                self._bins.clear()
             self._bins.append(self._least)
             self._least, self._bin_end = None, robot_time + BIN_S
             self._fit()
