@@ -10,6 +10,7 @@ import typer
 
 from weldcal.tools import console
 from weldcal.tools.studies.cli_reproduce import reproduce
+from weldcal.tools.studies.cli_tablet import benchmark_tablet
 
 app = typer.Typer(
     name="weldcal",
@@ -23,6 +24,7 @@ app = typer.Typer(
 benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
+benchmarks.command("tablet")(benchmark_tablet)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

@@ -8,8 +8,10 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.studies.cli_tablet import reproduce_tablet
 
 reproduce = typer.Typer(help="Figures against their targets.", no_args_is_help=True)
+reproduce.command("tablet")(reproduce_tablet)
 
 
 @reproduce.callback()
