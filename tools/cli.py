@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.cli_reproduce import reproduce
 from weldcal.tools.studies.cli_tablet import benchmark_tablet
 
@@ -24,6 +25,7 @@ app = typer.Typer(
 benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
+app.add_typer(tablet, name="tablet")
 benchmarks.command("tablet")(benchmark_tablet)
 
 OutOption = Annotated[
