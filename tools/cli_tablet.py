@@ -33,3 +33,63 @@ def serve(
         from weldcal.tools.tablet_page.serve import run_server
 
         run_server(host, port, out, typer.echo)
+
+
+@tablet.command("calibrate")
+def calibrate(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The page's touches (CSV), or planar touches (npz).")],
+    poses: Annotated[
+        Path | None, typer.Option("--poses", metavar="CSV", help="Flange poses at each touch, and one row 'camera'.")
+    ] = None,
+    camera: Annotated[
+        Path | None, typer.Option("--camera", metavar="YAML", help="fx, fy, cx, cy and distortion of the camera.")
+    ] = None,
+    image: Annotated[
+        Path | None, typer.Option("--image", metavar="PICTURE", help="What the camera saw; landmarks are found in it.")
+    ] = None,
+    seen: Annotated[
+        Path | None, typer.Option("--seen", metavar="CSV", help="Instead: landmark,u,v in the camera's image.")
+    ] = None,
+    look: Annotated[
+        str, typer.Option("--look", metavar="LOOK", help="Landmarks in the image: rings or dots.")
+    ] = "rings",
+    pen_length_mm: Annotated[
+        float | None, typer.Option("--pen-length-mm", metavar="MM", help="Pen tip before the flange, along its z.")
+    ] = None,
+    hand_step_mm: Annotated[
+        float, typer.Option("--hand-step-mm", metavar="MM", min=0.0, help="npz: hands were read off in such steps.")
+    ] = 0.0,
+    printed_sign: Annotated[
+        bool, typer.Option("--printed-sign", help="npz: the touching error with the sign that the paper prints.")
+    ] = False,
+    two_stages: Annotated[bool, typer.Option("--two-stages", help="npz: also the paper's own two stages.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
+    ] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", metavar="N", min=0, help="Names the folder; nothing here is random.")
+    ] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
+) -> None:
+    """Where do camera and pen sit on the wrist? From one look at the tablet and a touch of each landmark."""
+    from weldcal.tools.cli import finish, fresh_folder
+
+    folder = out or fresh_folder("tablet", file.stem, seed)
+    with console.boundary(json_wanted=json, debug=debug):
+        from weldcal.tools.tablet_calibrate import TabletInputs, calibrate_tablet
+
+        inputs = TabletInputs(
+            file,
+            poses,
+            camera,
+            image,
+            seen,
+            look,
+            None if pen_length_mm is None else 1e-3 * pen_length_mm,
+            1e-3 * hand_step_mm,
+            printed_sign,
+            two_stages,
+        )
+        summary = calibrate_tablet(inputs, folder)
+    finish("tablet calibrate", summary, folder, json_wanted=json)
