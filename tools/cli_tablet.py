@@ -56,6 +56,9 @@ def calibrate(
     pen_length_mm: Annotated[
         float | None, typer.Option("--pen-length-mm", metavar="MM", help="Pen tip before the flange, along its z.")
     ] = None,
+    pen_radius_mm: Annotated[
+        float, typer.Option("--pen-radius-mm", metavar="MM", min=0.0, help="Radius of the pen's round tip.")
+    ] = 0.0,
     hand_step_mm: Annotated[
         float, typer.Option("--hand-step-mm", metavar="MM", min=0.0, help="npz: hands were read off in such steps.")
     ] = 0.0,
@@ -87,9 +90,36 @@ def calibrate(
             seen,
             look,
             None if pen_length_mm is None else 1e-3 * pen_length_mm,
+            1e-3 * pen_radius_mm,
             1e-3 * hand_step_mm,
             printed_sign,
             two_stages,
         )
         summary = calibrate_tablet(inputs, folder)
     finish("tablet calibrate", summary, folder, json_wanted=json)
+
+
+@tablet.command("demo")
+def demo(
+    scenario: Annotated[
+        Path | None,
+        typer.Option("--scenario", metavar="FILE", help="A tablet scenario YAML.", show_default="as it ships"),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
+    ] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
+    ] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
+) -> None:
+    """The whole procedure in simulation: a look, a touch of each landmark by contact, the calibration, against the truth."""
+    from weldcal.tools.cli import finish, fresh_folder
+
+    folder = out or fresh_folder("tablet", "demo", seed)
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
+        from weldcal.tools.tablet_demo import run_tablet_demo
+
+        summary = run_tablet_demo(scenario, folder, seed, progress)
+    finish("tablet demo", summary, folder, json_wanted=json)

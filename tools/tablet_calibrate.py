@@ -35,6 +35,7 @@ class TabletInputs:
     seen: Path | None = None
     look: str = "rings"
     pen_length_m: float | None = None
+    pen_radius_m: float = 0.0
     hand_step_m: float = 0.0
     printed_sign: bool = False
     two_stages: bool = False
@@ -125,7 +126,15 @@ def _wrist(inputs: TabletInputs) -> TabletResult:
     if inputs.look not in ("rings", "dots"):
         raise InputError(f"--look must be rings or dots, not '{inputs.look}'.")
     look: Look = "dots" if inputs.look == "dots" else "rings"
-    visit = load_visit(inputs.file, inputs.poses, inputs.camera, image=inputs.image, seen=inputs.seen, look=look)
+    visit = load_visit(
+        inputs.file,
+        inputs.poses,
+        inputs.camera,
+        image=inputs.image,
+        seen=inputs.seen,
+        look=look,
+        tip_radius_m=inputs.pen_radius_m,
+    )
     fit = fit_wrist(visit.data, inputs.pen_length_m)
     files = (inputs.file, inputs.poses, inputs.camera, inputs.image, inputs.seen)
     checked = (

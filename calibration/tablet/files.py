@@ -125,12 +125,13 @@ def load_visit(
     image: Path | None = None,
     seen: Path | None = None,
     look: Look = "rings",
+    tip_radius_m: float = 0.0,
 ) -> WristVisit:
     """Touches of the page's CSV, with the flange's poses and what the camera saw (an image, or positions in a CSV).
 
     ``poses``: landmark,x,y,z,qw,qx,qy,qz of X_BF in metres at each touch, and one row whose landmark is `camera` for where
     the image was taken. Of a landmark touched twice the last touch counts. Landmarks without a pose are left out.
-    Raises TabletDataError with the file and what to change, LandmarksNotFound for the image.
+    ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the file and what to change, LandmarksNotFound for the image.
     """
     rows = {int(float(r["landmark"])): r for r in _table(touches, TOUCH_COLUMNS)}
     pose_rows = {r["landmark"].strip(): r for r in _table(poses, POSE_COLUMNS)}
@@ -166,6 +167,7 @@ def load_visit(
         landmark_m=landmark - corner,
         views=((_flange_pose(pose_rows[CAMERA_ROW], poses), intrinsics.rays(uv)),),
         focal_px=float(intrinsics.focal_px.mean()),
+        tip_radius_m=tip_radius_m,
     )
     return WristVisit(data, all(rows[k].get("size_checked", "1").strip() != "0" for k in used))
 

@@ -28,7 +28,8 @@ class WristTouches:
 
     ``X_BF`` flange in the base at each of n touches; ``touched_m`` and ``landmark_m`` (n, 2) on the tablet; ``views``:
     for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks; ``focal_px`` of the camera
-    (mean of both axes), which turns rays into pixels.
+    (mean of both axes), which turns rays into pixels. ``tip_radius_m`` of a round pen tip, whose centre is what p_FP then
+    means: however the pen leans, the centre stands that far above the point it touches.
     """
 
     X_BF: tuple[RigidTransform, ...]
@@ -36,12 +37,13 @@ class WristTouches:
     landmark_m: Array
     views: tuple[tuple[RigidTransform, Array], ...]
     focal_px: float
+    tip_radius_m: float = 0.0
 
     def pick(self, keep: NDArray[np.bool_]) -> WristTouches:
         """The same visit with these landmarks only."""
         poses = tuple(X for X, k in zip(self.X_BF, keep, strict=True) if k)
         views = tuple((X, rays[keep]) for X, rays in self.views)
-        return WristTouches(poses, self.touched_m[keep], self.landmark_m[keep], views, self.focal_px)
+        return WristTouches(poses, self.touched_m[keep], self.landmark_m[keep], views, self.focal_px, self.tip_radius_m)
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransfo
     U, _, Vt = np.linalg.svd(np.c_[x[0:3], x[3:6]], full_matrices=False)
     columns = U @ Vt
     R = RotationMatrix(np.c_[columns, np.cross(columns[:, 0], columns[:, 1])])
-    return RigidTransform(R, x[6:9]), x[9:12]
+    return RigidTransform(R, x[6:9] + data.tip_radius_m * R.matrix()[:, 2]), x[9:12]
 
 
 def _refine(
@@ -162,7 +164,7 @@ def _refine(
     pen_length_m: float | None,
 ) -> tuple[tuple[RigidTransform, Array, RigidTransform], Array, Array, Array]:
     """Least squares over (X_BT, p_FP, X_FC); returns them, their covariance (15, 15) and both kinds of residuals."""
-    touched = np.c_[data.touched_m, np.zeros(len(data.touched_m))]
+    touched = np.c_[data.touched_m, np.full(len(data.touched_m), -data.tip_radius_m)]
     landmarks = np.c_[data.landmark_m, np.zeros(len(data.landmark_m))]
     spread = np.array([_OPEN_PRIOR_M] * 2 + [_OPEN_PRIOR_M if pen_length_m is None else _KNOWN_PRIOR_M])
     expected = np.array([0.0, 0.0, 0.0 if pen_length_m is None else pen_length_m])
