@@ -103,7 +103,7 @@ class TabletWorld:
 
 
 def build_tablet_world(
-    builder: DiagramBuilder, arm: ArmModel, scenario: TabletScenario, truth: TabletTruth, time_step_s: float = 0.002
+    builder: DiagramBuilder, arm: ArmModel, scenario: TabletScenario, truth: TabletTruth, time_step_s: float = 0.004
 ) -> TabletWorld:
     """Build arm, rig, table and tablet. Frame: the world is the base B. The pen gives way along z_F against its spring."""
     plant, scene_graph = AddMultibodyPlant(

@@ -8,9 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.systems.analysis import Simulator
 
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.tablet_cell import make_tablet_cell, run_tablet_cell
+from weldcal.systems.drivers.wrist_devices import TabletTouch, WristPicture
+from weldcal.systems.messages import UrStatus
+from weldcal.systems.tablet_cell import make_tablet_cell, plan_tablet
+from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.tablet_scenario import load_tablet_scenario
 from weldcal.tools.tablet_demo import run_tablet_demo
 
@@ -62,16 +68,74 @@ def test_the_run_leaves_what_the_calibration_reads(demo: Demo) -> None:
     assert {"touches.csv", "poses.csv", "camera.yaml", "picture.png", "tablet.yaml", "ur_pose.script"} <= names
 
 
-def test_a_tablet_that_feels_nothing_holds_the_procedure_and_the_arm_goes_home() -> None:
-    scenario = load_tablet_scenario(
-        None, "{tablet: {touch_force_N: 50.0}, clearance_mm: 12.0, descent_mm_s: 25.0, deepest_mm: 3.0}"
+@dataclass(eq=False)
+class Alone:
+    """The procedure by itself: its inputs are told, and every goal it sets is reached at once."""
+
+    simulator: Simulator
+    procedure: TabletProcedure
+    plan: TabletPlan
+
+    def tell(self, **inputs: object) -> None:
+        for name, value in inputs.items():
+            self.procedure.GetInputPort(name).FixValue(self.simulator.get_mutable_context(), value)
+
+    @property
+    def state(self) -> TabletState:
+        shown: TabletState = self.procedure.GetOutputPort("state").Eval(self.simulator.get_context())
+        return shown
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.01)):
+            if self.state.goal_id:
+                self.tell(settled_goal=[self.state.goal_id], position_measured=np.array(self.state.q_goal))
+            if self.state.phase == "look":
+                self.tell(picture=AbstractValue.Make(WristPicture(self.state.trigger)))
+            self.simulator.AdvanceTo(self.simulator.get_context().get_time() + 0.01)
+
+
+@pytest.fixture
+def alone() -> Alone:
+    arm, scenario = load_arm("ur10e"), load_tablet_scenario()
+    plan = plan_tablet(scenario, arm)
+    procedure = TabletProcedure(arm, plan)
+    made = Alone(Simulator(procedure), procedure, plan)
+    made.tell(
+        position_measured=plan.q_home,
+        settled_goal=[0.0],
+        robot_status=AbstractValue.Make(UrStatus()),
+        picture=AbstractValue.Make(WristPicture()),
+        touch=AbstractValue.Make(TabletTouch()),
     )
-    cell = make_tablet_cell(scenario, 0)
-    visit = run_tablet_cell(cell)
-    assert visit.state.phase == "held"
-    assert "met no tablet at landmark 1" in visit.state.reason
-    assert visit.state.touches == ()
-    np.testing.assert_allclose(visit.state.q_goal, np.deg2rad(scenario.home_deg))
+    return made
+
+
+def test_a_tablet_that_feels_nothing_holds_the_procedure_and_the_arm_goes_home(alone: Alone) -> None:
+    alone.run(0.5)
+    assert alone.state.phase == "descend"
+    alone.run(alone.plan.longest_descent_s)
+    assert alone.state.phase == "held"
+    assert "met no tablet at landmark 1" in alone.state.reason
+    np.testing.assert_array_equal(alone.state.q_goal, alone.plan.q_home)
+
+
+def test_a_bounce_on_the_way_up_is_not_the_next_touch(alone: Alone) -> None:
+    alone.run(0.5)
+    alone.tell(touch=AbstractValue.Make(TabletTouch(1, 0.5, np.zeros(2), True)))
+    alone.run(0.02)
+    alone.tell(touch=AbstractValue.Make(TabletTouch(2, 0.52, np.ones(2), True)))
+    alone.run(0.5)
+    assert alone.state.phase == "descend"
+    assert alone.state.landmark == 1
+    assert len(alone.state.touches) == 1
+
+
+def test_a_stopped_robot_holds_the_procedure_with_its_own_words(alone: Alone) -> None:
+    alone.run(0.5)
+    alone.tell(robot_status=AbstractValue.Make(UrStatus(safety_mode="PROTECTIVE_STOP", fault="It stopped.")))
+    alone.run(0.05)
+    assert (alone.state.phase, alone.state.reason) == ("held", "It stopped.")
+    assert not alone.procedure.GetOutputPort("descent").Eval(alone.simulator.get_context()).any()
 
 
 def test_a_tablet_out_of_reach_is_refused_before_anything_moves(tmp_path: Path) -> None:
