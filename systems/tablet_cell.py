@@ -38,6 +38,7 @@ from weldcal.systems.tablet_scenario import TabletScenario, landmarks_m
 from weldcal.welding.guard import SlewLimits
 
 Array = NDArray[np.float64]
+RECORDING_FPS = 8.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +172,8 @@ class TabletVisit:
     seconds: float
 
 
-def run_tablet_cell(cell: TabletCell) -> TabletVisit:
-    """Run the procedure to its end (done, or held with a reason)."""
+def run_tablet_cell(cell: TabletCell, meshcat: Meshcat | None = None) -> TabletVisit:
+    """Run the procedure to its end (done, or held with a reason); the viewer that the cell was built with records it."""
     simulator = Simulator(cell.diagram)
 
     def watch(root: Context) -> EventStatus:
@@ -182,7 +183,12 @@ def run_tablet_cell(cell: TabletCell) -> TabletVisit:
 
     simulator.set_monitor(watch)
     simulator.Initialize()
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=RECORDING_FPS)
     simulator.AdvanceTo(cell.scenario.maximum_time_s)
+    if meshcat is not None:
+        meshcat.StopRecording()
+        meshcat.PublishRecording()
     root = simulator.get_context()
     picture: WristPicture = cell.camera.GetOutputPort("picture").Eval(cell.camera.GetMyContextFromRoot(root))
     return TabletVisit(_state(cell, root), picture, float(root.get_time()))

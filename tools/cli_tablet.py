@@ -111,6 +111,7 @@ def demo(
     seed: Annotated[
         int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
     ] = 0,
+    record: Annotated[bool, typer.Option("--record", help="Also write recording.html, the run in 3D.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
@@ -121,5 +122,5 @@ def demo(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
         from weldcal.tools.tablet_demo import run_tablet_demo
 
-        summary = run_tablet_demo(scenario, folder, seed, progress)
+        summary = run_tablet_demo(scenario, folder, seed, progress, record=record)
     finish("tablet demo", summary, folder, json_wanted=json)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump
+from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
@@ -28,16 +29,23 @@ Array = NDArray[np.float64]
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
 
 
-def run_tablet_demo(scenario: Path | None, folder: Path, seed: int, progress: Progress) -> dict[str, object]:
+def run_tablet_demo(
+    scenario: Path | None, folder: Path, seed: int, progress: Progress, *, record: bool = False
+) -> dict[str, object]:
     """Run the cell, write its files and the calibration from them; returns the summary for JSON.
+
+    ``record`` also writes recording.html, the run in 3D.
 
     Raises InputError (the scenario), LandmarksNotFound (the picture); a procedure that was held is a summary too.
     """
     start = time.monotonic()
     progress("build", 0.0)
-    cell = make_tablet_cell(load_tablet_scenario(scenario), seed)
+    meshcat = Meshcat(MeshcatParams(host="localhost", port=None)) if record else None
+    cell = make_tablet_cell(load_tablet_scenario(scenario), seed, meshcat)
     progress("look and touch", 0.1)
-    visit = run_tablet_cell(cell)
+    visit = run_tablet_cell(cell, meshcat)
+    if meshcat is not None:
+        write_atomic(folder / "recording.html", meshcat.StaticHtml())
     if visit.state.phase != "done":
         reason = visit.state.reason or "The procedure did not end in time; allow more with maximum_time_s."
         return {

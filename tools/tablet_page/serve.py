@@ -106,8 +106,14 @@ def addresses(host: str, port: int) -> list[str]:
     """What to type on the tablet."""
     if not _unspecified(host):
         return [f"http://{f'[{host}]' if ':' in host else host}:{port}/"]
-    found = {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
-    return [f"http://{name}:{port}/" for name in sorted(found)]
+    # connecting a datagram socket sends nothing, and tells which of this machine's addresses would be used
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))
+            name = str(probe.getsockname()[0])
+        except OSError:  # no network at all
+            name = "127.0.0.1"
+    return [f"http://{name}:{port}/"]
 
 
 def is_loopback(host: str) -> bool:
