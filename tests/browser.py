@@ -58,13 +58,21 @@ class Browser:
         self._driver.execute_cdp_cmd("Network.emulateNetworkConditions", conditions)
         self.console_messages()
         self._driver.get(page.resolve().as_uri() if isinstance(page, Path) else page)
+        self.wait(wait_for, timeout_s)
+
+    def wait(self, condition: str, timeout_s: float = 30) -> None:
+        """Waits until a JavaScript expression is true; raises selenium.common.TimeoutException if it never is."""
         WebDriverWait(self._driver, timeout_s).until(
-            lambda driver: driver.execute_script(f"return Boolean({wait_for})")
+            lambda driver: driver.execute_script(f"return Boolean({condition})")
         )
 
     def run(self, script: str) -> object:
         """The value that a piece of JavaScript returns."""
         return self._driver.execute_script(script)
+
+    def devtools(self, command: str, **parameters: object) -> object:
+        """What a command of the browser's own tools answers (input events, a screen's pixel ratio)."""
+        return self._driver.execute_cdp_cmd(command, parameters)
 
     def text(self) -> str:
         """What a person can read on the page."""

@@ -10,8 +10,10 @@ import typer
 
 from weldcal.tools import console
 from weldcal.tools.cli_robots import robots
+from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.cli_cell import cell as reproduce_cell
 from weldcal.tools.studies.cli_reproduce import reproduce
+from weldcal.tools.studies.cli_tablet import benchmark_tablet
 
 app = typer.Typer(
     name="weldcal",
@@ -27,6 +29,8 @@ app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
 app.command("robots")(robots)
 reproduce.command("cell")(reproduce_cell)
+app.add_typer(tablet, name="tablet")
+benchmarks.command("tablet")(benchmark_tablet)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

@@ -33,7 +33,7 @@ def source_files() -> set[str]:
         path.relative_to(ROOT).as_posix()
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("*")
-        if path.suffix in {".py", ".yaml", ".script", ".j2", ".css"} or path.name == "py.typed"
+        if path.suffix in {".py", ".yaml", ".script", ".j2", ".css", ".html"} or path.name == "py.typed"
     }
 
 

@@ -9,8 +9,10 @@ import typer
 
 from weldcal.tools import console
 from weldcal.tools.studies.cli_flange import flange
+from weldcal.tools.studies.cli_tablet import reproduce_tablet
 
 reproduce = typer.Typer(help="Figures against their targets.", no_args_is_help=True)
+reproduce.command("tablet")(reproduce_tablet)
 
 
 @reproduce.callback()

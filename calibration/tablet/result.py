@@ -1,0 +1,114 @@
+"""A tablet calibration as files: tablet.yaml, tablet.json, and where the camera sits on the flange for other tools."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump, yaml_load
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.result import (
+    export_ros2,
+    export_ur_pose,
+    export_urdf,
+    matrix4,
+    software_version,
+    write_atomically,
+)
+from weldcal.models.errors import InputError
+
+RESULT_FILE = "tablet.yaml"
+PARENT, CHILD = "flange", "camera_optical_frame"
+
+
+@dataclass(frozen=True)
+class TabletResult:
+    """All that tablet.yaml holds.
+
+    ``model``: closed_form, pnp (planar, an upright pen) or wrist (full poses); ``parameters`` by name, m and rad, and
+    their ``covariance`` in that order. Only for wrist: ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the
+    flange side about the camera's origin), ``p_FP_m`` and its covariance (3, 3).
+    """
+
+    model: str
+    parameters: dict[str, float]
+    covariance: list[list[float]]
+    residual_mm: list[float]
+    leave_one_out_mm: list[float]
+    X_FC: RigidTransform | None = None
+    X_FC_covariance: list[list[float]] | None = None
+    p_FP_m: list[float] | None = None
+    p_FP_covariance: list[list[float]] | None = None
+    two_stages: dict[str, Any] | None = None
+    other_models: dict[str, float] = field(default_factory=dict)
+    unobservable: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    data_sha256: dict[str, str] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """The result in YAML's and JSON's own types."""
+        return {
+            "schema": 1,
+            "software": software_version(),
+            "configuration": "eye_in_hand_tablet",
+            "model": self.model,
+            "parameters": dict(self.parameters),
+            "covariance": self.covariance,
+            "X_FC": None if self.X_FC is None else _pose(self.X_FC),
+            "X_FC_covariance": self.X_FC_covariance,
+            "p_FP_m": self.p_FP_m,
+            "p_FP_covariance": self.p_FP_covariance,
+            "residual_mm": self.residual_mm,
+            "leave_one_out_mm": self.leave_one_out_mm,
+            "two_stages": self.two_stages,
+            "leave_one_out_of_other_models_mm": dict(self.other_models),
+            "unobservable": list(self.unobservable),
+            "warnings": list(self.warnings),
+            "data_sha256": dict(self.data_sha256),
+        }
+
+
+def _pose(X: RigidTransform) -> dict[str, Any]:
+    q = X.rotation().ToQuaternion().wxyz()
+    return {"matrix": matrix4(X), "xyz": [float(v) for v in X.translation()], "wxyz": [float(v) for v in q]}
+
+
+def save_tablet_result(result: TabletResult, folder: Path) -> tuple[Path, ...]:
+    """Write tablet.yaml, tablet.json and, where the camera's place is known, URDF, ROS 2 and URScript forms of it."""
+    document = result.document()
+    files = {RESULT_FILE: yaml_dump(document), "tablet.json": json.dumps(document, indent=1, allow_nan=False) + "\n"}
+    if result.X_FC is not None:
+        files |= {
+            "camera.urdf.xacro": export_urdf(result.X_FC, PARENT, CHILD),
+            "static_transform.sh": export_ros2(result.X_FC, PARENT, CHILD),
+            "ur_pose.script": export_ur_pose(result.X_FC),
+        }
+    for name, text in files.items():
+        write_atomically(folder / name, text)
+    return tuple(folder / name for name in files)
+
+
+def load_tablet_result(path: Path) -> TabletResult:
+    """Read a tablet.yaml, or the folder that holds it; raises InputError where it is none."""
+    path = path / RESULT_FILE if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(f"There is no tablet calibration at '{path}'; give a folder of 'weldcal tablet calibrate'.")
+    try:
+        d = yaml_load(filename=str(path))
+        if d["schema"] != 1 or d["configuration"] != "eye_in_hand_tablet":
+            raise ValueError(d["schema"])
+        M = None if d["X_FC"] is None else np.array(d["X_FC"]["matrix"], dtype=float)
+        X_FC = None if M is None else RigidTransform(RotationMatrix(M[:3, :3]), M[:3, 3])
+        return TabletResult(
+            d["model"], dict(d["parameters"]), d["covariance"], d["residual_mm"], d["leave_one_out_mm"], X_FC,
+            d["X_FC_covariance"], d["p_FP_m"], d["p_FP_covariance"], d["two_stages"],
+            dict(d["leave_one_out_of_other_models_mm"]), tuple(d["unobservable"]), tuple(d["warnings"]), dict(d["data_sha256"]),
+        )  # fmt: skip
+    except Exception as error:
+        raise InputError(
+            f"'{path.name}' is no tablet calibration of schema 1; run 'weldcal tablet calibrate'."
+        ) from error

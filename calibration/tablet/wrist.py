@@ -1,0 +1,218 @@
+"""Camera and pen on the wrist from full robot poses: touches fix tablet and pen, images fix the camera, all in one fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.optimize import least_squares
+
+from weldcal.calibration.rigid import exp_rotation, skew
+from weldcal.calibration.tablet.errors import TabletDataError
+from weldcal.calibration.tablet.plane_pose import tablet_pose
+from weldcal.calibration.tablet.touches import check_layout, check_turns
+
+Array = NDArray[np.float64]
+
+_OPEN_PRIOR_M = 1.0  # of the pen's tip where nothing is known: far wider than any pen
+_KNOWN_PRIOR_M = 0.5e-3  # of a pen length that a person measured
+_UNSURE_M = 5e-3  # a pen's tip worse than this is not known
+_TOUCH_FLOOR_M, _PIXEL_FLOOR = 1e-6, 1e-3  # keep exact data from dividing by zero
+
+
+@dataclass(frozen=True)
+class WristTouches:
+    """Touches and images of one visit, SI units.
+
+    ``X_BF`` flange in the base at each of n touches; ``touched_m`` and ``landmark_m`` (n, 2) on the tablet; ``views``:
+    for each image the flange's pose when it was taken and the rays (n, 2) of the landmarks; ``focal_px`` of the camera
+    (mean of both axes), which turns rays into pixels. ``tip_radius_m`` of a round pen tip, whose centre is what p_FP then
+    means: however the pen leans, the centre stands that far above the point it touches.
+    """
+
+    X_BF: tuple[RigidTransform, ...]
+    touched_m: Array
+    landmark_m: Array
+    views: tuple[tuple[RigidTransform, Array], ...]
+    focal_px: float
+    tip_radius_m: float = 0.0
+
+    def pick(self, keep: NDArray[np.bool_]) -> WristTouches:
+        """The same visit with these landmarks only."""
+        poses = tuple(X for X, k in zip(self.X_BF, keep, strict=True) if k)
+        views = tuple((X, rays[keep]) for X, rays in self.views)
+        return WristTouches(poses, self.touched_m[keep], self.landmark_m[keep], views, self.focal_px, self.tip_radius_m)
+
+
+@dataclass(frozen=True)
+class WristFit:
+    """Camera ``X_FC`` and pen tip ``p_FP`` (3,) m on the flange, tablet ``X_BT`` in the base.
+
+    ``covariance`` (6, 6) of X_FC, [rotation; translation] on the flange side about the camera's origin, and
+    ``pen_covariance`` (3, 3) m^2, from the residuals. ``touch_residuals_m`` (n, 3), ``pixel_residuals`` (v, n, 2).
+    ``leave_one_out_m`` (n,): how far the pen would touch from what the first image shows, in the tablet's plane, by a fit
+    without that landmark. ``unobservable``: sentences on what the touches left open.
+    """
+
+    X_FC: RigidTransform
+    p_FP: Array
+    X_BT: RigidTransform
+    covariance: Array
+    pen_covariance: Array
+    touch_residuals_m: Array
+    pixel_residuals: Array
+    leave_one_out_m: Array
+    sigma_touch_m: float
+    sigma_pixel: float
+    unobservable: tuple[str, ...]
+
+
+def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_one_out: bool = True) -> WristFit:
+    """Fit tablet, pen and camera together; ``pen_length_m`` along the flange's z where it is known.
+
+    Start: touches are linear in two columns of R_BT, p_BT and p_FP; the camera follows from PnP. Then least squares over
+    all fifteen unknowns, touches and pixels each weighted by their own scatter. Raises TooFewLandmarks,
+    CollinearLandmarks, EqualRotations, LandmarksNotFound (PnP), TabletDataError (no image).
+    """
+    if not data.views:
+        raise TabletDataError("There is no image of the tablet; take at least one before touching.")
+    check_layout(data.landmark_m)
+    check_turns(_turns(data.X_BF))
+    X_BT, p_FP = _start(data, pen_length_m)
+    X_BF0, rays = data.views[0]
+    X_FC = X_BF0.inverse() @ X_BT @ tablet_pose(rays, data.landmark_m).inverse()
+    sigma_t, sigma_p, freedom = 0.3e-3, 0.3, 1.0
+    result, covariance = (X_BT, p_FP, X_FC), np.eye(15)
+    for _ in range(3):
+        result, covariance, touch, pixel = _refine(data, result, sigma_t, sigma_p, pen_length_m)
+        # nine unknowns are the touches', six the images'
+        freedom = max(touch.size - 9, 1)
+        sigma_t = max(float(np.sqrt((touch**2).sum() / freedom)), _TOUCH_FLOOR_M)
+        sigma_p = max(float(np.sqrt((pixel**2).sum() / max(pixel.size - 6, 1))), _PIXEL_FLOOR)
+    X_BT, p_FP, X_FC = result
+    pen_covariance = covariance[6:9, 6:9]
+    left_out = np.full(len(data.X_BF), np.nan)
+    if leave_one_out and len(data.X_BF) > 4:
+        for i in range(len(left_out)):
+            keep = np.arange(len(left_out)) != i
+            left_out[i] = _missed(fit_wrist(data.pick(keep), pen_length_m, leave_one_out=False), data, i)
+    return WristFit(
+        X_FC, p_FP, X_BT, covariance[9:, 9:], pen_covariance, touch, pixel, left_out, sigma_t, sigma_p,
+        _open_directions(p_FP, pen_covariance, _axis_spread(data.X_BF)),
+    )  # fmt: skip
+
+
+def seen_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
+    """Point (3,) m in the base where a ray (2,) of the camera, with the flange at ``X_BF``, meets the tablet's plane."""
+    X_BC = X_BF @ fit.X_FC
+    direction = X_BC.rotation().multiply(np.array([ray[0], ray[1], 1.0]))
+    normal = fit.X_BT.rotation().matrix()[:, 2]
+    depth = normal @ (fit.X_BT.translation() - X_BC.translation()) / (normal @ direction)
+    return np.asarray(X_BC.translation() + depth * direction)
+
+
+def _missed(fit: WristFit, data: WristTouches, i: int) -> float:
+    """Distance m in the tablet's plane between where the pen stood and what the first image says of landmark i."""
+    X_BF0, rays = data.views[0]
+    R = fit.X_BT.rotation().matrix()
+    beside = R[:, :2] @ (data.touched_m[i] - data.landmark_m[i])
+    off = data.X_BF[i].multiply(fit.p_FP) - (seen_point(fit, X_BF0, rays[i]) + beside)
+    return float(np.linalg.norm(R[:, :2].T @ off))
+
+
+def _turns(poses: tuple[RigidTransform, ...]) -> Array:
+    """Angle (n,) rad of each pose from the first, signed about the axis that they share best."""
+    vectors = [(poses[0].rotation().inverse() @ X.rotation()).ToAngleAxis() for X in poses]
+    turns = np.array([a.angle() * a.axis() for a in vectors])
+    axis = np.linalg.svd(turns)[2][0] if np.abs(turns).max() > 0.0 else np.array([0.0, 0.0, 1.0])
+    return np.asarray(turns @ axis)
+
+
+def _axis_spread(poses: tuple[RigidTransform, ...]) -> float:
+    """Largest angle (rad) between the flange's z axes."""
+    z = np.array([X.rotation().matrix()[:, 2] for X in poses])
+    return float(np.arccos(np.clip((z @ z.T).min(), -1.0, 1.0)))
+
+
+def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransform, Array]:
+    """Closed form: R_BF p_FP + p_BF = r1 x + r2 y + p_BT for twelve unknowns, the open ones kept at the prior."""
+    n = len(data.X_BF)
+    A, b = np.zeros((n, 3, 12)), np.zeros((n, 3))
+    for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
+        A[k, :, 0:3], A[k, :, 3:6], A[k, :, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
+        A[k, :, 9:12] = -X.rotation().matrix()
+        b[k] = X.translation()
+    # columns to a like size, so that what is open is left at its prior and not shared out by units
+    guess = np.r_[np.zeros(11), 0.0 if pen_length_m is None else pen_length_m]
+    unit = np.r_[np.full(6, 1.0 / max(float(np.abs(data.touched_m).max()), 1e-6)), np.ones(6)]
+    flat, rest = A.reshape(-1, 12) * unit, b.reshape(-1) - A.reshape(-1, 12) @ guess
+    prior = 1e-4 * np.eye(12)[9:]
+    x = guess + unit * np.linalg.lstsq(np.vstack([flat, prior]), np.r_[rest, np.zeros(3)], rcond=None)[0]
+    U, _, Vt = np.linalg.svd(np.c_[x[0:3], x[3:6]], full_matrices=False)
+    columns = U @ Vt
+    R = RotationMatrix(np.c_[columns, np.cross(columns[:, 0], columns[:, 1])])
+    return RigidTransform(R, x[6:9] + data.tip_radius_m * R.matrix()[:, 2]), x[9:12]
+
+
+def _refine(
+    data: WristTouches,
+    start: tuple[RigidTransform, Array, RigidTransform],
+    sigma_t: float,
+    sigma_p: float,
+    pen_length_m: float | None,
+) -> tuple[tuple[RigidTransform, Array, RigidTransform], Array, Array, Array]:
+    """Least squares over (X_BT, p_FP, X_FC); returns them, their covariance (15, 15) and both kinds of residuals."""
+    touched = np.c_[data.touched_m, np.full(len(data.touched_m), -data.tip_radius_m)]
+    landmarks = np.c_[data.landmark_m, np.zeros(len(data.landmark_m))]
+    spread = np.array([_OPEN_PRIOR_M] * 2 + [_OPEN_PRIOR_M if pen_length_m is None else _KNOWN_PRIOR_M])
+    expected = np.array([0.0, 0.0, 0.0 if pen_length_m is None else pen_length_m])
+
+    def moved(x: Array) -> tuple[RigidTransform, Array, RigidTransform]:
+        return _move(start[0], x[:6]), start[1] + x[6:9], _move(start[2], x[9:])
+
+    def parts(x: Array) -> tuple[Array, Array]:
+        X_BT, p_FP, X_FC = moved(x)
+        tip = np.array([X.multiply(p_FP) for X in data.X_BF])
+        touch = tip - X_BT.multiply(touched.T).T
+        pixel = []
+        for X_BF, rays in data.views:
+            p_C = (X_FC.inverse() @ X_BF.inverse() @ X_BT).multiply(landmarks.T)
+            pixel.append(data.focal_px * ((p_C[:2] / p_C[2]).T - rays))
+        return touch, np.array(pixel)
+
+    def residuals(x: Array) -> Array:
+        touch, pixel = parts(x)
+        pen = (start[1] + x[6:9] - expected) / spread
+        return np.concatenate([touch.ravel() / sigma_t, pixel.ravel() / sigma_p, pen])
+
+    unit = np.r_[np.full(3, 1e-2), np.full(6, 1e-3), np.full(3, 1e-2), np.full(3, 1e-3)]
+    found = least_squares(residuals, np.zeros(15), x_scale=unit, method="lm", xtol=1e-12, ftol=1e-12)
+    touch, pixel = parts(np.asarray(found.x))
+    J = np.asarray(found.jac, dtype=float)
+    covariance = np.linalg.inv(J.T @ J)
+    return moved(np.asarray(found.x)), covariance, touch, pixel
+
+
+def _move(X: RigidTransform, x: Array) -> RigidTransform:
+    """(exp(x_0..2) R, p + x_3..5)."""
+    return RigidTransform(exp_rotation(x[:3]) @ X.rotation(), X.translation() + x[3:])
+
+
+def _open_directions(p_FP: Array, pen_covariance: Array, spread: float) -> tuple[str, ...]:
+    values, vectors = np.linalg.eigh(pen_covariance)
+    if np.sqrt(values[-1]) < _UNSURE_M:
+        return ()
+    axis = "xyz"[int(np.abs(vectors[:, -1]).argmax())]
+    return (
+        f"The pen's length along the flange's {axis} and the camera's height over the pen's tip are not fixed by these "
+        f"touches (the hand's axis tilts by {np.degrees(spread):.0f} deg): tilt the hand by 10 deg or more in some, or give the "
+        "pen's length. Positions in the tablet's plane do not need it.",
+    )
+
+
+def camera_error_covariance(fit: WristFit, p_FQ: Array) -> Array:
+    """Covariance (3, 3) m^2, in the flange's frame, of a point that the camera sees at ``p_FQ`` (3,) m."""
+    J = np.hstack([-skew(np.asarray(p_FQ, dtype=float) - fit.X_FC.translation()), np.eye(3)])
+    return np.asarray(J @ fit.covariance @ J.T)

@@ -1,0 +1,213 @@
+"""weldcal tablet calibrate: from an npz, or from the page's CSV with robot poses and a picture, to a result others can read."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+from typer.testing import CliRunner
+
+from tests.unit.tablet_image import grid, picture, project
+from weldcal.calibration.tablet.errors import TabletDataError
+from weldcal.calibration.tablet.files import load_planar
+from weldcal.calibration.tablet.result import load_tablet_result
+from weldcal.models.errors import InputError
+from weldcal.tools.cli_tablet import tablet
+from weldcal.tools.studies.tablet_paper import published_touches
+
+X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
+P_FP = np.array([-0.002, -0.021, 0.163])
+X_BT = RigidTransform(RollPitchYaw(np.pi + 0.01, -0.02, 0.4), [0.5, -0.1, 0.02])
+K = np.array([[617.7, 0.0, 316.5], [0.0, 617.7, 242.3], [0.0, 0.0, 1.0]])
+PAGE = grid(3, 3, 0.06, 0.038)
+MM_PER_PX = 0.125
+
+
+def run(*arguments: object) -> tuple[int, dict[str, Any], str]:
+    finished = CliRunner().invoke(tablet, ["calibrate", *map(str, arguments), "--json"])
+    return finished.exit_code, json.loads(finished.stdout.splitlines()[-1]) if finished.stdout else {}, finished.output
+
+
+def write(path: Path, rows: Sequence[Mapping[str, object]]) -> Path:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return path
+
+
+@pytest.fixture
+def npz(tmp_path: Path) -> Path:
+    """The paper's touches in the documented layout."""
+    t = published_touches()
+    np.savez(
+        tmp_path / "touches.npz", uv=t.uv_px, depth=1e3 * t.depth_m, hand=1e3 * t.hand_m, theta_deg=np.degrees(t.theta_rad),
+        delta_px=t.delta_px, tablet_px=t.landmark_px, mm_per_px=1e3 * t.pitch_m, f=617.7, c=t.centre_px,
+        hand_capture=1e3 * t.hand_capture_m,
+    )  # fmt: skip
+    return tmp_path / "touches.npz"
+
+
+@pytest.fixture(scope="module")
+def visit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated visit as files: the page's CSV, flange poses, intrinsics and a picture that is blurred and noisy."""
+    folder = tmp_path_factory.mktemp("visit")
+    rng = np.random.default_rng(5)
+    shown = PAGE / (1e-3 * MM_PER_PX) + [150.5, 120.5]
+    touched = np.round(shown + rng.normal(0.0, 4.0, shown.shape), 1)
+    rows, poses = [], []
+    for k, p in enumerate(touched):
+        R = RollPitchYaw(
+            np.pi + 0.2 * rng.uniform(-1, 1), 0.2 * rng.uniform(-1, 1), np.radians(-90 + 22.5 * k)
+        ).ToRotationMatrix()
+        tip = X_BT.multiply(np.r_[1e-3 * MM_PER_PX * (p - shown[0]), 0.0]) + rng.normal(0.0, 0.05e-3, 3)
+        poses.append(_pose_row(str(k), RigidTransform(R, tip - R.multiply(P_FP))))
+        rows.append(
+            {"landmark": k, "time_utc": "2026-01-01T00:00:00.000Z", "landmark_x_px": shown[k, 0], "landmark_y_px": shown[k, 1],
+             "touch_x_px": p[0], "touch_y_px": p[1], "mm_per_px": MM_PER_PX, "size_checked": 1}
+        )  # fmt: skip
+    middle = X_BT.multiply(np.r_[PAGE[4], 0.0])
+    R_BF = RollPitchYaw(np.pi + 0.1, -0.08, -1.0).ToRotationMatrix()
+    X_BF = RigidTransform(
+        R_BF, middle - (R_BF @ X_FC.rotation()).multiply([0.0, 0.0, 0.3]) - R_BF.multiply(X_FC.translation())
+    )
+    poses.append(_pose_row("camera", X_BF))
+    X_CT = (X_BF @ X_FC).inverse() @ X_BT
+    cv2.imwrite(str(folder / "picture.png"), picture(X_CT, PAGE, K))
+    write(folder / "touches.csv", rows)
+    write(folder / "poses.csv", poses)
+    uv = project(X_CT, PAGE, K)
+    write(folder / "seen.csv", [{"landmark": k, "u": u, "v": v} for k, (u, v) in enumerate(uv)])
+    (folder / "camera.yaml").write_text("fx: 617.7\nfy: 617.7\ncx: 316.5\ncy: 242.3\n")
+    return folder
+
+
+def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:
+    q, p = X.rotation().ToQuaternion().wxyz(), X.translation()
+    return {"landmark": name, **dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), (*p, *q), strict=True))}
+
+
+def csv_options(visit: Path) -> list[object]:
+    return [visit / "touches.csv", "--poses", visit / "poses.csv", "--camera", visit / "camera.yaml"]
+
+
+def test_an_npz_is_calibrated_and_its_size_questioned(npz: Path, tmp_path: Path) -> None:
+    code, said, output = run(npz, "--out", tmp_path / "out", "--two-stages")
+    assert code == 0, output
+    assert said["model"] == "closed_form"
+    assert said["leave_one_out_mm"] <= 0.46 < said["leave_one_out_of_other_models_mm"]["pnp"]
+    assert (said["F1"], said["F2"]) == (pytest.approx(1.277, abs=0.0015), pytest.approx(0.5915, abs=0.0015))
+    assert "-0.9 % in length" in said["warnings"][0]
+    read = load_tablet_result(tmp_path / "out")
+    assert read.parameters == said["parameters"]
+    assert json.loads((tmp_path / "out" / "tablet.json").read_text())["parameters"] == said["parameters"]
+    assert not (tmp_path / "out" / "ur_pose.script").exists()
+
+
+def test_a_picture_touches_and_poses_give_camera_and_pen(visit: Path, tmp_path: Path) -> None:
+    code, said, output = run(*csv_options(visit), "--image", visit / "picture.png", "--out", tmp_path / "out")
+    assert code == 0, output
+    found = RigidTransform(np.array(said["X_FC"]))
+    # one picture with 0.05 px of noise in nine points some 100 mm apart at 300 mm: its tilt to 0.1 deg, that is 0.6 mm
+    assert np.linalg.norm(found.translation() - X_FC.translation()) < 1.2e-3
+    assert np.degrees((found.inverse() @ X_FC).rotation().ToAngleAxis().angle()) < 0.25
+    np.testing.assert_allclose(said["p_FP_mm"], 1e3 * P_FP, atol=0.3)
+    assert said["leave_one_out_mm"] < 0.2
+    assert said["unobservable"] == said["warnings"] == []
+    read = load_tablet_result(tmp_path / "out" / "tablet.yaml")
+    assert read.X_FC is not None
+    assert read.X_FC.IsNearlyEqualTo(found, 1e-12)
+    assert (tmp_path / "out" / "ur_pose.script").read_text().startswith("p[0.0")
+    assert "camera_optical_frame" in (tmp_path / "out" / "camera.urdf.xacro").read_text()
+    assert set(read.data_sha256) == {"touches.csv", "poses.csv", "camera.yaml", "picture.png"}
+
+
+def test_positions_in_the_image_do_as_well_as_the_image(visit: Path, tmp_path: Path) -> None:
+    code, said, output = run(*csv_options(visit), "--seen", visit / "seen.csv", "--out", tmp_path / "out")
+    assert code == 0, output
+    assert np.linalg.norm(np.array(said["X_FC"])[:3, 3] - X_FC.translation()) < 0.3e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (
+            lambda f: (f / "poses.csv").write_text("landmark,x\n0,1\n"),
+            "'poses.csv' lacks the columns y, z, qw, qx, qy, qz.",
+        ),
+        (lambda f: _edit(f / "poses.csv", "camera", "photo"), "is no number|lacks the row 'camera'"),
+        (lambda f: (f / "camera.yaml").write_text("fx: 600\n"), "must hold fx, fy, cx and cy"),
+        (
+            lambda f: (f / "camera.yaml").write_text("fx: -1\nfy: 1\ncx: 1\ncy: 1\n"),
+            "focal length that is not positive",
+        ),
+        (lambda f: _edit(f / "touches.csv", "0.125", "0.126", 1), "mixes sizes"),
+        (lambda f: _edit(f / "touches.csv", "0.125", "nan", 1), "'nan' in the column mm_per_px is no number"),
+        (lambda f: (f / "touches.csv").unlink(), "There is no file"),
+        (lambda f: (f / "picture.png").write_bytes(b"no picture"), "'picture.png' is no image"),
+        (lambda f: cv2.imwrite(str(f / "picture.png"), np.full((480, 640), 200, np.uint8)), "0 of 9 landmarks"),
+        (lambda f: _millimetres(f / "poses.csv"), "must be in metres"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_writes_nothing(visit: Path, tmp_path: Path, change: Any, sentence: str) -> None:
+    import re
+    import shutil
+
+    folder = tmp_path / "files"
+    shutil.copytree(visit, folder)
+    change(folder)
+    code, said, output = run(*csv_options(folder), "--image", folder / "picture.png", "--out", tmp_path / "out")
+    assert code == 1
+    assert said["state"] == "failed"
+    assert re.search(sentence, said["reason"]), said["reason"]
+    assert "Internal error" not in output
+    assert not (tmp_path / "out").exists()
+
+
+def _edit(path: Path, old: str, new: str, count: int = -1) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+
+
+def _millimetres(path: Path) -> None:
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    write(path, [{**r, **{c: 1e3 * float(r[c]) for c in "xyz"}} for r in rows])
+
+
+def test_options_that_do_not_belong_together_are_told(npz: Path, visit: Path, tmp_path: Path) -> None:
+    for arguments, sentence in (
+        ((npz, "--poses", visit / "poses.csv"), "holds everything"),
+        ((visit / "touches.csv",), "need the robot's poses"),
+        (csv_options(visit), "--image"),
+        ((*csv_options(visit), "--seen", visit / "seen.csv", "--two-stages"), "belong to planar touches"),
+        ((*csv_options(visit), "--image", visit / "picture.png", "--look", "stars"), "rings or dots"),
+    ):
+        code, said, _ = run(*arguments, "--out", tmp_path / "out")
+        assert code == 1
+        assert sentence in said["reason"]
+
+
+def test_an_npz_that_is_none_is_told(tmp_path: Path, npz: Path) -> None:
+    broken = tmp_path / "broken.npz"
+    broken.write_bytes(npz.read_bytes()[:500])
+    with pytest.raises(TabletDataError, match="no npz file"):
+        load_planar(broken)
+    np.savez(tmp_path / "part.npz", uv=np.zeros((4, 2)))
+    with pytest.raises(TabletDataError, match="lacks depth, hand"):
+        load_planar(tmp_path / "part.npz")
+
+
+def test_a_result_that_is_none_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no tablet calibration at"):
+        load_tablet_result(tmp_path)
+    (tmp_path / "tablet.yaml").write_text("schema: 7\n")
+    with pytest.raises(InputError, match="no tablet calibration of schema 1"):
+        load_tablet_result(tmp_path)

@@ -1,0 +1,182 @@
+"""The tablet paper comes out of its own data: both chains, both stages, its wrong sign and its slip."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from weldcal.calibration.tablet.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
+from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
+from weldcal.calibration.tablet.evolution import evolve
+from weldcal.calibration.tablet.published import hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.calibration.tablet.two_stage import AFFINE_NONE, Sign, fitness, stage1_residuals, stage2_residuals
+from weldcal.tools.studies.cli_reproduce import reproduce
+from weldcal.tools.studies.tablet_paper import STAGE_1, STAGE_2, published_touches
+from weldcal.tools.studies.tablet_study import compare_signs, dh_by_eq_20
+
+PUBLISHED = Path(__file__).resolve().parents[2].parent / "shared/data/profiler/tablet_published.npz"
+GATE_MM = 0.0015  # the issue's: half the last printed digit is 0.005
+
+
+@pytest.fixture(scope="module")
+def touches() -> TabletTouches:
+    return published_touches()
+
+
+@dataclass(frozen=True)
+class Reproduction:
+    """What one run of the command left."""
+
+    summary: dict[str, Any]
+    page: str
+
+
+@pytest.fixture(scope="module")
+def reproduction(tmp_path_factory: pytest.TempPathFactory) -> Reproduction:
+    """The command itself, without the slow search and with few trials."""
+    folder = tmp_path_factory.mktemp("tablet") / "out"
+    options = ["tablet", "--evolution-seeds", "0", "--trials", "2", "--seed", "5", "--json", "--out", str(folder)]
+    finished = CliRunner().invoke(reproduce, options)
+    # which code it ends with hangs on a time of this machine, so it is not asked
+    assert finished.stdout, finished.output
+    return Reproduction(json.loads(finished.stdout.splitlines()[-1]), (folder / "report.html").read_text())
+
+
+def test_the_typed_tables_are_those_of_the_shared_file(touches: TabletTouches) -> None:
+    if not PUBLISHED.is_file():
+        pytest.skip("the measured data (shared/data beside the repository) is not here")
+    d = np.load(PUBLISHED)
+    for mine, theirs in (
+        (touches.uv_px, d["uv"]),
+        (1e3 * touches.depth_m, d["depth"]),
+        (1e3 * touches.hand_m, d["hand"]),
+        (touches.delta_px, d["delta_px"]),
+        (touches.landmark_px, d["tablet_px"]),
+        (np.degrees(touches.theta_rad), d["theta_deg"]),
+        (1e3 * touches.pitch_m, d["mm_per_px"]),
+        (STAGE_1["htm"].parameters, d["htm_published"]),
+        (STAGE_1["dh"].parameters, d["dh_published"]),
+        (STAGE_2["htm"].parameters, np.r_[d["affine1_htm"], d["affine2_htm"]]),
+        (STAGE_2["dh"].parameters, np.r_[d["affine1_dh"], d["affine2_dh"]]),
+    ):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-9)
+
+
+def test_every_table_comes_out(reproduction: Reproduction) -> None:
+    tables = reproduction.summary["tables"]
+    for number, F in (("7", 1.6739), ("10", 0.9989), ("8", 7.103), ("11", 4.272)):
+        assert tables[number]["ours"]["F"] == pytest.approx(F, abs=GATE_MM)
+    assert reproduction.summary["F1"] == tables["7"]["ours"]["F"]
+
+
+def test_the_parameters_are_the_printed_ones(reproduction: Reproduction) -> None:
+    tables = reproduction.summary["tables"]
+    seven = tables["7"]["ours"]["parameters"]
+    # the paper's inputs are printed rounded: re-rounded they move x_c and y_c by up to 0.1 mm, the others less
+    for name, printed in zip(HTM_NAMES, STAGE_1["htm"].parameters, strict=True):
+        mirrored = abs(seven[name]) if name in ("alpha_t", "beta_t") else seven[name]
+        wanted = abs(printed) if name in ("alpha_t", "beta_t") else printed
+        assert mirrored == pytest.approx(wanted, abs=0.11 if name in ("x_c", "y_c") else 0.035), name
+    eight = tables["8"]["ours"]["parameters"]
+    assert eight["theta1_c"] + eight["gamma_c"] == pytest.approx(-1.28, abs=0.02)
+    assert eight["theta1_t"] + eight["gamma_t"] == pytest.approx(-5.90, abs=0.02)
+    for name, printed in zip(DH_NAMES, STAGE_1["dh"].parameters, strict=True):
+        if "theta1" not in name and name not in ("gamma_c", "gamma_t"):
+            assert abs(eight[name]) == pytest.approx(abs(printed), abs=0.035), name
+    for number, stage in (("10", STAGE_2["htm"]), ("11", STAGE_2["dh"])):
+        found = [tables[number]["ours"]["parameters"][name] for name in stage.names]
+        np.testing.assert_allclose(found, stage.parameters, rtol=0, atol=0.02)
+
+
+def test_the_report_shows_each_table_and_needs_no_other_file(reproduction: Reproduction) -> None:
+    for number in (7, 8, 9, 10, 11, 12):
+        assert f"Table {number}" in reproduction.page
+    assert 'src="data:image' in reproduction.page
+    assert "<script" not in reproduction.page
+    assert 'src="http' not in reproduction.page
+
+
+def test_left_out_landmarks_are_predicted_three_times_better(reproduction: Reproduction) -> None:
+    left_out = {m["name"]: m["left_out_mm"] for m in reproduction.summary["models"]}
+    assert left_out["paper, stage 1 + 2, sign as printed"] == pytest.approx(1.251, abs=0.005)
+    assert left_out["closed form"] <= 0.46
+    assert reproduction.summary["leave_one_out_mm"] == left_out["closed form"]
+
+
+def test_differential_evolution_ends_where_the_fast_solver_does(touches: TabletTouches) -> None:
+    found = tablet_stage1(touches, minimiser=lambda r, search: evolve(r, search, 3, 100, 700))
+    assert pytest.approx(tablet_stage1(touches).fitness.F, abs=1e-3) == found.fitness.F
+    again = tablet_stage1(touches, minimiser=lambda r, search: evolve(r, search, 3, 20, 3))
+    same = tablet_stage1(touches, minimiser=lambda r, search: evolve(r, search, 3, 20, 3))
+    assert (again.parameters == same.parameters).all()
+
+
+def test_a_tilt_and_its_mirror_image_fit_alike(touches: TabletTouches) -> None:
+    x = STAGE_1["htm"].parameters
+    mirrored = x * np.where(np.isin(np.arange(12), (7, 8)), -1.0, 1.0)
+    one, other = (stage1_residuals(touches, p, "htm", Sign.PRINTED) for p in (x, mirrored))
+    np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+def test_the_printed_sign_is_worse_than_no_correction(touches: TabletTouches) -> None:
+    printed, none, corrected = compare_signs(touches)
+    assert (printed.sign, none.sign, corrected.sign) == (Sign.PRINTED, Sign.NONE, Sign.CORRECTED)
+    assert corrected.scaled_mm < 0.6 * none.scaled_mm < none.scaled_mm < 0.7 * printed.scaled_mm
+    # reading the hand in whole millimetres leaves 1 / sqrt(12) per axis, less six unknowns of eighteen equations
+    assert corrected.scaled_mm <= np.sqrt(1.0 / 12.0 * 12.0 / 18.0)
+    assert printed.left_out_mm > none.left_out_mm > corrected.left_out_mm
+
+
+def test_the_sign_reversed_the_papers_own_scheme_fits_twice_as_well(touches: TabletTouches) -> None:
+    first = tablet_stage1(touches, sign=Sign.CORRECTED)
+    second = tablet_stage2(touches, first.parameters, sign=Sign.CORRECTED)
+    assert pytest.approx(1.2770, abs=GATE_MM) == first.fitness.F
+    assert pytest.approx(0.5915, abs=GATE_MM) == second.fitness.F
+
+
+def test_table_8_holds_only_with_the_translation_added_to_a_difference(touches: TabletTouches) -> None:
+    slip, written, optimum = dh_by_eq_20(touches).values()
+    assert pytest.approx(7.11, abs=0.005) == slip.F
+    assert written.f2 == pytest.approx(94.2, abs=0.05)
+    assert pytest.approx(7.4675, abs=GATE_MM) == optimum.F
+
+
+def test_no_affine_pair_changes_nothing(touches: TabletTouches) -> None:
+    stage1 = place_landmarks(touches, STAGE_1["htm"].parameters, "htm")
+    plain = stage1_residuals(touches, STAGE_1["htm"].parameters, "htm", Sign.PRINTED)
+    np.testing.assert_allclose(stage2_residuals(touches, AFFINE_NONE, stage1, Sign.PRINTED), plain, atol=1e-12)
+
+
+def test_the_hand_asked_for_is_the_one_that_f2_measures(touches: TabletTouches) -> None:
+    x, a = STAGE_1["htm"].parameters, STAGE_2["htm"].parameters
+    placed = place_landmarks(touches, x, "htm")
+    asked = hand_to_touch(touches, x, a, touches.uv_px, touches.depth_m, touches.theta_rad)
+    target = touches.hand_m - 1e-3 * placed.correction[0]
+    f2 = fitness(stage2_residuals(touches, a, placed, Sign.PRINTED)).f2
+    assert 1e3 * np.linalg.norm(asked - target, axis=1).mean() == pytest.approx(f2, abs=1e-9)
+
+
+def test_every_search_range_holds_the_printed_parameters() -> None:
+    for model in ("htm", "dh"):
+        low, high = search_range(model).T
+        assert ((low <= STAGE_1[model].parameters) & (STAGE_1[model].parameters <= high)).all()
+
+
+def test_touches_that_fix_nothing_are_named(touches: TabletTouches) -> None:
+    with pytest.raises(TooFewLandmarks, match="3 landmarks are too few"):
+        tablet_stage1(touches.pick(np.arange(3)))
+    with pytest.raises(CollinearLandmarks, match="one line"):
+        tablet_stage1(replace(touches, landmark_px=np.c_[100.0 * np.arange(9), 50.0 * np.arange(9)]))
+    with pytest.raises(EqualRotations, match="turn the last joint"):
+        tablet_stage1(replace(touches, theta_rad=np.full(9, 0.4)))
+    with pytest.raises(TabletDataError, match="finite"):
+        replace(touches, hand_m=np.full((9, 2), np.nan))
+    with pytest.raises(TabletDataError, match="shape"):
+        replace(touches, depth_m=np.ones(8))

@@ -1,0 +1,174 @@
+"""weldcal tablet calibrate: touches in, camera and pen out, with what is left out and what is left open."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.calibration.tablet.chain import HTM_NAMES
+from weldcal.calibration.tablet.detection import Look
+from weldcal.calibration.tablet.files import file_hash, load_planar, load_visit
+from weldcal.calibration.tablet.linear import LINEAR_NAMES, fit_linear
+from weldcal.calibration.tablet.planar import PLANAR_NAMES, PlanarConfig, fit_planar
+from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
+from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.calibration.tablet.two_stage import AFFINE_NAMES, Sign
+from weldcal.calibration.tablet.wrist import WristFit, fit_wrist
+from weldcal.models.errors import InputError
+
+_SCALE_SIGMAS = 3.0  # a free scale farther from 1 than this, and than a quarter of a percent, is told
+_SCALE_LEAST = 2.5e-3
+
+
+@dataclass(frozen=True)
+class TabletInputs:
+    """The files of one visit, and what is known besides."""
+
+    file: Path
+    poses: Path | None = None
+    camera: Path | None = None
+    image: Path | None = None
+    seen: Path | None = None
+    look: str = "rings"
+    pen_length_m: float | None = None
+    pen_radius_m: float = 0.0
+    hand_step_m: float = 0.0
+    printed_sign: bool = False
+    two_stages: bool = False
+
+
+def calibrate_tablet(inputs: TabletInputs, folder: Path) -> dict[str, object]:
+    """Calibrate from the files, write the result folder and return the summary for JSON.
+
+    Raises InputError and its kin: one sentence that says what to change; nothing is written then.
+    """
+    start = time.perf_counter()
+    result = _planar(inputs) if inputs.file.suffix == ".npz" else _wrist(inputs)
+    seconds = time.perf_counter() - start
+    save_tablet_result(result, folder)
+    stages = result.two_stages or {}
+    left_out = [v for v in result.leave_one_out_mm if v is not None]
+    return {
+        "state": "done",
+        "model": result.model,
+        "F1": stages.get("F1"),
+        "F2": stages.get("F2"),
+        "parameters": result.parameters,
+        "leave_one_out_mm": float(np.mean(left_out)) if left_out else None,
+        "leave_one_out_of_other_models_mm": result.other_models,
+        "X_FC": result.X_FC,
+        "p_FP_mm": None if result.p_FP_m is None else [1e3 * v for v in result.p_FP_m],
+        "warnings": result.warnings,
+        "unobservable": result.unobservable,
+        "seconds": seconds,
+    }
+
+
+def _planar(inputs: TabletInputs) -> TabletResult:
+    if any(path is not None for path in (inputs.poses, inputs.camera, inputs.image, inputs.seen)):
+        raise InputError(
+            "An npz file holds everything: leave --poses, --camera, --image and --seen out, or give the CSV."
+        )
+    touches = load_planar(inputs.file)
+    sign = Sign.PRINTED if inputs.printed_sign else Sign.CORRECTED
+    linear = fit_linear(touches, sign)
+    planar = fit_planar(touches, PlanarConfig(sign=sign, step_m=inputs.hand_step_m))
+    errors = {
+        name: 1e3 * float(np.linalg.norm(e, axis=1).mean())
+        for name, e in (("closed_form", linear.leave_one_out_m), ("pnp", planar.leave_one_out_m))
+    }
+    # what predicts better on the landmarks it did not see; with four landmarks there is nothing to leave out
+    best = "pnp" if not np.isfinite(errors["pnp"]) or errors["pnp"] <= errors["closed_form"] else "closed_form"
+    warnings = []
+    scale, deviation = planar.free_scale
+    if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST):
+        warnings.append(
+            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
+            "page's size with a card, or the tablet's pixels per inch."
+        )
+    fit, names = (planar, PLANAR_NAMES) if best == "pnp" else (linear, LINEAR_NAMES)
+    return TabletResult(
+        model=best,
+        parameters=dict(zip(names, fit.parameters.tolist(), strict=True)),
+        covariance=fit.covariance.tolist(),
+        residual_mm=_lengths_mm(fit.residuals_m),
+        leave_one_out_mm=_lengths_mm(fit.leave_one_out_m),
+        two_stages=_two_stages(touches, sign) if inputs.two_stages else None,
+        other_models={name: e for name, e in errors.items() if name != best and np.isfinite(e)},
+        warnings=tuple(warnings),
+        data_sha256={inputs.file.name: file_hash(inputs.file)},
+    )
+
+
+def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
+    """The paper's scheme in the paper's search ranges (Table 5), which hold for a rig like the paper's."""
+    first = tablet_stage1(touches, sign=sign)
+    second = tablet_stage2(touches, first.parameters, sign=sign)
+    return {
+        "F1": first.fitness.F,
+        "F2": second.fitness.F,
+        "stage_1": {**asdict(first.fitness), **dict(zip(HTM_NAMES, first.parameters.tolist(), strict=True))},
+        "stage_2": {**asdict(second.fitness), **dict(zip(AFFINE_NAMES, second.parameters.tolist(), strict=True))},
+    }
+
+
+def _wrist(inputs: TabletInputs) -> TabletResult:
+    if inputs.poses is None or inputs.camera is None:
+        raise InputError(
+            "Touches in a CSV need the robot's poses (--poses FILE) and the camera's numbers (--camera FILE)."
+        )
+    if inputs.two_stages or inputs.printed_sign or inputs.hand_step_m:
+        raise InputError("--two-stages, --printed-sign and --hand-step-mm belong to planar touches in an npz file.")
+    if inputs.look not in ("rings", "dots"):
+        raise InputError(f"--look must be rings or dots, not '{inputs.look}'.")
+    look: Look = "dots" if inputs.look == "dots" else "rings"
+    visit = load_visit(
+        inputs.file,
+        inputs.poses,
+        inputs.camera,
+        image=inputs.image,
+        seen=inputs.seen,
+        look=look,
+        tip_radius_m=inputs.pen_radius_m,
+    )
+    fit = fit_wrist(visit.data, inputs.pen_length_m)
+    files = (inputs.file, inputs.poses, inputs.camera, inputs.image, inputs.seen)
+    checked = (
+        ()
+        if visit.size_checked
+        else ("The page's size was not checked with a card: lengths may be wrong by percents.",)
+    )
+    return TabletResult(
+        model="wrist",
+        parameters=_wrist_parameters(fit),
+        covariance=fit.covariance.tolist(),
+        residual_mm=_lengths_mm(fit.touch_residuals_m),
+        leave_one_out_mm=_finite([1e3 * v for v in fit.leave_one_out_m.tolist()]),
+        X_FC=fit.X_FC,
+        X_FC_covariance=fit.covariance.tolist(),
+        p_FP_m=fit.p_FP.tolist(),
+        p_FP_covariance=fit.pen_covariance.tolist(),
+        unobservable=fit.unobservable,
+        warnings=checked,
+        data_sha256={path.name: file_hash(path) for path in files if path is not None},
+    )
+
+
+def _wrist_parameters(fit: WristFit) -> dict[str, float]:
+    rpy = fit.X_FC.rotation().ToRollPitchYaw().vector()
+    names = ("x", "y", "z", "roll", "pitch", "yaw", "pen_x", "pen_y", "pen_z")
+    values = [*fit.X_FC.translation(), *rpy, *fit.p_FP]
+    return {name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def _lengths_mm(errors_m: np.ndarray) -> list[float]:
+    return _finite((1e3 * np.linalg.norm(errors_m, axis=1)).tolist())
+
+
+def _finite(values: list[float]) -> list[float]:
+    """The values, or an empty list where nothing could be left out."""
+    return [v for v in values if np.isfinite(v)]
