@@ -26,7 +26,6 @@ from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED
-from weldcal.systems.drivers.simulated_world import FINGER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.drivers.tablet_world import TabletTruth, build_tablet_world, draw_truth
 from weldcal.systems.drivers.wrist_devices import TabletDigitizer, WristCamera, WristPicture
@@ -114,14 +113,15 @@ def make_tablet_cell(scenario: TabletScenario, seed: int = 0, meshcat: Meshcat |
     apply_driver_config(scenario.robot, build)
 
     cx, cy = 0.5 * (rig.width - 1), 0.5 * (rig.height - 1)
+    view = made.world.scanner_view
     core = RenderCameraCore(
-        FINGER_RENDERER,
+        view.renderer,
         # Drake samples pixel (u, v) at (u + 0.5, v + 0.5)
         CameraInfo(rig.width, rig.height, rig.focal_px, rig.focal_px, cx + 0.5, cy + 0.5),
         ClippingRange(0.02, 3.0),
         RigidTransform(),
     )
-    flange = plant.GetBodyFrameIdOrThrow(plant.GetBodyByName("flange", made.world.arm).index())
+    flange = view.frames[plant.GetBodyByName("flange", made.world.arm).index()]
     sensor = builder.AddSystem(
         RgbdSensor(flange, truth.X_FC, ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.05, 2.0)))
     )
@@ -139,7 +139,7 @@ def make_tablet_cell(scenario: TabletScenario, seed: int = 0, meshcat: Meshcat |
         system.set_name(name)
 
     connect = builder.Connect
-    connect(scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     connect(sensor.color_image_output_port(), camera.GetInputPort("color_image"))
     connect(sensor.depth_image_32F_output_port(), camera.GetInputPort("depth_image"))
     connect(plant.get_contact_results_output_port(), digitizer.GetInputPort("contact_results"))

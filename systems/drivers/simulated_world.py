@@ -200,7 +200,7 @@ def _add_tool(
     return instance, tuple(joints)
 
 
-def _compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
+def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
     """The controller's feed-forward: joint torques against gravity, so that the servos need not sag to find them.
 
     Gravity stays on: an arm at rest without any force leaves the contact solver no scale to converge by.
@@ -265,7 +265,7 @@ def build_world(
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):
         raise RuntimeError("the six joint servos of the arm are not in place")
     plant.SetDefaultPositions(instance, q_start)
-    _compensate_gravity(builder, plant, [m for m in (instance, tool_instance) if m is not None])
+    compensate_gravity(builder, plant, [m for m in (instance, tool_instance) if m is not None])
     if tool_instance is not None:
         rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
         rest.set_name("tip_at_rest")

@@ -14,10 +14,8 @@ from pydrake.geometry import (
     GeometryId,
     GeometryInstance,
     IllustrationProperties,
-    MakeRenderEngineVtk,
     PerceptionProperties,
     ProximityProperties,
-    RenderEngineVtkParams,
     Sphere,
 )
 from pydrake.math import RigidTransform, RotationMatrix
@@ -36,21 +34,22 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
+from weldcal.systems.drivers.picture_scene import add_picture_scene
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated_world import (
     DARK,
-    FINGER_RENDERER,
     JOINT_DAMPING,
     JOINT_STIFFNESS,
     STEEL,
     TABLE,
     SimulatedWorld,
-    _compensate_gravity,
+    compensate_gravity,
 )
 from weldcal.systems.messages import Message
 from weldcal.systems.tablet_scenario import TabletOnTable, TabletScenario, landmarks_m
 from weldcal.systems.textured_board import textured_board
 
+WRIST_RENDERER = "wrist"
 _TEXELS_PER_MM = 8
 _PEN_MASS_KG = 0.02
 _PEN_DAMPING = 3.0  # N s / m
@@ -110,7 +109,6 @@ def build_tablet_world(
         MultibodyPlantConfig(time_step=time_step_s, contact_model="point", discrete_contact_approximation="lagged"),
         builder,
     )
-    scene_graph.AddRenderer(FINGER_RENDERER, MakeRenderEngineVtk(RenderEngineVtkParams()))
     (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     flange = plant.GetBodyByName("flange", instance)
@@ -161,8 +159,9 @@ def build_tablet_world(
         servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
     plant.Finalize()
     plant.SetDefaultPositions(instance, np.deg2rad(scenario.home_deg))
-    _compensate_gravity(builder, plant, [instance, rig])
+    compensate_gravity(builder, plant, [instance, rig])
     rest = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
     rest.set_name("pen_at_rest")
     builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(rig))
-    return TabletWorld(SimulatedWorld(plant, scene_graph, instance, rig, (joint,)), glass, nib)
+    view = add_picture_scene(builder, plant, scene_graph, WRIST_RENDERER, mount="flange")
+    return TabletWorld(SimulatedWorld(plant, scene_graph, instance, rig, (joint,), view, None), glass, nib)

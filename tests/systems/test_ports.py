@@ -11,8 +11,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_load
-from pydrake.geometry import FramePoseVector, Meshcat, MeshcatParams
+from pydrake.geometry import FramePoseVector, GeometryId, Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
+from pydrake.multibody.plant import ContactResults
 from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDataType
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
@@ -29,7 +30,9 @@ from weldcal.systems.drivers.picture_scene import PicturePoses
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.drivers.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
+from weldcal.systems.drivers.tablet_world import TabletWorld
 from weldcal.systems.drivers.ur_rtde import UrRtdeArm
+from weldcal.systems.drivers.wrist_devices import TabletDigitizer, TabletTouch, WristCamera, WristPicture
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
@@ -51,6 +54,9 @@ from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import CheatPoses
+from weldcal.systems.tablet_cell import plan_tablet
+from weldcal.systems.tablet_procedure import TabletProcedure, TabletState
+from weldcal.systems.tablet_scenario import TabletOnTable, TabletScenario, WristRig
 from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.welding.guard import SlewLimits
 from weldcal.welding.servo_state import ServoConfig
@@ -91,10 +97,28 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     OperatorPanel: lambda: OperatorPanel(Meshcat(MeshcatParams(host="localhost", port=0))),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
+    TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(TabletScenario(), the_arm())),
+    WristCamera: lambda: WristCamera(WristRig(), 0),
+    TabletDigitizer: lambda: TabletDigitizer(
+        TabletOnTable(), TabletWorld(plain_station().world, GeometryId.get_new_id(), GeometryId.get_new_id()), X, 0
+    ),
 }
 
 # What travels on each port: a vector of that many numbers, or a message of that type.
 KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
+    TabletProcedure: {
+        "position_measured": 6,
+        "settled_goal": 1,
+        "robot_status": UrStatus,
+        "picture": WristPicture,
+        "touch": TabletTouch,
+        "job": JobCommand,
+        "descent": 6,
+        "trigger": 1,
+        "state": TabletState,
+    },
+    WristCamera: {"trigger": 1, "color_image": ImageRgba8U, "depth_image": ImageDepth32F, "picture": WristPicture},
+    TabletDigitizer: {"contact_results": ContactResults, "touch": TabletTouch},
     SpeedJointServo: {
         "velocity_command": 6,
         "arm_state": 12,

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from weldcal.calibration.tablet.planar import fit_plane_motion, hand_over
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.calibration.tablet.two_stage import Sign
-from weldcal.tools.report.plots_demo import OURS, THEIRS, TRUTH, svg
+from weldcal.tools.report.plots_weld import OURS, THEIRS, TRUTH, svg
 from weldcal.tools.studies.tablet_study import HeldOutRow, ModelRow
 
 _LARGER = 20.0
