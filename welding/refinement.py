@@ -166,6 +166,12 @@ def local_fit(
     if len(seam.corners):
         # Round a corner that was filled in the points are dense and free of noise: a wide fit would cut it.
         sigma = max(min(sigma, 0.4 * float(np.min(np.abs(seam.corners - arc)))), 0.3e-3)
+    # At the ends points lie on one side only, and a quadratic's end is three times as noisy as its middle: a window up to
+    # twice as wide takes that back.
+    edge = min(arc - float(seam.arc[0]), float(seam.arc[-1]) - arc) if len(seam) else math.inf
+    if edge < 2.0 * sigma and not len(seam.corners):
+        sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_radius_share * radius))
+    widest = max(config.fit_sigma_max_m, sigma)
     while True:
         low, high = np.searchsorted(seam.arc, (arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
         n = high - low
@@ -175,11 +181,11 @@ def local_fit(
             effective = float(w.sum() ** 2 / (w @ w))
             if effective >= config.fit_points:
                 break
-        if sigma >= config.fit_sigma_max_m:
+        if sigma >= widest:
             if n < 4 or effective < 3.0:
                 return None
             break
-        sigma = min(1.5 * sigma, config.fit_sigma_max_m)
+        sigma = min(1.5 * sigma, widest)
     basis = np.stack([np.ones(n), x, x * x])
     weighted = basis * w
     normal = weighted @ basis.T

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.tools.studies.budgets import Budget, planned_seam, roughness
 from weldcal.tools.studies.groove import DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.seams import TrueSeam
+from weldcal.welding.feel_start import with_touch_place
 from weldcal.welding.seam import SeamCurve
 from weldcal.welding.servo import welding_step
 from weldcal.welding.servo_state import DeflectionSample, Phase, ServoConfig, ServoSample, WeldingState
@@ -75,9 +76,9 @@ def simulate(
     Source: the kinematic model of the design note, section B.3, with a V-groove for the side wall.
     """
     rng = np.random.default_rng(seed)
-    settings = groove_config(config)
     root = SeamCurve.from_points(seam.points, seam.up)
     plan = planned_seam(seam, budget, rng)
+    settings = with_touch_place(plan, groove_config(config))
     groove = Groove(root.raised(SEAT_M), gaps, roughness(root.length, budget, rng), budget.friction)
     torch_line = groove.line.raised(settings.clearance_m) if settings.clearance_m else groove.line
     reason: str | None = None
