@@ -17,7 +17,8 @@ from weldcal.welding.vectors import Array, clip, dot
 
 BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH that are taken here
 
-_STRAIGHT_M = 20.0e-3  # a bend of less than this radius is no place to come down beside
+_STRAIGHT_RAD = math.radians(10.0)  # where the plan turns by more than this
+_BESIDE_M = 4.0e-3  # within this before and after is no place to come down beside
 _REACH_M = 0.030  # nor is what lies farther than this from the start
 _SETTLED_M = 0.15e-3
 _REENTRY_M = 12.0e-3
@@ -33,13 +34,11 @@ def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
     touch = config.touch
     if not touch.feel_start:
         return config
-    step = 1.0e-3
-    s = np.arange(touch.arc_m, min(_REACH_M, plan.length - config.contact.end_window_m), step)
-    bend = np.abs(plan.curvature(np.arange(touch.arc_m - 4.0e-3, _REACH_M + 4.0e-3, step)))
-    for k, place in enumerate(s.tolist()):
-        if bend[k : k + 9].max() * _STRAIGHT_M < 1.0:
-            return replace(config, touch=replace(touch, arc_m=place))
-    return config
+    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.contact.end_window_m), touch.arc_m + 1e-6), 1e-3)
+    turn = np.sum(plan.tangent(s - _BESIDE_M) * plan.tangent(s + _BESIDE_M), axis=1)
+    straight = np.flatnonzero(turn > math.cos(_STRAIGHT_RAD))
+    place = float(s[straight[0] if len(straight) else np.argmax(turn)])
+    return replace(config, touch=replace(touch, arc_m=place))
 
 
 def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:

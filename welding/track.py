@@ -18,7 +18,7 @@ from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
 _CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no point: too late to be confirmed
-_BEND_OVER_M = 10.0e-3
+_BEND_OVER_M = (3.0e-3, 10.0e-3)  # least and most of the path whose bend is carried on; 0.4 of the plan's radius between
 _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
 
@@ -115,9 +115,10 @@ def _carried_on(
     ahead = arc - inside
     if ahead > _CARRY_M:
         return None
-    before = local_fit(seam, inside - _BEND_OVER_M, plan.tangent, 1.0, config.refinement)
-    bend = np.zeros(3) if before is None else (fit.tangent - before.tangent) / _BEND_OVER_M
-    if norm(bend) > 0.5 / _BEND_OVER_M:
+    over = clip(0.4 / max(abs(plan.curvature), 1e-6), *_BEND_OVER_M)
+    before = local_fit(seam, inside - over, plan.tangent, 1.0, config.refinement)
+    bend = np.zeros(3) if before is None else (fit.tangent - before.tangent) / over
+    if norm(bend) * over > 1.0:
         return None
     tangent = unit(fit.tangent + ahead * bend, fit.tangent)
     return LocalFit(fit.point + ahead * fit.tangent + 0.5 * ahead**2 * bend, tangent, bend, 1.0, fit.effective)
