@@ -60,6 +60,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     plan = curve.frame(s)
     seam = state.refined
     residual, fit, arc = state.residual, None, state.torch_arc
+    drift = np.zeros(2)
     if len(seam) >= 5:
         first, last = float(seam.arc[0]), float(seam.arc[-1])
         inside = clip(arc, first + 1e-3, max(last - 1e-3, first + 1e-3))
@@ -77,8 +78,12 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
             # The change is spread over the path, so that the torch is not asked to step.
             step = 0.05 * abs(s - state.s_torch)
             residual = state.residual + np.clip(_bridged(state, curve, arc, s) - state.residual, -step, step)
+            came_on = s - state.s_torch
+            drift = (residual - state.residual) / came_on if came_on > 1e-6 else drift
     if fit is None:
-        t, up, bend = plan.tangent, plan.up, plan.curvature
+        # The torch heads where the target goes, not where the plan does.
+        t, bend = unit(plan.tangent + drift[0] * plan.normal + drift[1] * plan.up, plan.tangent), plan.curvature
+        up = unit(plan.up - dot(plan.up, t) * t, plan.up)
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
