@@ -59,18 +59,17 @@ def feel_start_step(
     """
     assert state.plan_fit is not None
     assert state.measurement is not None
-    curve, limits, t = state.plan_fit.curve, config.contact, state.touch
+    curve, limits, t, last = state.plan_fit.curve, config.contact, state.touch, state.measurement
     p_BT = np.asarray(sample.X_BT.translation())
-    here = state.measurement.point + (p_BT - state.measurement.p_BT) if t.step == "back" else p_BT
+    here = last.point + (p_BT - last.p_BT) if t.step == "back" else p_BT
     s = curve.nearest(here, state.s_tip)
     state = changed(state, s_tip=s)
     if t.step == "back":
         if is_new and contact_lost(before, state, config):
             return _start_found(before, state, sample.time, config), (0.0, 0.0, 0.0), None, False
         if is_new:
-            rest = curve.nearest(state.measurement.p_BT, s)
-            felt = PendingPoint(state.measurement.point, curve.nearest(state.measurement.point, s) - rest)
-            state = changed(state, touch=replace(t, felt=(*t.felt, felt)))
+            point = PendingPoint(last.point, curve.nearest(last.point, s) - curve.nearest(last.p_BT, s))
+            state = changed(state, touch=replace(t, felt=(*t.felt, point)))
         if s < -limits.end_window_m:
             # Still in the groove: it begins before the plan does, and the weld begins where the plan says.
             return _ready(changed(state, proven=True), p_BT, config), (0.0, 0.0, 0.0), None, True
@@ -109,9 +108,7 @@ def _start_found(before: WeldingState, state: WeldingState, now: float, config: 
         last = np.array([q.point for q in felt[-8:]])
         s = curve.project(last, state.s_tip, 0.02)
         gap = last - curve.position(s)
-        residual = np.array(
-            (np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean())
-        )
+        residual = np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
     touch = replace(state.touch, step="lift", since=now, felt=felt)
     return changed(
         state, touch=touch, residual_at_loss=residual, start_point=before.measurement.point, steer=0.0, felt=0.0

@@ -31,6 +31,8 @@ class RefinementConfig:
     Attributes:
         frames_to_commit: further good frames a point waits for.
         fit_sigma_m: width of the local fit's Gaussian; fit_radius_share: of the plan's radius, where that is less.
+        fit_sagitta_m: it is as wide as sqrt(sagitta R), up to fit_sigma_wide_m, where that is more and R the least radius
+            nearby: where curvature jumps by 1/R a quadratic is off by 0.06 sigma^2/R, 6 um with these numbers.
         fit_sigma_max_m: how wide it may grow to find points.
         fit_points: effective points it grows for.
         bridge_from_m: farther than this from any point a gap is bridged on the moved plan instead.
@@ -41,6 +43,8 @@ class RefinementConfig:
     frames_to_commit: int = 4
     fit_sigma_m: float = 1.5e-3
     fit_radius_share: float = 0.2
+    fit_sagitta_m: float = 0.1e-3
+    fit_sigma_wide_m: float = 2.5e-3
     fit_sigma_max_m: float = 3.0e-3
     fit_points: float = 5.0
     bridge_from_m: float = 0.6e-3
@@ -149,7 +153,12 @@ class LocalFit(NamedTuple):
 
 
 def local_fit(
-    seam: RefinedSeam, arc: float, plan_tangent: Array, radius: float, config: RefinementConfig
+    seam: RefinedSeam,
+    arc: float,
+    plan_tangent: Array,
+    radius: float,
+    config: RefinementConfig,
+    least_radius: float = 0.0,
 ) -> LocalFit | None:
     """A quadratic fitted to the points around `arc`, on both sides of it (the tip is a chord ahead of the torch).
 
@@ -157,13 +166,15 @@ def local_fit(
         seam: committed points.
         arc: parameter m.
         plan_tangent: (3,) registered plan's tangent, towards which the slope is held.
-        radius: the plan's radius of curvature m there.
+        radius: the plan's radius of curvature m there; least_radius: the least within 5 mm, when known.
         config: widths.
 
     Returns:
         None where even the widest window holds fewer than 3 effective points.
     """
     sigma = max(min(config.fit_radius_share * radius, config.fit_sigma_m), 0.3e-3)
+    sigma = max(sigma, min(math.sqrt(config.fit_sagitta_m * least_radius), config.fit_sigma_wide_m))
+    widest = max(config.fit_sigma_max_m, sigma)
     if len(seam.corners):
         # Round a corner that was filled in the points are dense and free of noise: a wide fit would cut it.
         sigma = max(min(sigma, 0.4 * float(np.min(np.abs(seam.corners - arc)))), 0.3e-3)
@@ -171,8 +182,7 @@ def local_fit(
     # twice as wide takes that back.
     edge = min(arc - float(seam.arc[0]), float(seam.arc[-1]) - arc) if len(seam) else math.inf
     if edge < 2.0 * sigma and not len(seam.corners):
-        sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_radius_share * radius))
-    widest = max(config.fit_sigma_max_m, sigma)
+        sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_sigma_max_m, 0.2 * radius))
     while True:
         low, high = np.searchsorted(seam.arc, (arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
         n = high - low

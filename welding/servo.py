@@ -17,8 +17,8 @@ from weldcal.welding.contact import (
     with_progress,
 )
 from weldcal.welding.evolve import changed
-from weldcal.welding.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
+from weldcal.welding.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.laws import get_law, motion_law
 from weldcal.welding.plan_fit import PlanFit
 from weldcal.welding.refinement import drop_pending
@@ -120,16 +120,15 @@ def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Wel
 def _touch(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
-    assert state.plan_fit is not None
     feels_start = config.touch.feel_start and get_law(config.law).guarded
     if state.touch.step in BACK_STEPS:
         state, (along, lateral, upward), problem, ready = feel_start_step(before, state, sample, is_new, config)
-        seam = state.plan_fit.curve.frame(state.s_tip) if state.plan_fit is not None else None
-        seated = False
+        assert state.plan_fit is not None
+        seam, seated = state.plan_fit.curve.frame(state.s_tip), False
     else:
+        assert state.plan_fit is not None
         seam, along, ready = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False
         state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
-    assert seam is not None
     if problem is not None:
         return _rest(_fault(state, sample.time, problem), sample, config)
     state = _slewed(state, lateral, upward, config, dt)
@@ -145,7 +144,9 @@ def _touch(
         p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
         s_torch = curve.nearest(p_BW, s - config.tool.torch_offset_m, 0.1)
         proven = seated or state.proven
-        state = changed(state, phase=Phase.TRACK, proven=proven, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch)
+        state = changed(
+            state, phase=Phase.TRACK, proven=proven, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch
+        )
     return _answer(state, V, config, Diagnostics(omega=0.0))
 
 

@@ -18,7 +18,11 @@ from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
 _CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no point: too late to be confirmed
-_BEND_OVER_M = (3.0e-3, 10.0e-3)  # least and most of the path whose bend is carried on; 0.4 of the plan's radius between
+_BEND_OVER_M = (
+    3.0e-3,
+    10.0e-3,
+)  # least and most of the path whose bend is carried on; 0.4 of the plan's radius between
+_WINDOW_M = 5.0e-3  # two sigma of the widest fit
 _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
 
@@ -64,9 +68,9 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     if len(seam) >= 5:
         first, last = float(seam.arc[0]), float(seam.arc[-1])
         inside = clip(arc, first + 1e-3, max(last - 1e-3, first + 1e-3))
-        bend = max(abs(plan.curvature), 1e-6)
+        radius = 1.0 / max(abs(plan.curvature), 1e-6)
         if _nearest_point(seam.arc, inside) < config.refinement.bridge_from_m:
-            fit = local_fit(seam, inside, plan.tangent, 1.0 / bend, config.refinement)
+            fit = local_fit(seam, inside, plan.tangent, radius, config.refinement, _least_radius(curve, s))
         # Before the first point, and where the window is empty, the plan leads and carries the nearest residual.
         if fit is not None:
             here = curve.frame(curve.nearest(fit.point, s + inside - arc))
@@ -93,15 +97,20 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     n = cross(up, t)
     if fit is not None:
         bend = dot(fit.bend, n) / fit.speed**2
-        reach = config.weld_speed_m_s * config.lag_s
-        ahead_of = (
-            local_fit(seam, arc + reach, plan.tangent, 1.0 / max(abs(plan.curvature), 1e-6), config.refinement)
-            if abs(plan.curvature) > _SHARP_PER_M
-            else None
-        )
-        if ahead_of is not None:
-            # Round a sharp corner the bend here says little of the path a moment later.
-            bend = math.asin(clip(dot(ahead_of.tangent, n), -1.0, 1.0)) / reach
+        if abs(plan.curvature) > _SHARP_PER_M:
+            # Round a sharp corner the bend here says little of the path a moment later, and a turn of the torch's way takes
+            # a ramp at the limit of the turning rate, of which half counts as lag.
+            speed = config.weld_speed_m_s
+            ramp = speed / (config.tool.torch_offset_m * config.omega_acceleration_rad_s2)
+            then = local_fit(
+                seam,
+                arc + speed * (config.lag_s + 0.5 * ramp),
+                plan.tangent,
+                1.0 / abs(plan.curvature),
+                config.refinement,
+            )
+            if then is not None:
+                bend = math.asin(clip(dot(then.tangent, n), -1.0, 1.0)) / (speed * config.lag_s)
     if config.clearance_m:
         # Where the surface twists along the seam, a line above or below it heads a little to the side.
         h = 2.0e-3
@@ -127,6 +136,11 @@ def _carried_on(
         return None
     tangent = unit(fit.tangent + ahead * bend, fit.tangent)
     return LocalFit(fit.point + ahead * fit.tangent + 0.5 * ahead**2 * bend, tangent, bend, 1.0, fit.effective)
+
+
+def _least_radius(curve: SeamCurve, s: float) -> float:
+    """The plan's least radius of curvature m within the widest window around an arc length m."""
+    return 1.0 / max(1e-6, *(abs(curve.frame(s + k * _WINDOW_M).curvature) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)))
 
 
 def _nearest_point(arcs: Array, arc: float) -> float:
@@ -197,7 +211,7 @@ def guarded_motion(
     back_b = -config.k_h * clip(dot(e, b), -limit, limit)
 
     # What is commanded now is done a robot's lag later: the rows look that far ahead along the path.
-    turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.3, 0.3)
+    turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.6, 0.6)
     t, n = math.cos(turn) * t + math.sin(turn) * n, math.cos(turn) * n - math.sin(turn) * t
     swing = clip(state.omega * config.lag_s, -0.1, 0.1)
     m_then = math.cos(swing) * m - math.sin(swing) * u
