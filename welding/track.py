@@ -14,6 +14,7 @@ from weldcal.welding.lsq import box_least_squares
 from weldcal.welding.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.seam import SeamCurve, SeamFrame
 from weldcal.welding.servo_state import ServoConfig, WeldingState
+from weldcal.welding.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
@@ -196,16 +197,10 @@ def guarded_motion(
         target: of the torch.
         servo: the tip's lateral and upward speeds, m/s.
     """
-    R = X_BT.rotation().matrix()
-    p_BT = X_BT.translation()
-    chord = -(R @ config.p_TW)
-    d = norm(chord)
-    u = chord / d
-    up = unit(tip.up + target.up, tip.up)
-    m = unit(cross(up, u), R[:, 1])
-    a = cross(u, m)
+    axes = tool_axes(X_BT, tip.up, target.up, config)
+    u, m, a, d, up = axes.along, axes.across, axes.yaw, axes.d, axes.up
     t, n, b = target.tangent, target.normal, target.up
-    e = p_BT - chord - target.point
+    e = axes.torch - target.point
     limit = config.feedback_limit_m
     back_n = target.rate - config.k_b * clip(dot(e, n), -limit, limit)
     back_b = -config.k_h * clip(dot(e, b), -limit, limit)
@@ -217,8 +212,7 @@ def guarded_motion(
     m_then = math.cos(swing) * m - math.sin(swing) * u
 
     # V_W = v t_s + V_0 - d w m + d w_p a. The height row gives w_p; putting it in leaves x -> x - (x.b)/(a.b) a.
-    ab = dot(a, b)
-    ab = ab if abs(ab) > 0.2 else math.copysign(0.2, ab)
+    ab = height_share(axes, b)
     tb = tip.tangent
     base = servo[0] * tip.normal + servo[1] * tip.up
     lean_n, lean_t = dot(a, n) / ab, dot(a, t) / ab
@@ -256,8 +250,6 @@ def guarded_motion(
 
     # Roll about the level chord goes to the work angle; what yaw about a tilted tool axis adds to it is taken off.
     level = unit(u - dot(u, up) * up, u)
-    lean = math.asin(clip(dot(R[:, 1], b), -1.0, 1.0)) - config.work_angle_rad
-    roll = clip(-config.k_roll * lean, -0.3, 0.3)
-    w_r = clip((roll - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
+    w_r = clip((roll_rate(axes, b, config) - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
     V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])
     return Motion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))
