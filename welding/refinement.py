@@ -14,6 +14,9 @@ from weldcal.welding.vectors import Array
 
 _EMPTY_POINTS = np.zeros((0, 3))
 _EMPTY_ARC = np.zeros(0)
+_STEPS = 6  # frames over which the tip's own way is measured
+_SLOW = 0.5  # of the progress: less is a tip that is held up
+_LEAST_STEP_M = 0.01e-3
 _STICKING = 0.25  # path per progress: below it the tip all but stands
 
 
@@ -60,7 +63,7 @@ class RefinedSeam:
         points: (n,3) m in B, the tip's centre.
         arc: (n,) m, the commanded tip progress at each point and what the tip sprang beyond it, increasing.
         pending: points waiting for confirmation, oldest first.
-        sprung: what the tip sprang so far, m.
+        sprung: what the tip sprang so far, less what it was held up, m.
         jump: number of points (before, after) a jump that is not filled in yet, or None.
         corners: (k,) arcs m of corners filled in.
     """
@@ -104,6 +107,14 @@ def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig
         before = len(seam) if seam.jump is None or len(seam) - seam.jump[1] > 4 else seam.jump[0]
         seam = replace(seam, sprung=seam.sprung + extra, jump=(before, len(seam)))
         arc += extra
+    elif len(seam) >= _STEPS:
+        # Where the tip hardly comes on, as in a concave corner that the rest point goes round outside, the parameter goes
+        # with the tip: points a third as far apart as their parameters tell the direction no worse, points that stand do.
+        step = arc - float(seam.arc[-1])
+        way = max(float(np.linalg.norm(oldest.point - seam.points[-_STEPS])) / _STEPS, _LEAST_STEP_M)
+        if way < _SLOW * step:
+            seam = replace(seam, sprung=seam.sprung + way - step)
+            arc += way - step
     seam = replace(seam, points=np.vstack([seam.points, oldest.point]), arc=np.append(seam.arc, arc))
     return _filled(seam, config.corner) if seam.jump is not None else seam
 
