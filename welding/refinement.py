@@ -16,6 +16,7 @@ _EMPTY_POINTS = np.zeros((0, 3))
 _EMPTY_ARC = np.zeros(0)
 _STEPS = 6  # frames over which the tip's own way is measured
 _SLOW = 0.5  # of the progress: less is a tip that is held up
+_FRAME_M = 1.5e-3  # no frame's progress is as long (40 mm/s at 30 Hz): beyond it lies a gap
 _LEAST_STEP_M = 0.01e-3
 _STICKING = 0.25  # path per progress: below it the tip all but stands
 
@@ -112,7 +113,7 @@ def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig
         # with the tip: points a third as far apart as their parameters tell the direction no worse, points that stand do.
         step = arc - float(seam.arc[-1])
         way = max(float(np.linalg.norm(oldest.point - seam.points[-_STEPS])) / _STEPS, _LEAST_STEP_M)
-        if way < _SLOW * step:
+        if way < _SLOW * step < _SLOW * _FRAME_M:
             seam = replace(seam, sprung=seam.sprung + way - step)
             arc += way - step
     seam = replace(seam, points=np.vstack([seam.points, oldest.point]), arc=np.append(seam.arc, arc))
