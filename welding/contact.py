@@ -10,7 +10,7 @@ from weldcal.welding.evolve import changed
 from weldcal.welding.plan_fit import add_point
 from weldcal.welding.refinement import drop_pending, refine, tip_point
 from weldcal.welding.seam import SeamFrame
-from weldcal.welding.servo_state import Measurement, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo_state import Measurement, Phase, ServoConfig, ServoSample, WeldingState
 from weldcal.welding.vectors import Array, clip, dot, finite, norm
 
 
@@ -42,8 +42,11 @@ def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config
     steer = _steering(state, delta, seam, config) if minded else 0.0
     seam = turned(seam, steer)
     delta_n, delta_axial = dot(delta, seam.normal), -dot(delta, seam.up)
+    same = state.reading is not None and bool(np.array_equal(frame.deflection_T, state.reading))
     return changed(
         state,
+        reading=frame.deflection_T,
+        same_readings=state.same_readings + 1 if same and state.phase == Phase.TRACK else 0,
         measurement=Measurement(frame.capture_time, point, delta, p_BT),
         frame_time=frame.capture_time,
         delta_n=delta_n,

@@ -114,6 +114,10 @@ def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Wel
     if state.phase != Phase.FINISH and blind > config.contact.hidden_s:
         text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
         return _fault(state, sample.time, text)
+    # No two readings of a tag are alike to the last bit, unless they are of one picture told again with a new time.
+    if state.same_readings >= config.contact.frozen_frames:
+        text = f"The finger camera repeats one picture ({state.same_readings} readings alike); restart the camera."
+        return _fault(state, sample.time, text)
     return state
 
 

@@ -102,7 +102,7 @@ class ContactConfig:
         regain_axial_m: axial deflection that shows the groove again; regain_frames: for so many frames,
             regain_after_m, regain_after_s: this far past the loss, and this long after it, at the earliest.
         limit_lateral_m, limit_axial_m: mechanical limits of the tip.
-        hidden_s: tag not seen for this long stops the weld.
+        hidden_s: tag not seen for this long stops the weld; frozen_frames: so does the very same reading in so many frames.
         coast_m: longest gap; hover_m: how far below its seat the free tip hangs while crossing one.
         end_window_m: how far the seam's end may be from the plan's.
     """
@@ -117,6 +117,7 @@ class ContactConfig:
     limit_lateral_m: float = 5.0e-3
     limit_axial_m: float = 6.5e-3
     hidden_s: float = 0.3
+    frozen_frames: int = 30
     coast_m: float = 40.0e-3
     hover_m: float = 0.5e-3
     end_window_m: float = 6.0e-3
@@ -334,6 +335,8 @@ class WeldingState:
     zero: Array | None = None
     measurement: Measurement | None = None
     frame_time: float = -math.inf
+    reading: Array | None = None
+    same_readings: int = 0
     delta_n: float = 0.0
     delta_axial: float = 0.0
     delta_wanted: float | None = None
