@@ -10,7 +10,7 @@ from weldcal.welding.evolve import changed
 from weldcal.welding.plan_fit import add_point
 from weldcal.welding.refinement import drop_pending, refine, tip_point
 from weldcal.welding.seam import SeamFrame
-from weldcal.welding.servo_state import Measurement, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo_state import Measurement, Phase, ServoConfig, ServoSample, WeldingState
 from weldcal.welding.vectors import Array, clip, dot, finite, norm
 
 
@@ -47,8 +47,11 @@ def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config
     steer = _steering(state, delta, seam, config) if minded else 0.0
     seam = turned(seam, steer)
     delta_n, delta_axial = dot(delta, seam.normal), -dot(delta, seam.up)
+    same = state.reading is not None and bool(np.array_equal(frame.deflection_T, state.reading))
     return changed(
         state,
+        reading=frame.deflection_T,
+        same_readings=state.same_readings + 1 if same and state.phase == Phase.TRACK else 0,
         measurement=Measurement(frame.capture_time, point, delta, p_BT),
         frame_time=frame.capture_time,
         delta_n=delta_n,
@@ -66,18 +69,22 @@ def turned(seam: SeamFrame, angle: float) -> SeamFrame:
     return seam._replace(tangent=c * seam.tangent + s * seam.normal, normal=c * seam.normal - s * seam.tangent)
 
 
-def felt_turn(state: WeldingState, point: Array, seam: SeamFrame, config: ServoConfig) -> float:
+def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoConfig) -> float:
     """How far the path just felt turns from the plan's tangent, rad about up; zero where they agree.
 
     A plan rounds its corners, and beside a rounded corner its tangent is wrong by half of the turn. The direction of
     the last points is noisier than the plan's, so that it is believed only where the two plainly differ.
     """
-    points = [point, *(q.point for q in reversed(state.refined.pending)), *state.refined.points[-1:-13:-1]]
+    seam = state.refined
+    points = [point, *(q.point for q in reversed(seam.pending))]
+    # Going over ground that was felt on the way back, the last points committed lie ahead.
+    if not (seam.pending and len(seam) and seam.pending[0].arc + seam.sprung < seam.arc[-1]):
+        points += [*seam.points[-1:-13:-1]]
     x, y = [0.0], [0.0]
     for earlier in points[1:]:
         back = earlier - point
-        x.append(dot(back, seam.tangent))
-        y.append(dot(back, seam.normal))
+        x.append(dot(back, at.tangent))
+        y.append(dot(back, at.normal))
         if len(x) >= config.felt_points and math.hypot(x[-1], y[-1]) >= config.felt_length_m:
             break
     else:

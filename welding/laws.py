@@ -15,8 +15,9 @@ from weldcal.welding.guard import seam_conditioning
 from weldcal.welding.refinement import RefinedSeam
 from weldcal.welding.seam import SeamFrame
 from weldcal.welding.servo_state import ServoConfig, WeldingState
+from weldcal.welding.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.track import Motion, TorchTarget, guarded_motion
-from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
+from weldcal.welding.vectors import Array, clip, cross, dot, unit
 
 _OMEGA_CEILING = 100.0  # rad/s; an unguarded law asks for thousands, no robot turns by more than this in a tick
 
@@ -107,21 +108,15 @@ def paper_motion(
 
     The paper is planar; as in the guarded law, pitch keeps the torch's height and roll the work angle.
     """
-    R = X_BT.rotation().matrix()
-    p_BT = X_BT.translation()
-    chord = -(R @ config.p_TW)
-    d = norm(chord)
-    u = chord / d
-    up = unit(tip.up + target.up, tip.up)
-    m = unit(cross(up, u), R[:, 1])  # the paper's n_d
-    a = cross(u, m)
+    axes = tool_axes(X_BT, tip.up, target.up, config)
+    u, m, a, d = axes.along, axes.across, axes.yaw, axes.d
     n, t = target.normal, target.tangent
     if not law.fitted:
-        t = literal_tangent(state.refined, p_BT - chord, target.tangent)
+        t = literal_tangent(state.refined, axes.torch, target.tangent)
         n = unit(cross(target.up, t), target.normal)
     v = config.weld_speed_m_s
     V_tip = v * tip.tangent + servo[0] * tip.normal + servo[1] * tip.up
-    e = p_BT - chord - target.point
+    e = axes.torch - target.point
     back = config.k_b * dot(e, n) if law.feedback else 0.0
     c = dot(m, n)
     wanted = law.sign * dot(V_tip, n) + back
@@ -129,14 +124,11 @@ def paper_motion(
     omega = clip(wanted * slope / d, -law.omega_limit, law.omega_limit)
 
     b = target.up
-    ab = dot(a, b)
-    ab = math.copysign(max(abs(ab), 0.2), ab)
     flat = V_tip - d * omega * m
-    w_p = -(dot(flat, b) + config.k_h * clip(dot(e, b), -config.feedback_limit_m, config.feedback_limit_m)) / (d * ab)
+    w_p = -(dot(flat, b) + config.k_h * clip(dot(e, b), -config.feedback_limit_m, config.feedback_limit_m))
+    w_p /= d * height_share(axes, b)
     w_p = clip(w_p, -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
-    lean = math.asin(clip(dot(R[:, 1], b), -1.0, 1.0)) - config.work_angle_rad
-    roll = clip(-config.k_roll * lean, -0.3, 0.3)
-    V = np.concatenate([omega * a + w_p * m + roll * u, V_tip])
+    V = np.concatenate([omega * a + w_p * m + roll_rate(axes, b, config) * u, V_tip])
     return Motion(V, v, dot(flat, t), omega, seam_conditioning(u, tip.tangent, t))
 
 

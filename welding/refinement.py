@@ -14,6 +14,11 @@ from weldcal.welding.vectors import Array
 
 _EMPTY_POINTS = np.zeros((0, 3))
 _EMPTY_ARC = np.zeros(0)
+_STEPS = 6  # frames over which the tip's own way is measured
+_SLOW = 0.5  # of the progress: less is a tip that is held up
+_FRAME_M = 1.5e-3  # no frame's progress is as long (40 mm/s at 30 Hz): beyond it lies a gap
+_LEAST_STEP_M = 0.01e-3
+_STICKING = 0.25  # path per progress: below it the tip all but stands
 
 
 class PendingPoint(NamedTuple):
@@ -30,6 +35,8 @@ class RefinementConfig:
     Attributes:
         frames_to_commit: further good frames a point waits for.
         fit_sigma_m: width of the local fit's Gaussian; fit_radius_share: of the plan's radius, where that is less.
+        fit_sagitta_m: it is as wide as sqrt(sagitta R), up to fit_sigma_wide_m, where that is more and R the least radius
+            nearby: where curvature jumps by 1/R a quadratic is off by 0.06 sigma^2/R, 6 um with these numbers.
         fit_sigma_max_m: how wide it may grow to find points.
         fit_points: effective points it grows for.
         bridge_from_m: farther than this from any point a gap is bridged on the moved plan instead.
@@ -40,6 +47,8 @@ class RefinementConfig:
     frames_to_commit: int = 4
     fit_sigma_m: float = 1.5e-3
     fit_radius_share: float = 0.2
+    fit_sagitta_m: float = 0.1e-3
+    fit_sigma_wide_m: float = 2.5e-3
     fit_sigma_max_m: float = 3.0e-3
     fit_points: float = 5.0
     bridge_from_m: float = 0.6e-3
@@ -55,7 +64,7 @@ class RefinedSeam:
         points: (n,3) m in B, the tip's centre.
         arc: (n,) m, the commanded tip progress at each point and what the tip sprang beyond it, increasing.
         pending: points waiting for confirmation, oldest first.
-        sprung: what the tip sprang so far, m.
+        sprung: what the tip sprang so far, less what it was held up, m.
         jump: number of points (before, after) a jump that is not filled in yet, or None.
         corners: (k,) arcs m of corners filled in.
     """
@@ -99,6 +108,14 @@ def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig
         before = len(seam) if seam.jump is None or len(seam) - seam.jump[1] > 4 else seam.jump[0]
         seam = replace(seam, sprung=seam.sprung + extra, jump=(before, len(seam)))
         arc += extra
+    elif len(seam) >= _STEPS:
+        # Where the tip hardly comes on, as in a concave corner that the rest point goes round outside, the parameter goes
+        # with the tip: points a third as far apart as their parameters tell the direction no worse, points that stand do.
+        step = arc - float(seam.arc[-1])
+        way = max(float(np.linalg.norm(oldest.point - seam.points[-_STEPS])) / _STEPS, _LEAST_STEP_M)
+        if way < _SLOW * step < _SLOW * _FRAME_M:
+            seam = replace(seam, sprung=seam.sprung + way - step)
+            arc += way - step
     seam = replace(seam, points=np.vstack([seam.points, oldest.point]), arc=np.append(seam.arc, arc))
     return _filled(seam, config.corner) if seam.jump is not None else seam
 
@@ -148,7 +165,12 @@ class LocalFit(NamedTuple):
 
 
 def local_fit(
-    seam: RefinedSeam, arc: float, plan_tangent: Array, radius: float, config: RefinementConfig
+    seam: RefinedSeam,
+    arc: float,
+    plan_tangent: Array,
+    radius: float,
+    config: RefinementConfig,
+    least_radius: float = 0.0,
 ) -> LocalFit | None:
     """A quadratic fitted to the points around `arc`, on both sides of it (the tip is a chord ahead of the torch).
 
@@ -156,16 +178,23 @@ def local_fit(
         seam: committed points.
         arc: parameter m.
         plan_tangent: (3,) registered plan's tangent, towards which the slope is held.
-        radius: the plan's radius of curvature m there.
+        radius: the plan's radius of curvature m there; least_radius: the least within 5 mm, when known.
         config: widths.
 
     Returns:
         None where even the widest window holds fewer than 3 effective points.
     """
     sigma = max(min(config.fit_radius_share * radius, config.fit_sigma_m), 0.3e-3)
+    sigma = max(sigma, min(math.sqrt(config.fit_sagitta_m * least_radius), config.fit_sigma_wide_m))
+    widest = max(config.fit_sigma_max_m, sigma)
     if len(seam.corners):
         # Round a corner that was filled in the points are dense and free of noise: a wide fit would cut it.
         sigma = max(min(sigma, 0.4 * float(np.min(np.abs(seam.corners - arc)))), 0.3e-3)
+    # At the ends points lie on one side only, and a quadratic's end is three times as noisy as its middle: a window up to
+    # twice as wide takes that back.
+    edge = min(arc - float(seam.arc[0]), float(seam.arc[-1]) - arc) if len(seam) else math.inf
+    if edge < 2.0 * sigma and not len(seam.corners):
+        sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_sigma_max_m, 0.2 * radius))
     while True:
         low, high = np.searchsorted(seam.arc, (arc - 3.0 * sigma, arc + 3.0 * sigma)).tolist()
         n = high - low
@@ -175,11 +204,11 @@ def local_fit(
             effective = float(w.sum() ** 2 / (w @ w))
             if effective >= config.fit_points:
                 break
-        if sigma >= config.fit_sigma_max_m:
+        if sigma >= widest:
             if n < 4 or effective < 3.0:
                 return None
             break
-        sigma = min(1.5 * sigma, config.fit_sigma_max_m)
+        sigma = min(1.5 * sigma, widest)
     basis = np.stack([np.ones(n), x, x * x])
     weighted = basis * w
     normal = weighted @ basis.T
@@ -193,8 +222,14 @@ def local_fit(
     speed = math.sqrt(float(slope @ slope))
     if not math.isfinite(speed):
         return None
-    # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it.
-    slope = slope + max(0.0, 0.8 - speed) * plan_tangent
+    # The way the fitted point itself goes when the window moves on is the slope plus what the moving weights add: where
+    # the curvature jumps the two differ by 0.2 sigma/R, and a torch that headed along the slope would leave the point.
+    left_over = seam.points[low:high] - seam.points[low] - basis.T @ c
+    slope = slope + np.linalg.solve(normal, (weighted * x) @ left_over)[0] / sigma
+    speed = math.sqrt(float(slope @ slope))
+    # A tip that sticks leaves points that hardly advance, and their direction is noise: the plan's stands in for it. In a
+    # concave corner of 1 mm the tip still comes on by a third of the rest point's way, and its direction is good.
+    slope = slope + max(0.0, _STICKING - speed) * plan_tangent
     speed = math.sqrt(float(slope @ slope))
     if speed < 0.2:
         return None

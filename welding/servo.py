@@ -19,6 +19,7 @@ from weldcal.welding.contact import (
 )
 from weldcal.welding.evolve import changed
 from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
+from weldcal.welding.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.laws import get_law, motion_law
 from weldcal.welding.plan_fit import PlanFit
 from weldcal.welding.refinement import drop_pending
@@ -65,7 +66,7 @@ def welding_step(
         state = with_frame(state, sample, _frame_at_tip(state), config)
     state = _watch(state, sample, config)
     if state.phase == Phase.TOUCH:
-        return _touch(state, sample, is_new, config, dt)
+        return _touch(before, state, sample, is_new, config, dt)
     if is_new and state.phase in _MOVING:
         state = _contact(before, state, config)
     if state.phase in _MOVING:
@@ -119,26 +120,43 @@ def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Wel
     if state.phase != Phase.FINISH and blind > config.contact.hidden_s:
         text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
         return _fault(state, sample.time, text)
+    # No two readings of a tag are alike to the last bit, unless they are of one picture told again with a new time.
+    if state.same_readings >= config.contact.frozen_frames:
+        text = f"The finger camera repeats one picture ({state.same_readings} readings alike); restart the camera."
+        return _fault(state, sample.time, text)
     return state
 
 
 def _touch(
-    state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
+    before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig, dt: float
 ) -> tuple[WeldingState, WeldingCommand]:
-    assert state.plan_fit is not None
-    seam = state.plan_fit.curve.frame(config.touch.arc_m)
-    state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
+    feels_start = config.touch.feel_start and get_law(config.law).guarded
+    if state.touch.step in BACK_STEPS:
+        state, (along, lateral, upward), problem, ready = feel_start_step(before, state, sample, is_new, config)
+        assert state.plan_fit is not None
+        seam, seated = state.plan_fit.curve.frame(state.s_tip), False
+    else:
+        assert state.plan_fit is not None
+        seam, along, ready = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False
+        state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
     if problem is not None:
         return _rest(_fault(state, sample.time, problem), sample, config)
     state = _slewed(state, lateral, upward, config, dt)
-    V = np.concatenate([np.zeros(3), state.u_n * seam.normal + state.u_a * seam.up])
-    if seated:
+    speed_up = config.tip_acceleration_m_s2 * dt
+    state = changed(state, v_tip=clip(along, state.v_tip - speed_up, state.v_tip + speed_up))
+    V = np.concatenate([np.zeros(3), state.v_tip * seam.tangent + state.u_n * seam.normal + state.u_a * seam.up])
+    if seated and feels_start:
+        state = begin_feeling_back(state, sample.time)
+    elif seated or ready:
         assert state.plan_fit is not None
         curve, p_BT = state.plan_fit.curve, np.asarray(sample.X_BT.translation())
-        s = curve.nearest(p_BT, config.touch.arc_m)
+        s = curve.nearest(p_BT, state.s_tip)
         p_BW = p_BT + sample.X_BT.rotation().matrix() @ config.p_TW
         s_torch = curve.nearest(p_BW, s - config.tool.torch_offset_m, 0.1)
-        state = changed(state, phase=Phase.TRACK, proven=True, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch)
+        proven = seated or state.proven
+        state = changed(
+            state, phase=Phase.TRACK, proven=proven, s_tip=s, progress=s, s_torch=s_torch, torch_arc=s_torch
+        )
     return _answer(state, V, config, Diagnostics(omega=0.0))
 
 
@@ -252,7 +270,7 @@ def _weld(
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(_fault(state, sample.time, text), sample, config)
     # Once lit it burns to the end: the plan may still move back under a torch that has just passed its start.
-    lit = state.torch_on or (target.s >= 0.0 and error < config.ignition_error_m)
+    lit = state.torch_on or (target.s >= _start_arc(state, curve) and error < config.ignition_error_m)
     burning = lit and target.s < state.s_end
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
     state = changed(state, torch_on=burning, lit_at=lit_at)
@@ -270,6 +288,11 @@ def _weld(
         p_BTorch_target=target.point,
     )
     return _answer(state, motion.V_BT, config, diagnostics)
+
+
+def _start_arc(state: WeldingState, curve: SeamCurve) -> float:
+    """Where the arc is to be lit, m along the moved plan: where the groove was felt to begin, else where planned."""
+    return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
 def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfig) -> tuple[WeldingState, str | None]:

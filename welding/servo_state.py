@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.errors import InputError
 from weldcal.welding.feasibility import SeamWindows
 from weldcal.welding.plan_fit import PlanFit, PlanFitConfig
-from weldcal.welding.refinement import RefinedSeam, RefinementConfig
+from weldcal.welding.refinement import PendingPoint, RefinedSeam, RefinementConfig
 from weldcal.welding.vectors import Array
 from weldcal.welding.weave import WeaveConfig
 
@@ -67,6 +67,8 @@ class TouchConfig:
         settle_s: pause on the face before the search.
         calibrate_gain: press to `press_ratio` times the wanted deflection and back, and fit the tag's gain.
         press_m_s: speed of that; gain_sigma: prior sigma of the gain about 1.
+        feel_start: draw the seated tip back over the seam's start before the weld, so that the torch has felt points to
+            begin on and the arc starts where the groove does (welding.feel_start).
         zero_frames: frames of the free tip, before the descent, whose mean is taken for its rest (0: the tag's own rest
             pose is); zero_limit_m: a larger mean, or as large a spread, is no free tip.
     """
@@ -85,6 +87,7 @@ class TouchConfig:
     press_ratio: float = 1.6
     press_m_s: float = 1.0e-3
     gain_sigma: float = 0.06
+    feel_start: bool = False
     zero_frames: int = 0
     zero_limit_m: float = 1.0e-3
 
@@ -99,7 +102,7 @@ class ContactConfig:
         regain_axial_m: axial deflection that shows the groove again; regain_frames: for so many frames,
             regain_after_m, regain_after_s: this far past the loss, and this long after it, at the earliest.
         limit_lateral_m, limit_axial_m: mechanical limits of the tip.
-        hidden_s: tag not seen for this long stops the weld.
+        hidden_s: tag not seen for this long stops the weld; frozen_frames: so does the very same reading in so many frames.
         coast_m: longest gap; hover_m: how far below its seat the free tip hangs while crossing one.
         end_window_m: how far the seam's end may be from the plan's.
     """
@@ -114,6 +117,7 @@ class ContactConfig:
     limit_lateral_m: float = 5.0e-3
     limit_axial_m: float = 6.5e-3
     hidden_s: float = 0.3
+    frozen_frames: int = 30
     coast_m: float = 40.0e-3
     hover_m: float = 0.5e-3
     end_window_m: float = 6.0e-3
@@ -303,7 +307,8 @@ class GainFit(NamedTuple):
 
 @dataclass(frozen=True)
 class TouchState:
-    """Where the search is: its step, the step's start, heights and lateral place; `free`: deflections of the free tip."""
+    """Where the search is: its step, the step's start, heights and lateral place; `free`: deflections of the free tip;
+    `felt`: points felt on the way back to the start, each with how far ahead of its rest point friction held the tip."""
 
     step: str = "descend"
     since: float = 0.0
@@ -312,6 +317,7 @@ class TouchState:
     seated_frames: int = 0
     gain_fit: GainFit = field(default_factory=GainFit)
     free: tuple[Array, ...] = ()
+    felt: tuple[PendingPoint, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -330,6 +336,8 @@ class WeldingState:
     zero: Array | None = None
     measurement: Measurement | None = None
     frame_time: float = -math.inf
+    reading: Array | None = None
+    same_readings: int = 0
     delta_n: float = 0.0
     delta_axial: float = 0.0
     delta_wanted: float | None = None
@@ -354,6 +362,7 @@ class WeldingState:
     hold: Array = field(default_factory=lambda: np.zeros(2))
     residual_at_loss: Array = field(default_factory=lambda: np.zeros(2))
     s_end: float = math.nan
+    start_point: Array | None = None
     advanced: tuple[float, float] = (0.0, -math.inf)
     torch_on: bool = False
     lit_at: float = math.nan

@@ -14,11 +14,16 @@ from weldcal.welding.lsq import box_least_squares
 from weldcal.welding.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.seam import SeamCurve, SeamFrame
 from weldcal.welding.servo_state import ServoConfig, WeldingState
+from weldcal.welding.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
 _CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no point: too late to be confirmed
-_BEND_OVER_M = 10.0e-3
+_BEND_OVER_M = (
+    3.0e-3,
+    10.0e-3,
+)  # least and most of the path whose bend is carried on; 0.4 of the plan's radius between
+_WINDOW_M = 5.0e-3  # two sigma of the widest fit
 _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
 
@@ -60,12 +65,13 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     plan = curve.frame(s)
     seam = state.refined
     residual, fit, arc = state.residual, None, state.torch_arc
+    drift = np.zeros(2)
     if len(seam) >= 5:
         first, last = float(seam.arc[0]), float(seam.arc[-1])
         inside = clip(arc, first + 1e-3, max(last - 1e-3, first + 1e-3))
-        bend = max(abs(plan.curvature), 1e-6)
+        radius = 1.0 / max(abs(plan.curvature), 1e-6)
         if _nearest_point(seam.arc, inside) < config.refinement.bridge_from_m:
-            fit = local_fit(seam, inside, plan.tangent, 1.0 / bend, config.refinement)
+            fit = local_fit(seam, inside, plan.tangent, radius, config.refinement, _least_radius(curve, s))
         # Before the first point, and where the window is empty, the plan leads and carries the nearest residual.
         if fit is not None:
             here = curve.frame(curve.nearest(fit.point, s + inside - arc))
@@ -77,8 +83,12 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
             # The change is spread over the path, so that the torch is not asked to step.
             step = 0.05 * abs(s - state.s_torch)
             residual = state.residual + np.clip(_bridged(state, curve, arc, s) - state.residual, -step, step)
+            came_on = s - state.s_torch
+            drift = (residual - state.residual) / came_on if came_on > 1e-6 else drift
     if fit is None:
-        t, up, bend = plan.tangent, plan.up, plan.curvature
+        # The torch heads where the target goes, not where the plan does.
+        t, bend = unit(plan.tangent + drift[0] * plan.normal + drift[1] * plan.up, plan.tangent), plan.curvature
+        up = unit(plan.up - dot(plan.up, t) * t, plan.up)
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
@@ -88,15 +98,20 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     n = cross(up, t)
     if fit is not None:
         bend = dot(fit.bend, n) / fit.speed**2
-        reach = config.weld_speed_m_s * config.lag_s
-        ahead_of = (
-            local_fit(seam, arc + reach, plan.tangent, 1.0 / max(abs(plan.curvature), 1e-6), config.refinement)
-            if abs(plan.curvature) > _SHARP_PER_M
-            else None
-        )
-        if ahead_of is not None:
-            # Round a sharp corner the bend here says little of the path a moment later.
-            bend = math.asin(clip(dot(ahead_of.tangent, n), -1.0, 1.0)) / reach
+        if abs(plan.curvature) > _SHARP_PER_M:
+            # Round a sharp corner the bend here says little of the path a moment later, and a turn of the torch's way takes
+            # a ramp at the limit of the turning rate, of which half counts as lag.
+            speed = config.weld_speed_m_s
+            ramp = speed / (config.tool.torch_offset_m * config.omega_acceleration_rad_s2)
+            then = local_fit(
+                seam,
+                arc + speed * (config.lag_s + 0.5 * ramp),
+                plan.tangent,
+                1.0 / abs(plan.curvature),
+                config.refinement,
+            )
+            if then is not None:
+                bend = math.asin(clip(dot(then.tangent, n), -1.0, 1.0)) / (speed * config.lag_s)
     if config.clearance_m:
         # Where the surface twists along the seam, a line above or below it heads a little to the side.
         h = 2.0e-3
@@ -115,12 +130,18 @@ def _carried_on(
     ahead = arc - inside
     if ahead > _CARRY_M:
         return None
-    before = local_fit(seam, inside - _BEND_OVER_M, plan.tangent, 1.0, config.refinement)
-    bend = np.zeros(3) if before is None else (fit.tangent - before.tangent) / _BEND_OVER_M
-    if norm(bend) > 0.5 / _BEND_OVER_M:
+    over = clip(0.4 / max(abs(plan.curvature), 1e-6), *_BEND_OVER_M)
+    before = local_fit(seam, inside - over, plan.tangent, 1.0, config.refinement)
+    bend = np.zeros(3) if before is None else (fit.tangent - before.tangent) / over
+    if norm(bend) * over > 1.0:
         return None
     tangent = unit(fit.tangent + ahead * bend, fit.tangent)
     return LocalFit(fit.point + ahead * fit.tangent + 0.5 * ahead**2 * bend, tangent, bend, 1.0, fit.effective)
+
+
+def _least_radius(curve: SeamCurve, s: float) -> float:
+    """The plan's least radius of curvature m within the widest window around an arc length m."""
+    return 1.0 / max(1e-6, *(abs(curve.frame(s + k * _WINDOW_M).curvature) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)))
 
 
 def _nearest_point(arcs: Array, arc: float) -> float:
@@ -176,29 +197,22 @@ def guarded_motion(
         target: of the torch.
         servo: the tip's lateral and upward speeds, m/s.
     """
-    R = X_BT.rotation().matrix()
-    p_BT = X_BT.translation()
-    chord = -(R @ config.p_TW)
-    d = norm(chord)
-    u = chord / d
-    up = unit(tip.up + target.up, tip.up)
-    m = unit(cross(up, u), R[:, 1])
-    a = cross(u, m)
+    axes = tool_axes(X_BT, tip.up, target.up, config)
+    u, m, a, d, up = axes.along, axes.across, axes.yaw, axes.d, axes.up
     t, n, b = target.tangent, target.normal, target.up
-    e = p_BT - chord - target.point
+    e = axes.torch - target.point
     limit = config.feedback_limit_m
     back_n = target.rate - config.k_b * clip(dot(e, n), -limit, limit)
     back_b = -config.k_h * clip(dot(e, b), -limit, limit)
 
     # What is commanded now is done a robot's lag later: the rows look that far ahead along the path.
-    turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.3, 0.3)
+    turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.6, 0.6)
     t, n = math.cos(turn) * t + math.sin(turn) * n, math.cos(turn) * n - math.sin(turn) * t
     swing = clip(state.omega * config.lag_s, -0.1, 0.1)
     m_then = math.cos(swing) * m - math.sin(swing) * u
 
     # V_W = v t_s + V_0 - d w m + d w_p a. The height row gives w_p; putting it in leaves x -> x - (x.b)/(a.b) a.
-    ab = dot(a, b)
-    ab = ab if abs(ab) > 0.2 else math.copysign(0.2, ab)
+    ab = height_share(axes, b)
     tb = tip.tangent
     base = servo[0] * tip.normal + servo[1] * tip.up
     lean_n, lean_t = dot(a, n) / ab, dot(a, t) / ab
@@ -236,8 +250,6 @@ def guarded_motion(
 
     # Roll about the level chord goes to the work angle; what yaw about a tilted tool axis adds to it is taken off.
     level = unit(u - dot(u, up) * up, u)
-    lean = math.asin(clip(dot(R[:, 1], b), -1.0, 1.0)) - config.work_angle_rad
-    roll = clip(-config.k_roll * lean, -0.3, 0.3)
-    w_r = clip((roll - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
+    w_r = clip((roll_rate(axes, b, config) - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
     V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])
     return Motion(V, v, v * t_v + w * t_w + t_0, w, seam_conditioning(u, tb, t))

@@ -7,12 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from weldcal.tools.studies.seams import arcs, s_curve
 from weldcal.welding.chord_map import chord_map
 from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.process import ProcessLogError, path_error, speed_statistics, torch_events
 from weldcal.welding.seam import SeamCurve
 
-from .weld_kinematics import arcs, l_curve, s_curve, straight
+from .weld_kinematics import l_curve, straight
 
 D, V = 0.060, 0.008
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.welding.plan_fit import PlanFit, PlanFitConfig, add_point
@@ -93,6 +94,42 @@ def test_there_is_no_fit_where_nothing_was_felt() -> None:
     seam = felt(np.column_stack([arc, 0 * arc, 0 * arc]), arc)
     assert local_fit(seam, 0.035, X_AXIS, 1e6, CONFIG) is None
     assert local_fit(RefinedSeam.empty(), 0.0, X_AXIS, 1e6, CONFIG) is None
+
+
+def test_a_tip_that_is_held_up_does_not_advance_the_path() -> None:
+    # 10 mm at full progress, 3 mm of progress at a fifth of the way, 10 mm at full progress: 10 + 0.6 + 10 mm of path.
+    x = (
+        np.concatenate(
+            [np.arange(0.0, 10.0, 0.25), 10.0 + np.arange(0.0, 0.6, 0.05), 10.6 + np.arange(0.0, 10.0, 0.25)]
+        )
+        * 1e-3
+    )
+    arc = 0.25e-3 * np.arange(len(x))
+    noise = np.random.default_rng(3).normal(0.0, 0.05e-3, (len(x), 2))
+    seam = felt(np.column_stack([x, noise]), arc)
+    # Six frames pass before it is seen to be slow, and six more until it is seen to be quick again.
+    assert seam.sprung == pytest.approx(-2.4e-3, abs=1.2e-3)
+    assert np.all(np.diff(seam.arc) > 0.0)
+    # What comes after a gap of 30 mm is no tip that was held up.
+    on = np.concatenate([np.arange(0.0, 10e-3, 0.25e-3), np.arange(40e-3, 50e-3, 0.25e-3)])
+    assert felt(np.column_stack([on, 0 * on, 0 * on]), on).sprung == 0.0
+
+
+def test_the_torch_heads_where_the_fitted_point_goes() -> None:
+    # A straight runs into a bend of 20 mm: there the fit's slope is 0.2 sigma/R = 0.9 deg off the way of its own point.
+    arc = np.arange(0.0, 0.04, 2e-4)
+    a = np.maximum(arc - 0.02, 0.0) / 0.020
+    line = np.column_stack([np.minimum(arc, 0.02) + 0.020 * np.sin(a), 0.020 * (1.0 - np.cos(a)), 0 * arc])
+    seam = felt(line, arc)
+    h = 0.1e-3
+    for s in (0.018, 0.0195, 0.020, 0.0205, 0.022):
+        ahead, here, behind = (local_fit(seam, s + k * h, X_AXIS, 0.1, CONFIG) for k in (1.0, 0.0, -1.0))
+        assert ahead is not None
+        assert here is not None
+        assert behind is not None
+        way = (ahead.point - behind.point) / np.linalg.norm(ahead.point - behind.point)
+        # What is left is the ridge, 0.2 of about 20 points, on the slope's difference from the plan's, at most 6 deg.
+        assert np.degrees(np.arcsin(np.linalg.norm(np.cross(way, here.tangent)))) < 0.15
 
 
 def moved_plan(shift: np.ndarray, angle: float) -> tuple[SeamCurve, np.ndarray]:

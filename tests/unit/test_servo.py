@@ -11,6 +11,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.tools.studies.budgets import HARD, NOMINAL, PERFECT
+from weldcal.tools.studies.groove import DROP_M as DROP
+from weldcal.tools.studies.groove import SEAT_M as SEAT
+from weldcal.tools.studies.seams import s_curve
 from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam import SeamCurve
 from weldcal.welding.servo import welding_step
@@ -26,7 +30,7 @@ from weldcal.welding.servo_state import (
 )
 from weldcal.welding.touch import touch_start_pose
 
-from .weld_kinematics import DROP, HARD, NOMINAL, PERFECT, SEAT, Run, l_curve, s_curve, straight, weld
+from .weld_kinematics import Run, l_curve, straight, weld
 
 CALIBRATED = ServoConfig(touch=TouchConfig(calibrate_gain=True))
 SPEED = CALIBRATED.weld_speed_m_s

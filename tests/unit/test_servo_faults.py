@@ -123,6 +123,25 @@ def test_a_frozen_camera_stops_the_weld() -> None:
     assert "Tag hidden" in (command.reason or "")
 
 
+def test_one_picture_told_again_and_again_stops_the_weld(
+    half_way: tuple[WeldingState, RigidTransform, SeamCurve],
+) -> None:
+    state, X, plan = half_way
+    time = float(state.time or 0.0)
+    for k in range(200):
+        # The tool moves on along x, and every frame is new by its time and old by its picture.
+        now = time + 0.034 * (k + 1)
+        pose = RigidTransform(X.rotation(), X.translation() + np.array([2e-4 * k, 0.0, 0.0]))
+        frame = DeflectionSample(now - 0.04, pose, np.array([0.0, -2e-3, 3e-3]), True)
+        state, command = welding_step(state, ServoSample(now, pose, frame), plan, CONFIG)
+        bounded(command)
+        if command.phase == Phase.FAULT:
+            break
+    assert command.phase == Phase.FAULT
+    assert "repeats one picture" in (command.reason or "")
+    assert k <= CONFIG.contact.frozen_frames + 1
+
+
 def test_a_tag_that_reads_mirrored_never_passes_touch_on() -> None:
     mirrored = replace(NOMINAL, tag_yaw_rad=math.pi)  # the camera mounted the wrong way round
     run = simulate(straight(0.2), mirrored, CONFIG, 0, time_limit_s=40.0)
@@ -165,7 +184,7 @@ def test_a_torch_that_stands_is_stopped_by_name(half_way: tuple[WeldingState, Ri
     for k in range(700):
         # The robot does not follow: its pose stays, its camera is fine.
         now = time + 0.008 * (k + 1)
-        frame = DeflectionSample(now - 0.04, X, np.array([0.0, -2e-3, 3e-3]), True)
+        frame = DeflectionSample(now - 0.04, X, np.array([0.0, -2e-3, 3e-3 + 1e-9 * k]), True)
         state, command = welding_step(state, ServoSample(now, X, frame), plan, CONFIG)
         bounded(command)
         if command.phase == Phase.FAULT:

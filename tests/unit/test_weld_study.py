@@ -44,8 +44,9 @@ def test_the_hard_budget_holds_its_targets() -> None:
     holds("hard", Case("s_r60", "hard"))
 
 
-def test_a_sharp_convex_corner_is_put_back_from_its_sides() -> None:
-    holds("r1_convex", Case("l_r1_convex"))
+def test_round_a_sharp_concave_corner_the_torch_goes_by_what_was_felt() -> None:
+    # With this seed it was 0.34 mm off when the plan, which is 2 mm late, stood in for points close together.
+    assert holds("r1_concave", Case("l_r1_concave"), 100).max_mm <= 0.2
 
 
 def test_a_sharp_concave_corner_is_welded_in_the_hard_budget() -> None:
@@ -153,22 +154,26 @@ def test_the_tip_sits_in_the_groove_lags_by_friction_and_relaxes_beyond_the_end(
 
 def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
     out = tmp_path / "study"
-    answer = CliRunner().invoke(reproduce, ["weld", "--rows", "r5", "--seeds", "1", "--out", str(out), "--json"])
+    answer = CliRunner().invoke(reproduce, ["weld", "--rows", "r1_convex", "--seeds", "1", "--out", str(out), "--json"])
     assert answer.exit_code == 0, answer.output
     told = json.loads(answer.stdout.strip().splitlines()[-1])
     written = json.loads((out / "table.json").read_text())
-    assert told["rows"]["r5"]["completed"] == 2
-    assert written["rows"]["r5"]["figures"]["max_mm"]["target"] == 0.35
+    # A sharp convex corner is put back from its two sides, within the target of its row.
+    assert told["rows"]["r1_convex"]["completed"] == 1
+    assert told["rows"]["r1_convex"]["met"]
+    assert written["rows"]["r1_convex"]["figures"]["max_mm"]["target"] == 0.50
     with (out / "runs.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["case"] for row in rows] == ["l_r5_convex-d60-nominal", "l_r5_concave-d60-nominal"]
-    assert max(float(row["max_mm"]) for row in rows) == pytest.approx(told["rows"]["r5"]["figures"]["max_mm"]["worst"])
-    with (out / "runs" / "l_r5_convex-d60-nominal.csv").open() as file:
+    assert [row["case"] for row in rows] == ["l_r1_convex-d60-nominal"]
+    assert max(float(row["max_mm"]) for row in rows) == pytest.approx(
+        told["rows"]["r1_convex"]["figures"]["max_mm"]["worst"]
+    )
+    with (out / "runs" / "l_r1_convex-d60-nominal.csv").open() as file:
         ticks = list(csv.DictReader(file))
-    assert {tick["phase"] for tick in ticks} == {"TOUCH", "TRACK", "FINISH", "DONE"}
+    assert {tick["phase"] for tick in ticks} >= {"TOUCH", "TRACK", "FINISH", "DONE"}
     report = (out / "report.html").read_text()
-    assert "Corner of 5 mm, convex" in report
-    assert report.count("data:image/svg+xml") == 4
+    assert "Corner of 1 mm, convex" in report
+    assert report.count("data:image/svg+xml") == 2
 
 
 def test_an_unknown_row_is_one_sentence_and_exit_code_one(tmp_path: Path) -> None:

@@ -61,7 +61,8 @@ HARD = Budget(
 )
 PERFECT = Budget("perfect", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 KINEMATIC = replace(PERFECT, name="kinematic", lag_s=0.020, tag_sigma_m=0.02e-3)
-BUDGETS = {b.name: b for b in (NOMINAL, HARD, KINEMATIC, PERFECT)}
+QUIETER = tuple(replace(KINEMATIC, name=f"kinematic_{um}um", tag_sigma_m=1e-6 * um) for um in (0, 5, 10))
+BUDGETS = {b.name: b for b in (NOMINAL, HARD, KINEMATIC, *QUIETER, PERFECT)}
 
 
 def planned_seam(seam: TrueSeam, budget: Budget, rng: np.random.Generator) -> SeamCurve:

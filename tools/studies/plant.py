@@ -11,9 +11,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.tools.studies.budgets import Budget, planned_seam, roughness
 from weldcal.tools.studies.groove import DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.seams import TrueSeam
+from weldcal.welding.feel_start import with_touch_place
 from weldcal.welding.seam import SeamCurve
 from weldcal.welding.servo import welding_step
-from weldcal.welding.servo_state import DeflectionSample, Phase, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo_state import DeflectionSample, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.touch import touch_start_pose
 from weldcal.welding.vectors import Array
 
@@ -33,12 +34,14 @@ class StudyRun:
     Attributes:
         table: (N, len(COLUMNS)) one row per servo tick, SI units; phase is its number in PHASES.
         torch_line: where the torch should run; planned: the plan raised to the tip's line.
+        commands: what the servo answered at every tick.
         state: the servo's last; reason: why it stopped early, None when it did not.
     """
 
     table: Array
     torch_line: SeamCurve
     planned: SeamCurve
+    commands: tuple[WeldingCommand, ...]
     state: WeldingState
     reason: str | None
 
@@ -69,15 +72,21 @@ def simulate(
     seed: int,
     gaps: tuple[tuple[float, float], ...] = (),
     time_limit_s: float = 150.0,
+    plan: SeamCurve | None = None,
+    hidden_s: tuple[float, float] = (math.inf, math.inf),
 ) -> StudyRun:
     """One weld of a seam in a budget; everything random follows from the seed. The servo is the cell's own, unchanged.
+
+    Args:
+        gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
+            the tag is not seen.
 
     Source: the kinematic model of the design note, section B.3, with a V-groove for the side wall.
     """
     rng = np.random.default_rng(seed)
-    settings = groove_config(config)
     root = SeamCurve.from_points(seam.points, seam.up)
-    plan = planned_seam(seam, budget, rng)
+    plan = planned_seam(seam, budget, rng) if plan is None else plan
+    settings = with_touch_place(plan, groove_config(config))
     groove = Groove(root.raised(SEAT_M), gaps, roughness(root.length, budget, rng), budget.friction)
     torch_line = groove.line.raised(settings.clearance_m) if settings.clearance_m else groove.line
     reason: str | None = None
@@ -91,6 +100,7 @@ def simulate(
     newest: DeflectionSample | None = None
     blend = 1.0 if budget.lag_s <= 0.0 else 1.0 - math.exp(-dt / budget.lag_s)
     next_frame, stopped, rows = 0.0, 0, []
+    commands: list[WeldingCommand] = []
     for k in range(int(time_limit_s / dt)):
         t = k * dt
         centre = tip.step(p, dt)
@@ -98,10 +108,11 @@ def simulate(
         if t >= next_frame - 1e-9:
             next_frame += FRAME_PERIOD_S
             deflection = yaw @ (R.T @ (centre - p)) + rng.normal(0.0, 1.0, 3) * budget.tag_sigma_m + bias
-            queue.append(DeflectionSample(t, X_BT, deflection, True))
+            queue.append(DeflectionSample(t, X_BT, deflection, not hidden_s[0] <= t < hidden_s[1]))
         while queue and queue[0].capture_time + budget.latency_s <= t + 1e-9:
             newest = queue.pop(0)
         state, command = welding_step(state, ServoSample(t, X_BT, newest), plan, settings)
+        commands.append(command)
         d = command.diagnostics
         rows.append(
             (t, PHASES.index(command.phase), float(command.torch_on), *(p + R @ settings.p_TW), *p, *centre,
@@ -116,7 +127,7 @@ def simulate(
             break
         V = V + blend * (command.V_BT - V)
         R, p = _turned(R, V[:3] * dt, k), p + V[3:] * dt
-    return StudyRun(np.array(rows), torch_line, plan.raised(SEAT_M), state, reason or state.reason)
+    return StudyRun(np.array(rows), torch_line, plan.raised(SEAT_M), tuple(commands), state, reason or state.reason)
 
 
 def _lost(line: SeamCurve, p: Array) -> bool:

@@ -111,6 +111,15 @@ ROWS: tuple[Row, ...] = (
             Target("travel_error_deg", 0.1, unit="deg"),
         ),
     ),
+    *(
+        Row(
+            f"space_{um}um",
+            f"the same L on R 300 mm, tag noise {um} um: what of the error is noise",
+            (Case("l_r20_on_r300", f"kinematic_{um}um"),),
+            (Target("space_mm", 0.03),),
+        )
+        for um in (0, 5, 10)
+    ),
 )  # fmt: skip
 
 _LAWS = ("printed", "literal", "open", "fixed", "dls", "guarded")

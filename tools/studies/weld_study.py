@@ -87,7 +87,7 @@ def study_config(case: Case) -> ServoConfig:
     """
     config = ServoConfig(
         tool=ToolGeometry(torch_offset_m=case.chord_m),
-        touch=TouchConfig(calibrate_gain=True, zero_frames=10),
+        touch=TouchConfig(calibrate_gain=True, zero_frames=30, feel_start=True),
         weld_speed_m_s=case.speed_m_s,
         law=case.law,
     )

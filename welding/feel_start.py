@@ -1,0 +1,144 @@
+"""The seam's start by feel: the seated tip is drawn back over it, so that the torch begins on ground that was felt."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from weldcal.welding.contact import contact_lost
+from weldcal.welding.evolve import changed
+from weldcal.welding.plan_fit import add_point
+from weldcal.welding.refinement import PendingPoint, RefinedSeam
+from weldcal.welding.seam import SeamCurve
+from weldcal.welding.servo_state import ServoConfig, ServoSample, WeldingState
+from weldcal.welding.vectors import Array, clip, dot
+
+BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH that are taken here
+
+_STRAIGHT_RAD = math.radians(10.0)  # where the plan turns by more than this
+_BESIDE_M = 4.0e-3  # within this before and after is no place to come down beside
+_REACH_M = 0.030  # nor is what lies farther than this from the start
+_SETTLED_M = 0.15e-3
+_REENTRY_M = 12.0e-3
+_LEAST_STEP_M = 0.03e-3
+
+
+def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
+    """The settings with a touch place that can be touched: the first straight stretch, where the start is a bend.
+
+    Beside a bend of about the touch's offset there is no telling which part of the seam the tip meets. Only a tip that
+    then feels its way back (`touch.feel_start`) may begin so far on.
+    """
+    touch = config.touch
+    if not touch.feel_start:
+        return config
+    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.contact.end_window_m), touch.arc_m + 1e-6), 1e-3)
+    turn = np.sum(plan.tangent(s - _BESIDE_M) * plan.tangent(s + _BESIDE_M), axis=1)
+    straight = np.flatnonzero(turn > math.cos(_STRAIGHT_RAD))
+    place = float(s[straight[0] if len(straight) else np.argmax(turn)])
+    return replace(config, touch=replace(touch, arc_m=place))
+
+
+def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:
+    """The state of a tip that is seated and sets off backwards."""
+    return changed(state, proven=True, v_tip=0.0, touch=replace(state.touch, step="back", since=now))
+
+
+def feel_start_step(
+    before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
+) -> tuple[WeldingState, tuple[float, float, float], str | None, bool]:
+    """One tick of it: back until contact is lost, or six millimetres past the plan's start; then up, and in again.
+
+    Args:
+        before: the state before this tick's frame, `is_new`: whether there is one.
+
+    Returns:
+        (state, wanted speeds along, to the left and up m/s, fault sentence or None, whether the tip is ready to track).
+    """
+    assert state.plan_fit is not None
+    assert state.measurement is not None
+    curve, limits, t, last = state.plan_fit.curve, config.contact, state.touch, state.measurement
+    p_BT = np.asarray(sample.X_BT.translation())
+    here = last.point + (p_BT - last.p_BT) if t.step == "back" else p_BT
+    s = curve.nearest(here, state.s_tip)
+    state = changed(state, s_tip=s)
+    if t.step == "back":
+        if is_new and contact_lost(before, state, config):
+            return _start_found(before, state, sample.time, config), (0.0, 0.0, 0.0), None, False
+        if is_new:
+            point = PendingPoint(last.point, curve.nearest(last.point, s) - curve.nearest(last.p_BT, s))
+            state = changed(state, touch=replace(t, felt=(*t.felt, point)))
+        if s < -limits.end_window_m:
+            # Still in the groove: it begins before the plan does, and the weld begins where the plan says.
+            return _ready(changed(state, proven=True), p_BT, config), (0.0, 0.0, 0.0), None, True
+        lateral = config.k_p * (config.delta_d_m - state.delta_n)
+        upward = config.k_z * (state.delta_axial - config.axial_d_m)
+        return state, (-config.touch.search_m_s, lateral, upward), None, False
+    # Out of the groove: centred and raised, so that it lifts the tip when it comes back, as after a gap.
+    seam = curve.frame(s)
+    gap = p_BT - seam.position
+    side = state.residual_at_loss[0] - dot(gap, seam.normal)
+    height = state.residual_at_loss[1] - limits.hover_m - dot(gap, seam.up)
+    servo = (config.k_follow * side, config.k_follow * height)
+    if t.step == "lift":
+        settled = math.hypot(side, height) < _SETTLED_M and sample.time - t.since > limits.regain_after_s
+        if settled:
+            state = changed(state, touch=replace(t, step="enter", since=sample.time), lost_at=s, regained=0)
+        return state, (0.0, *servo), None, False
+    if is_new:
+        state = changed(state, regained=state.regained + 1 if state.delta_axial > limits.regain_axial_m else 0)
+    if state.regained >= limits.regain_frames:
+        return _ready(changed(state, proven=False, regained=0), p_BT, config), (0.0, *servo), None, True
+    if s - state.lost_at > _REENTRY_M:
+        text = "The tip left the seam's start and did not find it again; check the groove there."
+        return state, (0.0, 0.0, 0.0), text, False
+    return state, (config.touch.search_m_s, *servo), None, False
+
+
+def _start_found(before: WeldingState, state: WeldingState, now: float, config: ServoConfig) -> WeldingState:
+    """The state once contact went: what was felt while it was going is dropped, and the seam starts where it went."""
+    assert before.measurement is not None
+    assert state.plan_fit is not None
+    felt = state.touch.felt[: max(0, len(state.touch.felt) - config.refinement.frames_to_commit)]
+    curve = state.plan_fit.curve
+    residual = np.zeros(2)
+    if felt:
+        last = np.array([q.point for q in felt[-8:]])
+        s = curve.project(last, state.s_tip, 0.02)
+        gap = last - curve.position(s)
+        residual = np.array((np.sum(gap * curve.normal(s), axis=1).mean(), np.sum(gap * curve.up(s), axis=1).mean()))
+    touch = replace(state.touch, step="lift", since=now, felt=felt)
+    return changed(
+        state, touch=touch, residual_at_loss=residual, start_point=before.measurement.point, steer=0.0, felt=0.0
+    )
+
+
+def _ready(state: WeldingState, p_BT: Array, config: ServoConfig) -> WeldingState:
+    """The state with what was felt on the way back as the first of the refined seam, and the plan moved onto it.
+
+    Forwards friction holds the tip back behind its rest point by as much as it held it ahead on the way back; the path's
+    parameter is the rest point's progress, so that a point's is its arc length and that lag.
+    """
+    assert state.plan_fit is not None
+    felt = state.touch.felt[::-1]
+    plan_fit = state.plan_fit
+    for q in felt:
+        plan_fit = add_point(plan_fit, q.point, plan_fit.curve.nearest(q.point, state.s_tip, 0.05), config.plan_fit)
+    curve = plan_fit.curve
+    points: list[Array] = []
+    arcs: list[float] = []
+    for q in felt:
+        arc = curve.nearest(q.point, state.s_tip, 0.05) + max(q.arc, 0.0)
+        if not arcs or arc > arcs[-1] + _LEAST_STEP_M:
+            points.append(q.point)
+            arcs.append(arc)
+    refined = RefinedSeam(np.array(points), np.array(arcs)) if points else state.refined
+    s = curve.nearest(p_BT, state.s_tip, 0.02)
+    start = state.start_point
+    if start is not None:
+        reach = config.contact.end_window_m
+        at = curve.nearest(start, 0.0, 0.02)
+        start = start + (clip(at, -reach, reach) - at) * curve.frame(at).tangent
+    return changed(state, plan_fit=plan_fit, refined=refined, s_tip=s, progress=s, start_point=start)

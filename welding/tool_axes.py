@@ -1,0 +1,58 @@
+"""The tool in its seam: chord and axes that every steering law moves by, and the roll that holds the work angle."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from pydrake.math import RigidTransform
+
+from weldcal.welding.servo_state import ServoConfig
+from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
+
+
+class ToolAxes(NamedTuple):
+    """The tool at a tick, all in B.
+
+    `rest`: point T (3,) m; `left`: y_T (3,); `chord`: torch to rest point (3,) m, `d` long; `along`: its direction u;
+    `across`: the paper's n_d, level and to the left; `yaw`: the axis u x n_d that turns the chord towards n_d;
+    `up`: between the seam's at tip and torch.
+    """
+
+    rest: Array
+    left: Array
+    chord: Array
+    d: float
+    along: Array
+    across: Array
+    yaw: Array
+    up: Array
+
+    @property
+    def torch(self) -> Array:
+        """The torch point (3,) m."""
+        return self.rest - self.chord
+
+
+def tool_axes(X_BT: RigidTransform, tip_up: Array, torch_up: Array, config: ServoConfig) -> ToolAxes:
+    """The axes of a tool at X_BT above a seam whose up-normals (3,) at tip and torch are given."""
+    R = X_BT.rotation().matrix()
+    chord = -(R @ config.p_TW)
+    d = norm(chord)
+    along = chord / d
+    up = unit(tip_up + torch_up, tip_up)
+    left = R[:, 1]
+    across = unit(cross(up, along), left)
+    return ToolAxes(X_BT.translation(), left, chord, d, along, across, cross(along, across), up)
+
+
+def height_share(axes: ToolAxes, torch_up: Array) -> float:
+    """How much of the yaw axis stands along the torch's up (3,): what pitch divides by, never under 0.2."""
+    share = dot(axes.yaw, torch_up)
+    return share if abs(share) > 0.2 else math.copysign(0.2, share)
+
+
+def roll_rate(axes: ToolAxes, torch_up: Array, config: ServoConfig) -> float:
+    """The rate rad/s about the chord that brings the lean across it to the wanted work angle."""
+    lean = math.asin(clip(dot(axes.left, torch_up), -1.0, 1.0)) - config.work_angle_rad
+    return clip(-config.k_roll * lean, -0.3, 0.3)
