@@ -46,9 +46,7 @@ def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> RigidTr
     return RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), eye)
 
 
-def cast(
-    meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int
-) -> NDArray[np.float64]:
+def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> NDArray[np.float64]:
     """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
     import open3d
 
@@ -72,7 +70,9 @@ def random_pose(rng: np.random.Generator, part: Workpiece, tilt_rad: float, spre
     """X_BP of a part wedged up on the table: any turn, a tilt up to `tilt_rad` in any direction, its underside free."""
     heading, tilt = rng.uniform(-math.pi, math.pi), tilt_rad * math.sqrt(rng.uniform())
     axis = tilt * np.array([math.cos(heading), math.sin(heading)])
-    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi))
+    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
+        rng.uniform(-math.pi, math.pi)
+    )
     corners = np.array([[*xy, -part.size_m[2]] for xy in part.outline_P])
     lift = -float((corners @ R.matrix().T)[:, 2].min()) + 0.0005
     x, y = np.array([0.6, 0.0]) + rng.uniform(-spread_m, spread_m, size=2)
@@ -100,7 +100,9 @@ def scan_part(
     far = distance_m if distance_m is not None else min(0.93, 0.97 * scanner.far_m)
     around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
     target = np.array([0.6, 0.0, 0.02])
-    eye = target + far * np.array([math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)])
+    eye = target + far * np.array(
+        [math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)]
+    )
     X_BC = looking_at(eye, target)
     X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.3, 0.3)), eye)
     cloud = cast([part.mesh.transformed(X), table(), *others], X_BC, scanner, seed)
