@@ -218,7 +218,7 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
 
 def _profile(f: Floats, line: Line, groove: CoarseGroove, config: GrooveConfig) -> Profile:
     """The groove's cross-section over its whole length, from the coarse line."""
-    s, n, beside = line.coordinates(f[:, :2])
+    _, n, beside = line.coordinates(f[:, :2])
     beside &= np.abs(n) < 0.5 * groove.width_m + BAND_M + 0.003
     n, z = n[beside], f[beside, 2]
     if groove.width_m < config.least_pitches * groove.pitch_m * 0.7:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -36,7 +37,7 @@ def split_legs(line: Line, profile: Profile) -> tuple[list[Line], list[Corner]]:
     blind = 2.0 * half_width + 0.002
     bounds = [0.0, *turns, line.length]
     legs, corners = [], []
-    for k, (a, b) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+    for k, (a, b) in enumerate(pairwise(bounds)):
         low = a + blind if k > 0 else a
         high = b - blind if k < len(turns) else b
         inside = (line.s >= low) & (line.s <= high)

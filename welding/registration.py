@@ -14,7 +14,7 @@ because a scanner loses its last pixel more often at the edges that face away fr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -36,6 +36,7 @@ from weldcal.welding.planes import (
     turned,
     upward_planes,
 )
+from weldcal.welding.pose_covariance import moved_covariance, outline_covariance, pose_covariance, seam_sigma
 
 
 class WorkpieceNotFound(WeldcalError):
@@ -68,6 +69,9 @@ class WorkpieceRegistration:
     supported, contradicted   shares of the outline where the scan confirms, or denies, that the face ends there
     confidence        supported less contradicted, 0 to 1
     n_points          points on the face
+    covariance        (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation then translation
+    seam_sigma_m      what that covariance makes of the drawn seam: rms over it of the sigma sideways in the face, m.
+                      The groove's own displacement against the outline comes on top and is not seen here.
     """
 
     X_BP: RigidTransform
@@ -78,6 +82,14 @@ class WorkpieceRegistration:
     contradicted: float
     confidence: float
     n_points: int
+    covariance: Floats
+    seam_sigma_m: float
+
+    def turned_round(self, workpiece: Workpiece) -> WorkpieceRegistration:
+        """The same with the part turned by 180 deg about the middle of its outline."""
+        turn = turned(*(2.0 * workpiece.outline_P.mean(axis=0)).tolist(), math.pi)
+        covariance = moved_covariance(self.covariance, turn)
+        return replace(self, X_BP=self.X_BP @ turn, covariance=covariance)
 
 
 def register_workpiece(
@@ -85,13 +97,16 @@ def register_workpiece(
     workpiece: Workpiece,
     X_BP_guess: RigidTransform,
     config: RegistrationConfig | None = None,
+    eye_B: npt.ArrayLike | None = None,
 ) -> WorkpieceRegistration:
     """Finds the plate in a scan (N,3) or (H,W,3), metres in base, NaN where unmeasured, near a guess.
 
+    `eye_B` (3,): where the scanner stands; it only serves the covariance, which assumes a usual slant without it.
     A rectangle looks the same after half a turn: the guess decides. Raises WorkpieceNotFound when the scan shows no
     such plate there, InputError for a scan of the wrong shape.
     """
     config = config or RegistrationConfig()
+    eye = None if eye_B is None else np.asarray(eye_B, dtype=np.float64)
     points = np.asarray(points_B, dtype=np.float64)
     if points.ndim < 2 or points.shape[-1] != 3:
         raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
@@ -116,11 +131,11 @@ def register_workpiece(
             best = (score, X_BP_guess @ X_GQ @ X_QP)
     if best is None:
         raise WorkpieceNotFound("The scan shows no flat face where the workpiece should be: check the guess.")
-    return _refine(points, workpiece, best[1], config)
+    return _refine(points, workpiece, best[1], config, eye)
 
 
 def _refine(
-    points: Floats, workpiece: Workpiece, X_BP: RigidTransform, config: RegistrationConfig
+    points: Floats, workpiece: Workpiece, X_BP: RigidTransform, config: RegistrationConfig, eye_B: Floats | None
 ) -> WorkpieceRegistration:
     """Plane and outline by least squares from a pose good to a few millimetres, then the check against the drawing."""
     not_found = f"The scan shows no plate of {' x '.join(f'{1e3 * v:.0f}' for v in workpiece.size_m[:2])} mm there: "
@@ -133,6 +148,10 @@ def _refine(
     X_PQ, sigma = robust_plane(p[above])
     X_BP = X_BP @ X_PQ
 
+    slant = None
+    if eye_B is not None:
+        sight = eye_B - X_BP.translation()
+        slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
     band = max(4.0 * sigma, 0.0003)
     pitch, inset, fit_rms = 0.0, 0.0, math.inf
     for gate in (0.008, 0.004, 0.002):
@@ -143,7 +162,7 @@ def _refine(
         rims, edges = _outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise WorkpieceNotFound(not_found + "too little of its outline is in view.")
-        X_PP, inset, fit_rms = _fit_outline(rims, edges, outline, pitch)
+        X_PP, inset, fit_rms, in_plane = _fit_outline(rims, edges, outline, pitch, slant)
         X_BP = X_BP @ X_PP
 
     p = into(X_BP, points)
@@ -160,6 +179,7 @@ def _refine(
         raise WorkpieceNotFound(not_found + visible + "; clear the view or scan from higher up.")
     inside = inside_loops(p[:, :2], [core])
     on_face = flat & inside
+    covariance = pose_covariance(p[on_face], in_plane, pitch)
     return WorkpieceRegistration(
         X_BP=X_BP,
         rms_m=float(np.sqrt(np.mean(np.square(p[on_face, 2])))),
@@ -169,6 +189,8 @@ def _refine(
         contradicted=contradicted,
         confidence=max(0.0, supported - contradicted),
         n_points=int(np.count_nonzero(on_face)),
+        covariance=covariance,
+        seam_sigma_m=seam_sigma(covariance, workpiece),
     )
 
 
@@ -240,9 +262,10 @@ def _outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tupl
 
 
 def _fit_outline(
-    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float
-) -> tuple[RigidTransform, float, float]:
-    """The motion in the plane that puts outermost points (M,2) on their edges, the inset found and the rms left, m.
+    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None
+) -> tuple[RigidTransform, float, float, Floats]:
+    """The motion in the plane that puts outermost points (M,2) on their edges, the inset found, the rms left, m, and
+    the covariance (3,3) of x, y and turn.
 
     The scanner's last point on the face lies up to a pitch inside the edge; that inset is one more unknown, the same at
     all edges and held near half a pitch, so that it cancels where opposite edges are seen.
@@ -267,7 +290,9 @@ def _fit_outline(
         bounds=(np.append(-limit, -0.1 * pitch), np.append(limit, 1.3 * pitch)),
     )
     off = residuals(fit.x)[:-1]
-    return turned(*fit.x[:3]), float(fit.x[3]), float(np.sqrt(np.mean(np.square(off))))
+    rms = float(np.sqrt(np.mean(np.square(off))))
+    covariance = outline_covariance(np.asarray(fit.jac), off, edges, pitch, prior, slant_rad)
+    return turned(*fit.x[:3]), float(fit.x[3]), rms, covariance
 
 
 def _displaced(
