@@ -183,11 +183,7 @@ def _decided(
     found = turns[chosen]
     confidence = float(np.clip(found.confidence * (1.0 - max(0.0, other - 0.5)), 0.0, 1.0))
     word = "high" if confidence > 0.85 else "fair" if confidence > 0.65 else "low"
-    words = (
-        f"{word} confidence {confidence:.2f}: {100 * found.supported:.0f} % of the outline seen where it is drawn, "
-        f"{100 * found.contradicted:.0f} % denied, next best place {100 * other:.0f} % as good; {why}; "
-        f"the drawn seam is known to {1e3 * found.seam_sigma_m:.2f} mm"
-    )
+    words = f"{word} confidence {confidence:.2f}: {found.words}; the next best place is {100 * other:.0f} % as good, and {why}"
     turned_groove = grooves[1 - chosen] if len(grooves) == 2 else None
     return FoundWorkpiece(found, other, grooves[chosen], turned_groove, confidence, words)
 
@@ -299,9 +295,9 @@ def _groove_agreement(
             out.append(None)
             continue
         reach = config.groove_reach_m
-        seen = cKDTree(plane[:, :2]).query(drawn)[0] < 3.0 * half_width
-        hit = cKDTree(low).query(drawn)[0] < max(reach, pitch)
-        miss = cKDTree(workpiece.seam_P[::4, :2]).query(low)[0] > half_width + reach
+        seen = np.asarray(cKDTree(plane[:, :2]).query(drawn)[0]) < 3.0 * half_width
+        hit = np.asarray(cKDTree(low).query(drawn)[0]) < max(reach, pitch)
+        miss = np.asarray(cKDTree(workpiece.seam_P[::4, :2]).query(low)[0]) > half_width + reach
         if np.count_nonzero(seen) < 0.3 * len(drawn):
             out.append(None)
             continue

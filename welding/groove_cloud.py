@@ -7,108 +7,23 @@ by them, and so again until it stays. Every figure carries a sigma, scaled by ho
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-
 import numpy as np
 import numpy.typing as npt
-from pydrake.math import RigidTransform
+from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.welding.groove_corner import Corner, round_corners, split_legs
+from weldcal.welding.groove_extent import ends_at_edges, one_lap, seen_extent
+from weldcal.welding.groove_follow import STATION_M, Slices, agreed, cut_slices, followed, measured_profile
 from weldcal.welding.groove_line import Line, smoothing_weights
-from weldcal.welding.groove_search import CoarseGroove, SearchConfig, find_grooves
-from weldcal.welding.groove_section import BAND_M, Profile, Section, fit_section
+from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain, SeveralGrooves
+from weldcal.welding.groove_search import CoarseGroove, find_grooves
+from weldcal.welding.groove_section import BAND_M, Profile
 from weldcal.welding.planes import Floats, into
 from weldcal.welding.seam import SeamCurve
 
-STATION_M = 0.001
-
-
-class GrooveNotFound(WeldcalError):
-    """The cloud shows no V-groove."""
-
-
-class SeveralGrooves(WeldcalError):
-    """The cloud shows more than one V-groove and nothing says which is meant."""
-
-
-class GrooveTooNarrow(WeldcalError):
-    """The scanner's points lie too far apart for this groove."""
-
-
-class GrooveUncertain(WeldcalError):
-    """The groove is there, but not known well enough to weld."""
-
-
-@dataclass(frozen=True)
-class GrooveConfig:
-    """Limits of the extraction.
-
-    least_pitches  a groove must be this many point distances wide
-    smoothing_m    width of the Gaussian along the seam
-    most_sigma_m   a root that is less certain than this, outside gaps, is refused
-    longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
-    """
-
-    search: SearchConfig = field(default_factory=SearchConfig)
-    least_pitches: float = 3.0
-    smoothing_m: float = 0.0045
-    most_sigma_m: float = 0.0005
-    longest_gap_m: float = 0.090
-    most_missing: float = 0.5
-    steepest_wall_rad: float = math.radians(82.0)
-
-
-@dataclass(frozen=True, eq=False)
-class GrooveSeam:
-    """A V-groove, by arc length from its start, every millimetre; metres and radians, in the cloud's frame A.
-
-    curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm
-    root, left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root
-    depth, angle         (N,) of the root below the face, and between the walls
-    sigma, sigma_height  (N,) standard deviations of the root sideways and in height
-    gaps                 (from, to) arc lengths that were bridged and not seen;
-    corners, apexes      arc lengths of tight corners, and (K,3) where the two sides meet there
-    ends_seen            whether first and last end lie at the edge of the face, not at the edge of what was seen
-    start                in words, which end is the start
-    X_AF                 the face: origin on it, z up out of it
-    """
-
-    curve: SeamCurve
-    root: Floats
-    left: Floats
-    right: Floats
-    s: Floats
-    depth: Floats
-    angle: Floats
-    sigma: Floats
-    sigma_height: Floats
-    gaps: tuple[tuple[float, float], ...]
-    corners: tuple[float, ...]
-    apexes: Floats
-    closed: bool
-    ends_seen: tuple[bool, bool]
-    start: str
-    X_AF: RigidTransform
-    pitch: float
-    face_sigma: float
-    n_sections: int
-
-    @property
-    def width(self) -> float:
-        """Median width of the opening, m."""
-        return float(np.median(np.linalg.norm(self.left - self.right, axis=1)))
-
-    @property
-    def half_angle(self) -> float:
-        """Half the median angle between the walls, rad."""
-        return 0.5 * float(np.median(self.angle))
-
-    @property
-    def typical_sigma(self) -> float:
-        """Rms over the seam of the root's sigma sideways, m."""
-        return float(np.sqrt(np.mean(np.square(self.sigma))))
+SIGMA_SCALE = 1.2  # of the slices' own sigmas: what neighbouring slices err together
+SIGMA_FLOOR_PITCHES = 0.02
 
 
 def extract_groove(
@@ -164,26 +79,6 @@ def _mm(p: Floats) -> str:
     return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * p))
 
 
-@dataclass(frozen=True, eq=False)
-class _Slices:
-    """Fitted sections along a line: where, and their sigma sideways and in height (not yet scaled)."""
-
-    s: Floats
-    sections: list[Section]
-    half_slice: float
-
-    def column(self, name: str) -> Floats:
-        return np.array([getattr(section, name) for section in self.sections], dtype=np.float64)
-
-    @property
-    def sigma(self) -> Floats:
-        return np.sqrt([section.covariance[0, 0] for section in self.sections])
-
-    @property
-    def sigma_height(self) -> Floats:
-        return np.sqrt([section.covariance[1, 1] for section in self.sections])
-
-
 def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A: npt.ArrayLike | None) -> GrooveSeam:
     """The groove's lines, refined from its coarse centre line."""
     f = into(groove.X_AQ, points)
@@ -192,6 +87,9 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
     near = np.all((f[:, :2] > low) & (f[:, :2] < high), axis=1)
     near &= (f[:, 2] > -config.search.max_depth_m) & (f[:, 2] < max(5.0 * groove.sigma_m, 0.003))
     f = f[near]
+    # Later lines stay within a few millimetres of this one: all that lies further off is left here.
+    rough = cKDTree(groove.line_Q[::4]).query(f[:, :2], distance_upper_bound=0.5 * groove.width_m + BAND_M + 0.012)[0]
+    f = f[np.isfinite(rough)]
     pitch, sigma = groove.pitch_m, groove.sigma_m
     overlap = round(0.030 / STATION_M)
     line = Line(groove.line_Q).even()
@@ -202,134 +100,25 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
         trim = min(groove.width_m, 0.25 * line.length)
         inner = (line.s >= trim) & (line.s <= line.length - trim)
         line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
-    profile = _profile(f, line, groove, config)
-    lines, corners = [line], []
+    profile = measured_profile(f, line, groove, config)
+    lines: list[Line] = [line]
+    corners: list[Corner] = []
     half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
     for step in range(4):
-        lines = [_followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
+        lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
         if step == 0:
             lines, corners = split_legs(lines[0], profile)
     whole = lines[0]
     if corners:
         whole, corners = round_corners(f, lines, corners, profile, sigma)
-    slices = _agreed(_slices(f, whole, profile, sigma, pitch, half_slice, corners))
+    slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
     return _finish(f, whole, slices, corners, groove, profile, config, start_A)
-
-
-def _profile(f: Floats, line: Line, groove: CoarseGroove, config: GrooveConfig) -> Profile:
-    """The groove's cross-section over its whole length, from the coarse line."""
-    _, n, beside = line.coordinates(f[:, :2])
-    beside &= np.abs(n) < 0.5 * groove.width_m + BAND_M + 0.003
-    n, z = n[beside], f[beside, 2]
-    if groove.width_m < config.least_pitches * groove.pitch_m * 0.7:
-        raise _too_narrow(groove.width_m, groove.pitch_m, config)
-    inner = np.abs(n) < 0.3 * groove.width_m
-    if np.count_nonzero(inner) < 20:
-        raise GrooveNotFound(
-            f"An opening {1e3 * groove.width_m:.1f} mm wide was seen, but nothing in it: look from above."
-        )
-    depth = -float(np.percentile(z[inner], 10.0))
-    slope = depth / (0.5 * groove.width_m)
-    guess = Profile((slope, slope), depth, slope_sigma=1.0, depth_sigma=1.0)
-    best = fit_section(n, z, (0.0, guess), groove.sigma_m, groove.pitch_m, faces_known=False)
-    if (
-        best is None
-        or best.agreeing < 0.2
-        or best.depth < 5.0 * groove.sigma_m
-        or max(best.slopes) > math.tan(config.steepest_wall_rad)
-    ):
-        raise GrooveNotFound(
-            f"An opening {1e3 * groove.width_m:.1f} mm wide and {1e3 * depth:.1f} mm deep was seen, but it has no two "
-            "sloping walls: it is a gap or a step, not a V-groove."
-        )
-    if best.width < config.least_pitches * groove.pitch_m:
-        raise _too_narrow(best.width, groove.pitch_m, config)
-    return Profile(best.slopes, best.depth)
-
-
-def _too_narrow(width: float, pitch: float, config: GrooveConfig) -> GrooveTooNarrow:
-    return GrooveTooNarrow(
-        f"The groove is {1e3 * width:.1f} mm wide and the scan's points are {1e3 * pitch:.1f} mm apart: "
-        f"{width / pitch:.1f} of the {config.least_pitches:.0f} point distances it takes; move the scanner nearer or use "
-        "a finer one."
-    )
-
-
-def _slices(
-    f: Floats, line: Line, profile: Profile, sigma: float, pitch: float, half_slice: float, corners: list[Corner]
-) -> _Slices:
-    """Sections one beside the other along a line, each from points of its own; none within reach of a sharp corner."""
-    half_width = profile.depth / min(profile.slopes)
-    s, n, beside = line.coordinates(f[:, :2])
-    # What lies deeper than the root is the table beyond the plate's edge.
-    beside &= (np.abs(n) < half_width + BAND_M + 0.002) & (f[:, 2] > -1.3 * profile.depth - 4.0 * sigma)
-    order = np.argsort(s[beside])
-    s, n, z = (v[beside][order] for v in (s, n, f[:, 2]))
-    centers = np.arange(half_slice, line.length, 2.0 * half_slice)
-    bounds = np.searchsorted(s, np.append(centers - half_slice, centers[-1] + half_slice))
-    keep, sections = [], []
-    for k, center in enumerate(centers):
-        if any(abs(center - c.s) < c.blind for c in corners):
-            continue
-        part = slice(bounds[k], bounds[k + 1])
-        section = fit_section(n[part], z[part], (0.0, profile), sigma, pitch)
-        if section is None or section.agreeing < 0.4 or not 0.5 < section.depth / profile.depth < 1.6:
-            continue
-        if abs(section.centre) < half_width and math.sqrt(section.covariance[0, 0]) < 0.4 * half_width:
-            keep.append(center)
-            sections.append(section)
-    return _Slices(np.array(keep), sections, half_slice)
-
-
-def _agreed(slices: _Slices) -> _Slices:
-    """Without the sections that have few points, or that their neighbours deny."""
-    if len(slices.s) < 5:
-        return slices
-    points = np.array([sum(x.on_walls) for x in slices.sections])
-    good = points >= max(5.0, 0.35 * float(np.median(points)))
-    for name, least in (("centre", 2e-4), ("root", 4e-4)):
-        value = slices.column(name)
-        # Median of the five before and the five behind: one-sided at an end, where most of the wrong ones are.
-        around = np.array([np.median(value[max(0, k - 5) : k + 6]) for k in range(len(value))])
-        off = np.abs(value - around)
-        good &= off < max(least, 6.0 * float(np.median(off)))
-    return _Slices(
-        slices.s[good], [x for x, keep in zip(slices.sections, good, strict=True) if keep], slices.half_slice
-    )
-
-
-def _followed(
-    f: Floats,
-    line: Line,
-    profile: Profile,
-    sigma: float,
-    pitch: float,
-    half_slice: float,
-    config: GrooveConfig,
-    settled: bool,
-) -> Line:
-    """The line moved to where its sections have their centres, smoothly."""
-    slices = _slices(f, line, profile, sigma, pitch, half_slice, [])
-    slices = _agreed(slices) if settled else slices
-    if len(slices.s) < 5:
-        raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
-    r, weight = slices.column("centre"), slices.sigma
-    at = np.arange(0.0, line.length + STATION_M, STATION_M)
-    # Wider than the last smoothing: moving a line again and again keeps ever more of the noise.
-    width = FOLLOW * max(config.smoothing_m, 2.0 * half_slice)
-    for _ in range(2):
-        smooth = smoothing_weights(slices.s, slices.s, weight, width) @ r
-        off = np.abs(r - smooth)
-        # A section that its neighbours deny counts for little.
-        weight = np.where(off > 4.0 * np.median(off) + 5e-5, 10.0, 1.0) * slices.sigma
-    W = smoothing_weights(np.clip(at, slices.s[0], slices.s[-1]), slices.s, weight, width)
-    return line.moved(at, W @ r)
 
 
 def _finish(
     f: Floats,
     line: Line,
-    slices: _Slices,
+    slices: Slices,
     corners: list[Corner],
     groove: CoarseGroove,
     profile: Profile,
@@ -340,9 +129,9 @@ def _finish(
     if len(slices.s) < 5:
         raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
     pitch = groove.pitch_m
-    first, last, gaps = _extent(f, line, profile, slices, groove)
+    first, last, gaps = seen_extent(f, line, profile, slices, groove)
     if groove.closed:
-        first, last, gaps = _one_lap(line, gaps)
+        first, last, gaps = one_lap(line, gaps)
     missing = sum(b - a for a, b in gaps)
     longest = max((b - a for a, b in gaps), default=0.0)
     if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
@@ -395,7 +184,7 @@ def _finish(
     depth = 0.5 * (smooth["face_left"] + smooth["face_right"]) - smooth["root"]
     R, p = groove.X_AQ.rotation().matrix(), groove.X_AQ.translation()
     lines = [v @ R.T + p for v in (root, left, right)]
-    ends_seen = _ends_seen(f, base, at, line, profile, pitch) if not groove.closed else (True, True)
+    ends_seen = ends_at_edges(f, base, at, line, profile, pitch) if not groove.closed else (True, True)
     corners = [c for c in corners if first < c.s < last]
     corner_s = [c.s - first for c in corners]
     apexes = np.array([[*c.apex, np.interp(c.s, at, smooth["root"])] for c in corners]).reshape(-1, 3) @ R.T + p
@@ -438,58 +227,3 @@ def _finish(
         face_sigma=groove.sigma_m,
         n_sections=len(slices.s),
     )
-
-
-SIGMA_SCALE = 1.2
-FOLLOW = 3.0
-SIGMA_FLOOR_PITCHES = 0.02
-
-
-def _extent(
-    f: Floats, line: Line, profile: Profile, slices: _Slices, groove: CoarseGroove
-) -> tuple[float, float, list[tuple[float, float]]]:
-    """Where along the line the groove begins and ends, and what is not seen of it in between."""
-    half_width = profile.depth / min(profile.slopes)
-    s, n, beside = line.coordinates(f[:, :2])
-    centre = np.interp(s, slices.s, slices.column("centre"))
-    run = np.abs(n - centre)
-    expected = -profile.depth + min(profile.slopes) * run
-    beside &= (run < 0.75 * half_width) & (np.abs(f[:, 2] - expected) < 0.35 * profile.depth)
-    cell = max(0.0005, 0.75 * groove.pitch_m)
-    counts = np.bincount((s[beside] / cell).astype(int), minlength=3)
-    filled = np.flatnonzero(counts >= 1)
-    sturdy = filled[[np.count_nonzero(counts[max(0, k - 2) : k + 3]) >= 3 for k in filled]]
-    inside = np.sort(s[beside])
-    first = float(inside[np.searchsorted(inside, sturdy[0] * cell)])
-    last = float(inside[np.searchsorted(inside, (sturdy[-1] + 1) * cell) - 1])
-    jump = np.flatnonzero(np.diff(inside) > max(0.003, 3.0 * groove.pitch_m))
-    gaps = [(float(inside[k]), float(inside[k + 1])) for k in jump if first <= inside[k] and inside[k + 1] <= last]
-    # Half of a pitch is lost at each end, less what many rows make up for.
-    rows = max(1.0, 1.5 * half_width / groove.pitch_m)
-    loss = groove.pitch_m / (rows + 1.0)
-    return first - loss, last + loss, gaps
-
-
-def _one_lap(line: Line, gaps: list[tuple[float, float]]) -> tuple[float, float, list[tuple[float, float]]]:
-    """From the middle of the overlap round to itself."""
-    first = 0.015
-    start = line.at(np.array([first]))[0][0]
-    late = line.s > 0.5 * line.length
-    k = int(np.argmin(np.where(late, np.linalg.norm(line.points - start, axis=1), math.inf)))
-    last = float(line.s[k])
-    return first, last, [(max(a, first), min(b, last)) for a, b in gaps if b > first and a < last]
-
-
-def _ends_seen(f: Floats, base: Floats, at: Floats, line: Line, profile: Profile, pitch: float) -> tuple[bool, bool]:
-    """Whether the face beside the groove ends where the groove does: then it is the edge of the plate."""
-    half_width = profile.depth / min(profile.slopes)
-    s, n, beside = line.coordinates(f[:, :2])
-    strip = (
-        beside & (np.abs(n) > half_width + 0.001) & (np.abs(n) < half_width + BAND_M) & (f[:, 2] > -0.4 * profile.depth)
-    )
-    seen = []
-    for end, sign in ((at[0], -1.0), (at[-1], 1.0)):
-        beyond = sign * (s - end)
-        out, back = (beyond > 0.002) & (beyond < 0.008), (beyond > -0.008) & (beyond < -0.002)
-        seen.append(bool(np.count_nonzero(strip & out) < 0.25 * max(np.count_nonzero(strip & back), 1)))
-    return seen[0], seen[1]

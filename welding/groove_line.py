@@ -76,14 +76,16 @@ class Line:
         return Line(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
 
     def coordinates(self, xy: Floats) -> tuple[Floats, Floats, Mask]:
-        """(s, n) of points (M,2) by their nearest point on the line, and which lie beside it and not beyond its ends."""
-        nearest = np.asarray(cKDTree(self.points).query(xy)[1])
+        """(s, n) of points (M,2) by their nearest point on the line, and which lie within 30 mm beside it."""
+        nearest = np.asarray(cKDTree(self.points).query(xy, distance_upper_bound=0.03)[1])
+        far = nearest == len(self.points)
+        nearest = np.where(far, 0, nearest)
         gap = xy - self.points[nearest]
         along = np.sum(gap * self.tangents[nearest], axis=1)
         n = np.sum(gap * self.normals[nearest], axis=1)
         # Towards the centre of a bend the line runs faster than the point.
         along = np.clip(along / np.maximum(1.0 - n * self.curvatures[nearest], 0.3), -2.0 * STEP_M, 2.0 * STEP_M)
-        beside = ((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M)
+        beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
         return self.s[nearest] + along, n, beside
 
     def moved(self, s: Floats, left: Floats) -> Line:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from pydrake.math import RigidTransform
 from scipy.ndimage import gaussian_filter1d
-from scipy.sparse import coo_array
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from weldcal.welding.planes import Floats, Mask, into, point_pitch, robust_plane, upward_planes
@@ -105,7 +105,8 @@ def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> lis
         mine = label_of == label
         if stats[label, cv2.CC_STAT_AREA] * cell**2 < config.least_face_m2 or np.count_nonzero(mine & on) < 300:
             continue
-        X_QF, sigma = robust_plane(q[mine & on])
+        on_it = q[mine & on]
+        X_QF, sigma = robust_plane(on_it[:: max(1, len(on_it) // 20000)])
         f = into(X_QF, q[mine])
         sigma = 1.4826 * float(np.median(np.abs(f[np.abs(f[:, 2]) < max(0.003, 4.0 * sigma), 2])))
         out.append(sigma)
@@ -114,7 +115,7 @@ def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> lis
         below[index[mine][low, 1], index[mine][low, 0]] = 1
         level[index[mine][~low, 1], index[mine][~low, 0]] = 1
         inside = cv2.erode((labels == label).astype(np.uint8), _disc(5))
-        below = cv2.morphologyEx(below & inside, cv2.MORPH_CLOSE, _disc(5)) & inside
+        below = cv2.bitwise_and(cv2.morphologyEx(cv2.bitwise_and(below, inside), cv2.MORPH_CLOSE, _disc(5)), inside)
         back = X_QF.inverse()
         for line, closed, opening in _lines(below.astype(bool), level.astype(bool), cell, config):
             xyz = np.column_stack([line * cell + corner + 0.5 * cell, np.zeros(len(line))])
@@ -171,10 +172,10 @@ def _centre_line(mask: Mask) -> tuple[Floats, bool]:
     step = np.concatenate(steps)
     shape = (len(rows), len(rows))
 
-    def graph(cost: Floats, keep: Mask) -> coo_array:
+    def graph(cost: Floats, keep: Mask) -> csr_matrix:
         some = keep[ends[0]] & keep[ends[1]]
         a, b = ends[0][some], ends[1][some]
-        return coo_array((step[some] * 0.5 * (cost[a] + cost[b]), (a, b)), shape=shape)
+        return csr_matrix((step[some] * 0.5 * (cost[a] + cost[b]), (a, b)), shape=shape)
 
     everything = np.ones(len(rows), dtype=bool)
     plain = graph(np.ones(len(rows)), everything)

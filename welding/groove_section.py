@@ -137,7 +137,7 @@ def fit_section(
         if abs(change[0]) + abs(change[1]) / lever < 1e-6:
             break
     good = weights * sigma_point**2 > 0.25
-    counted = np.count_nonzero(on_wall)
+    counted = max(1, int(np.count_nonzero(on_wall)))
     on_left, on_right = (int(np.count_nonzero(good & on_wall & (left == side))) for side in (True, False))
     if x[1] >= min(faces) or on_left + on_right < 5:
         return None
@@ -147,9 +147,9 @@ def fit_section(
         root=float(x[1]),
         slopes=(float(x[2]), float(x[3])),
         faces=faces,
-        covariance=np.linalg.inv(information)[:2, :2],
+        covariance=np.asarray(np.linalg.inv(information)[:2, :2], dtype=np.float64),
         on_walls=(on_left, on_right),
-        agreeing=float(np.count_nonzero(good & on_wall) / max(counted, 1)),
+        agreeing=float(np.count_nonzero(good & on_wall) / counted),
         spread=spread,
     )
 

@@ -109,7 +109,7 @@ def robust_plane(p: Floats) -> tuple[RigidTransform, float]:
 def point_pitch(xy: Floats) -> float:
     """Typical distance between neighbouring scan points on the face, m."""
     some = xy[:: max(1, len(xy) // 1000)]
-    distance = np.asarray(cKDTree(xy).query(some, k=2)[0])
+    distance = np.asarray(cKDTree(xy, balanced_tree=False, compact_nodes=False).query(some, k=2)[0])
     return max(float(np.median(distance[:, 1])), 1e-4)
 
 

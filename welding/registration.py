@@ -85,9 +85,18 @@ class WorkpieceRegistration:
     covariance: Floats
     seam_sigma_m: float
 
+    @property
+    def words(self) -> str:
+        """What was found, for a person."""
+        return (
+            f"{100 * self.supported:.0f} % of the outline seen where it is drawn, {100 * self.contradicted:.0f} % denied; "
+            f"the drawn seam is known to {1e3 * self.seam_sigma_m:.2f} mm"
+        )
+
     def turned_round(self, workpiece: Workpiece) -> WorkpieceRegistration:
         """The same with the part turned by 180 deg about the middle of its outline."""
-        turn = turned(*(2.0 * workpiece.outline_P.mean(axis=0)).tolist(), math.pi)
+        x, y = 2.0 * workpiece.outline_P.mean(axis=0)
+        turn = turned(float(x), float(y), math.pi)
         covariance = moved_covariance(self.covariance, turn)
         return replace(self, X_BP=self.X_BP @ turn, covariance=covariance)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,12 +53,13 @@ def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset
 
     scene = open3d.t.geometry.RaycastingScene()
     for mesh in meshes:
-        tensors = (mesh.vertices.astype(np.float32), mesh.triangles.astype(np.uint32))
-        scene.add_triangles(*(open3d.core.Tensor(t) for t in tensors))
+        vertices: Any = mesh.vertices.astype(np.float32)
+        triangles: Any = mesh.triangles.astype(np.uint32)
+        scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles))
     flat = np.ones((scanner.height, scanner.width), dtype=np.float32)
     rays_C = depth_to_points(flat, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
     R, eye = X_BC.rotation().matrix(), X_BC.translation()
-    rays = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
+    rays: Any = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
     # The rays have unit depth, so what the caster calls distance is depth.
     depth = scene.cast_rays(open3d.core.Tensor(rays))["t_hit"].numpy()
     depth[~np.isfinite(depth)] = 0.0
