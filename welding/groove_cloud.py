@@ -14,16 +14,25 @@ from scipy.spatial import cKDTree
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.welding.groove_corner import Corner, round_corners, split_legs
 from weldcal.welding.groove_extent import ends_at_edges, one_lap, seen_extent
-from weldcal.welding.groove_follow import STATION_M, Slices, agreed, cut_slices, followed, measured_profile
+from weldcal.welding.groove_follow import (
+    STATION_M,
+    Slices,
+    agreed,
+    common_profile,
+    cut_slices,
+    followed,
+    measured_profile,
+)
 from weldcal.welding.groove_line import Line, smoothing_weights
 from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain, SeveralGrooves
 from weldcal.welding.groove_search import CoarseGroove, find_grooves
-from weldcal.welding.groove_section import BAND_M, Profile
+from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
 from weldcal.welding.planes import Floats, into
 from weldcal.welding.seam import SeamCurve
 
 SIGMA_SCALE = 1.2  # of the slices' own sigmas: what neighbouring slices err together
 SIGMA_FLOOR_PITCHES = 0.02
+ONE_SIDED_PITCHES = 0.2
 
 
 def extract_groove(
@@ -85,6 +94,7 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
     low = groove.line_Q.min(axis=0) - 0.03
     high = groove.line_Q.max(axis=0) + 0.03
     near = np.all((f[:, :2] > low) & (f[:, :2] < high), axis=1)
+    around = f[near & (f[:, 2] < 0.003)]
     near &= (f[:, 2] > -config.search.max_depth_m) & (f[:, 2] < max(5.0 * groove.sigma_m, 0.003))
     f = f[near]
     # Later lines stay within a few millimetres of this one: all that lies further off is left here.
@@ -108,15 +118,20 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
         lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
         if step == 0:
             lines, corners = split_legs(lines[0], profile)
+        else:
+            # One cutter made the whole groove: its angle and depth, once known, steady every slice.
+            longest = max(lines, key=lambda one: one.length)
+            profile = common_profile(cut_slices(f, longest, profile, sigma, pitch, half_slice, []), profile)
     whole = lines[0]
     if corners:
         whole, corners = round_corners(f, lines, corners, profile, sigma)
     slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
-    return _finish(f, whole, slices, corners, groove, profile, config, start_A)
+    return _finish(f, around, whole, slices, corners, groove, profile, config, start_A)
 
 
 def _finish(
     f: Floats,
+    around: Floats,
     line: Line,
     slices: Slices,
     corners: list[Corner],
@@ -132,8 +147,15 @@ def _finish(
     first, last, gaps = seen_extent(f, line, profile, slices, groove)
     if groove.closed:
         first, last, gaps = one_lap(line, gaps)
+    ends_seen = (True, True)
+    if not groove.closed:
+        ends_seen = ends_at_edges(around, (first, last), line, profile)
+        # At the edge of a shadow the last section is not to be trusted.
+        first = first if ends_seen[0] else max(first, float(slices.s[1]))
+        last = last if ends_seen[1] else min(last, float(slices.s[-2]))
     missing = sum(b - a for a, b in gaps)
     longest = max((b - a for a, b in gaps), default=0.0)
+    gaps = [(a, b) for a, b in gaps if a >= first and b <= last]
     if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
         raise GrooveUncertain(
             f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan again "
@@ -166,15 +188,24 @@ def _finish(
         errors[name] = SIGMA_SCALE * max(1.0, scale) * np.sqrt(np.square(W) @ np.square(spread))
     for a, b in gaps:
         hidden = (at > a) & (at < b)
-        bend = max(float(np.percentile(np.abs(line.curvatures), 95.0)), 2.0)
+        bend = max(line.tightest_bend(0.016), 2.0)
         errors["centre"][hidden] += 0.25 * bend * (at[hidden] - a) * (b - at[hidden])
+    # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
+    lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
+    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
     sigma = np.hypot(errors["centre"], SIGMA_FLOOR_PITCHES * pitch)
+    sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
     seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
         raise GrooveUncertain(
             f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan "
             f"(noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and "
             f"{1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
+        )
+    if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
+        raise GrooveUncertain(
+            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its way there is only known to "
+            f"{1e3 * np.max(sigma[~seen]):.1f} mm: clear the view or scan again from elsewhere."
         )
     base, normal = line.at(at)
     moved = base + smooth["centre"][:, None] * normal
@@ -184,7 +215,6 @@ def _finish(
     depth = 0.5 * (smooth["face_left"] + smooth["face_right"]) - smooth["root"]
     R, p = groove.X_AQ.rotation().matrix(), groove.X_AQ.translation()
     lines = [v @ R.T + p for v in (root, left, right)]
-    ends_seen = ends_at_edges(f, base, at, line, profile, pitch) if not groove.closed else (True, True)
     corners = [c for c in corners if first < c.s < last]
     corner_s = [c.s - first for c in corners]
     apexes = np.array([[*c.apex, np.interp(c.s, at, smooth["root"])] for c in corners]).reshape(-1, 3) @ R.T + p

@@ -30,6 +30,9 @@ def seen_extent(
     inside = np.sort(s[beside])
     first = float(inside[np.searchsorted(inside, sturdy[0] * cell)])
     last = float(inside[np.searchsorted(inside, (sturdy[-1] + 1) * cell) - 1])
+    # Beyond the last section that makes sense single points do not tell where the groove goes.
+    first = max(first, float(slices.s[0]) - 3.0 * slices.half_slice)
+    last = min(last, float(slices.s[-1]) + 3.0 * slices.half_slice)
     jump = np.flatnonzero(np.diff(inside) > max(0.003, 3.0 * groove.pitch_m))
     gaps = [(float(inside[k]), float(inside[k + 1])) for k in jump if first <= inside[k] and inside[k + 1] <= last]
     # Half of a pitch is lost at each end, less what many rows make up for.
@@ -48,16 +51,17 @@ def one_lap(line: Line, gaps: list[tuple[float, float]]) -> tuple[float, float, 
     return first, last, [(max(a, first), min(b, last)) for a, b in gaps if b > first and a < last]
 
 
-def ends_at_edges(f: Floats, base: Floats, at: Floats, line: Line, profile: Profile, pitch: float) -> tuple[bool, bool]:
-    """Whether the face beside the groove ends where the groove does: then it is the edge of the plate."""
+def ends_at_edges(f: Floats, ends: tuple[float, float], line: Line, profile: Profile) -> tuple[bool, bool]:
+    """Whether lower ground is seen beyond each end of the groove: then the plate ends there, and not only the view."""
     half_width = profile.depth / min(profile.slopes)
-    s, n, beside = line.coordinates(f[:, :2])
-    strip = (
-        beside & (np.abs(n) > half_width + 0.001) & (np.abs(n) < half_width + BAND_M) & (f[:, 2] > -0.4 * profile.depth)
-    )
+    tail = line.extended(0.010, 0.010)
+    s, n, beside = tail.coordinates(f[:, :2])
+    s = s - 0.010
+    strip = beside & (np.abs(n) < half_width + BAND_M)
     seen = []
-    for end, sign in ((at[0], -1.0), (at[-1], 1.0)):
+    for end, sign in zip(ends, (-1.0, 1.0), strict=True):
         beyond = sign * (s - end)
-        out, back = (beyond > 0.002) & (beyond < 0.008), (beyond > -0.008) & (beyond < -0.002)
-        seen.append(bool(np.count_nonzero(strip & out) < 0.25 * max(int(np.count_nonzero(strip & back)), 1)))
+        out = strip & (beyond > 0.002) & (beyond < 0.009)
+        ground = out & (f[:, 2] < -1.3 * profile.depth)
+        seen.append(bool(np.count_nonzero(ground) > max(5.0, 0.5 * np.count_nonzero(out))))
     return seen[0], seen[1]

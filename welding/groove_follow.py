@@ -15,7 +15,9 @@ from weldcal.welding.groove_section import BAND_M, Profile, Section, fit_section
 from weldcal.welding.planes import Floats
 
 STATION_M = 0.001
-FOLLOW = 3.0
+FOLLOW = 3.0  # times wider than the last smoothing: a line moved again and again keeps ever more of the noise
+SLOPE_SIGMA = 0.06  # relative, of a slice about the common profile: 2 deg between the walls of a 45 deg groove
+DEPTH_SIGMA = 0.10
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +69,14 @@ def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: Groove
     if best.width < config.least_pitches * groove.pitch_m:
         raise _too_narrow(best.width, groove.pitch_m, config)
     return Profile(best.slopes, best.depth)
+
+
+def common_profile(slices: Slices, profile: Profile) -> Profile:
+    """The median of the slices' profiles, from which the next ones may differ less."""
+    if len(slices.s) < 5:
+        return profile
+    left, right = np.median([x.slopes for x in slices.sections], axis=0)
+    return Profile((float(left), float(right)), float(np.median(slices.column("depth"))), SLOPE_SIGMA, DEPTH_SIGMA)
 
 
 def _too_narrow(width: float, pitch: float, config: GrooveConfig) -> GrooveTooNarrow:

@@ -47,6 +47,13 @@ class Line:
         """(N,) 1/m, positive to the left."""
         return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
 
+    def tightest_bend(self, over_m: float) -> float:
+        """Largest curvature of its chords over a length, 1/m."""
+        step = max(1, round(over_m / (self.length / (len(self.points) - 1))))
+        chords = self.points[step:] - self.points[:-step]
+        heading = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+        return float(np.max(np.abs(heading[step:] - heading[:-step]), initial=0.0)) / over_m
+
     def at(self, s: Floats) -> tuple[Floats, Floats]:
         """Points (M,2) and left normals (M,2) at arc lengths (M,); straight on beyond the ends."""
         inside = np.clip(s, 0.0, self.length)

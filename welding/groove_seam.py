@@ -38,14 +38,16 @@ class GrooveConfig:
     smoothing_m    width of the Gaussian along the seam
     most_sigma_m   a root that is less certain than this, outside gaps, is refused
     longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
+    most_bridge_sigma_m           how uncertain the line may be where it is bridged
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)
     least_pitches: float = 3.0
     smoothing_m: float = 0.0045
     most_sigma_m: float = 0.0005
-    longest_gap_m: float = 0.090
+    longest_gap_m: float = 0.045
     most_missing: float = 0.5
+    most_bridge_sigma_m: float = 0.0015
     steepest_wall_rad: float = math.radians(82.0)
 
 

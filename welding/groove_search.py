@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
 
 from weldcal.welding.planes import Floats, Mask, into, point_pitch, robust_plane, upward_planes
 
@@ -57,11 +58,9 @@ def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroov
     noise = 0.0
     for X in upward_planes(sample - center, config.steepest_rad, 120, rng, most=6):
         X_AQ = RigidTransform(center) @ X
-        for groove_or_noise in _in_plane(points, X_AQ, config):
-            if isinstance(groove_or_noise, float):
-                noise = max(noise, groove_or_noise)
-            else:
-                found.append(groove_or_noise)
+        here, noise_here = _in_plane(points, X_AQ, config)
+        found += here
+        noise = max(noise, noise_here)
     return _distinct(found), noise
 
 
@@ -80,48 +79,65 @@ def _lifted(groove: CoarseGroove) -> Floats:
     return np.asarray(line @ groove.X_AQ.rotation().matrix().T + groove.X_AQ.translation())
 
 
-def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> list[CoarseGroove | float]:
-    """The grooves of every separate face in one plane, each preceded by that face's noise."""
+def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> tuple[list[CoarseGroove], float]:
+    """The grooves of all faces in one plane, and the noise of the noisiest."""
     q = into(X_AQ, points)
-    q = q[(q[:, 2] > -config.max_depth_m) & (q[:, 2] < 0.006)]
+    q = q[(q[:, 2] > -0.15) & (q[:, 2] < 0.006)]
     on = np.abs(q[:, 2]) < 0.003
     if np.count_nonzero(on) < 300:
-        return []
+        return [], 0.0
     pitch = point_pitch(q[on][:, :2])
     cell = 1.25 * pitch
     corner = q[:, :2].min(axis=0) - 6.0 * cell
     width, height = (np.ceil((q[:, :2].max(axis=0) - corner) / cell).astype(int) + 6).tolist()
     index = ((q[:, :2] - corner) / cell).astype(np.int64)
-    face = np.zeros((height, width), dtype=np.uint8)
+    face, below, level = np.zeros((3, height, width), dtype=np.uint8)
     face[index[on, 1], index[on, 0]] = 1
     solid = cv2.morphologyEx(face, cv2.MORPH_CLOSE, _disc(3))
     across = max(3, math.ceil(config.max_width_m / cell)) | 1
     bridged = cv2.morphologyEx(solid, cv2.MORPH_OPEN, _disc(5))
     bridged = cv2.morphologyEx(cv2.morphologyEx(bridged, cv2.MORPH_CLOSE, _disc(across)), cv2.MORPH_OPEN, _disc(across))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(bridged)
-    out: list[CoarseGroove | float] = []
     label_of = labels[index[:, 1], index[:, 0]]
+    noise = 0.0
     for label in range(1, count):
         mine = label_of == label
         if stats[label, cv2.CC_STAT_AREA] * cell**2 < config.least_face_m2 or np.count_nonzero(mine & on) < 300:
             continue
-        on_it = q[mine & on]
-        X_QF, sigma = robust_plane(on_it[:: max(1, len(on_it) // 20000)])
-        f = into(X_QF, q[mine])
-        sigma = 1.4826 * float(np.median(np.abs(f[np.abs(f[:, 2]) < max(0.003, 4.0 * sigma), 2])))
-        out.append(sigma)
+        at, f = index[mine], q[mine]
+        X_QF, sigma = _thinned_plane(f[np.abs(f[:, 2]) < 0.003])
+        f = into(X_QF, f)
+        noise = max(noise, sigma)
         low = f[:, 2] < -max(4.0 * sigma, 0.0008)
-        below, level = np.zeros((2, height, width), dtype=np.uint8)
-        below[index[mine][low, 1], index[mine][low, 0]] = 1
-        level[index[mine][~low, 1], index[mine][~low, 0]] = 1
+        opening = np.zeros((height, width), dtype=np.uint8)
+        deep = low & (f[:, 2] > -config.max_depth_m)
+        opening[at[deep, 1], at[deep, 0]] = 1
+        level[at[~low, 1], at[~low, 0]] = 1
         inside = cv2.erode((labels == label).astype(np.uint8), _disc(5))
-        below = cv2.bitwise_and(cv2.morphologyEx(cv2.bitwise_and(below, inside), cv2.MORPH_CLOSE, _disc(5)), inside)
-        back = X_QF.inverse()
-        for line, closed, opening in _lines(below.astype(bool), level.astype(bool), cell, config):
-            xyz = np.column_stack([line * cell + corner + 0.5 * cell, np.zeros(len(line))])
-            in_face = into(back.inverse(), xyz)[:, :2]
-            out.append(CoarseGroove(X_AQ @ X_QF, in_face, closed, opening, sigma, pitch))
-    return out
+        opening = cv2.morphologyEx(cv2.bitwise_and(opening, inside), cv2.MORPH_CLOSE, _disc(5))
+        below = cv2.bitwise_or(below, cv2.bitwise_and(opening, inside))
+    # Lower ground in view outside every face ends a groove as a face does.
+    ground = (label_of == 0) & (q[:, 2] < -0.004)
+    level[index[ground, 1], index[ground, 0]] = 1
+    found = []
+    for line, closed, opening_m in _lines(below.astype(bool), level.astype(bool), cell, config):
+        xy = line * cell + corner + 0.5 * cell
+        beside = np.asarray(cKDTree(xy[::3]).query(q[on][:, :2], distance_upper_bound=0.02)[0])
+        near = q[on][np.isfinite(beside)]
+        if len(near) < 200:
+            continue
+        X_QF, sigma = _thinned_plane(near)
+        in_face = into(X_QF, np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
+        found.append(CoarseGroove(X_AQ @ X_QF, in_face, closed, opening_m, sigma, pitch))
+    return found, noise
+
+
+def _thinned_plane(q: Floats) -> tuple[RigidTransform, float]:
+    """The face through points (N,3), and their noise about it."""
+    some = q[:: max(1, len(q) // 20000)]
+    X_QF, sigma = robust_plane(some)
+    z = into(X_QF, some)[:, 2]
+    return X_QF, 1.4826 * float(np.median(np.abs(z[np.abs(z) < max(0.003, 4.0 * sigma)])))
 
 
 def _disc(size: int) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 from weldcal.welding.planes import Floats
 
 ITERATIONS = 12
+ENOUGH = 3  # points on a wall to be a wall
 BAND_M = 0.006  # of face beyond each shoulder that takes part
 
 
@@ -118,7 +119,7 @@ def fit_section(
         A = J.T @ (J * weights[:, None]) + np.diag(1.0 / prior_sigma**2)
         b = J.T @ (weights * residual) + (prior - x) / prior_sigma**2
         for side, edge in enumerate(edges):
-            enough = np.count_nonzero(on_wall & (left == (side == 0))) >= 8
+            enough = np.count_nonzero(on_wall & (left == (side == 0))) >= ENOUGH
             if edge is None or enough:
                 continue
             # The shoulder lies where the face was seen to end.
