@@ -7,6 +7,8 @@ by them, and so again until it stays. Every figure carries a sigma, scaled by ho
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -30,9 +32,11 @@ from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
 from weldcal.welding.planes import Floats, into
 from weldcal.welding.seam import SeamCurve
 
-SIGMA_SCALE = 1.2  # of the slices' own sigmas: what neighbouring slices err together
-SIGMA_FLOOR_PITCHES = 0.02
+SIGMA_SCALE = 1.1  # of the slices' own sigmas: what neighbouring slices err together
+SIGMA_FLOOR_PITCHES = 0.04
+SIGMA_FLOOR_NOISE = 0.15
 ONE_SIDED_PITCHES = 0.2
+LEAST_NOISE_M = 3e-5  # what a smooth profile itself misses
 
 
 def extract_groove(
@@ -193,7 +197,7 @@ def _finish(
     # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
     lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
     one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
-    sigma = np.hypot(errors["centre"], SIGMA_FLOOR_PITCHES * pitch)
+    sigma = np.hypot(errors["centre"], math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
     sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
     seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:

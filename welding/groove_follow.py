@@ -55,7 +55,8 @@ def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: Groove
     depth = -float(np.percentile(z[inner], 10.0))
     slope = depth / (0.5 * groove.width_m)
     guess = Profile((slope, slope), depth, slope_sigma=1.0, depth_sigma=1.0)
-    best = fit_section(n, z, (0.0, guess), groove.sigma_m, groove.pitch_m, faces_known=False)
+    # The coarse line wanders by a fraction of a millimetre, which on the walls looks like noise.
+    best = fit_section(n, z, (0.0, guess), max(groove.sigma_m, 2e-4), groove.pitch_m, faces_known=False)
     if (
         best is None
         or best.agreeing < 0.2
@@ -119,11 +120,12 @@ def agreed(slices: Slices) -> Slices:
         return slices
     points = np.array([sum(x.on_walls) for x in slices.sections])
     good = points >= max(5.0, 0.35 * float(np.median(points)))
-    for name, least in (("centre", 2e-4), ("root", 4e-4)):
+    for name, least in (("centre", 3e-4), ("root", 6e-4)):
         value = slices.column(name)
-        # Median of the five before and the five behind: one-sided at an end, where most of the wrong ones are.
-        around = np.array([np.median(value[max(0, k - 5) : k + 6]) for k in range(len(value))])
-        off = np.abs(value - around)
+        # Against a smooth curve through the others near it: a bend is not an outlier.
+        W = smoothing_weights(slices.s, slices.s, np.ones(len(value)), 3.0 * slices.half_slice)
+        own = np.diag(W)
+        off = np.abs(value - W @ value) / np.maximum(1.0 - own, 0.2)
         good &= off < max(least, 6.0 * float(np.median(off)))
     return Slices(slices.s[good], [x for x, keep in zip(slices.sections, good, strict=True) if keep], slices.half_slice)
 

@@ -16,6 +16,7 @@ from weldcal.welding.planes import Floats
 
 ITERATIONS = 12
 ENOUGH = 3  # points on a wall to be a wall
+WIDE_M = 0.0015  # how far off in z points may at first be, on a line that is not yet the groove's
 BAND_M = 0.006  # of face beyond each shoulder that takes part
 
 
@@ -91,7 +92,7 @@ def fit_section(
     prior = x.copy()
     prior_sigma = np.array([2.0 * half, profile.depth_sigma * profile.depth, *(profile.slope_sigma * slopes)])
     edges = _edges(n - centre, z, faces, half, sigma)
-    scale = max(2.5 * sigma, 1e-5)
+    scale = max(2.5 * sigma, WIDE_M)
     floor = max(sigma, 1e-5)
     weights = np.ones(len(n))
     information = np.eye(4)
@@ -112,7 +113,7 @@ def fit_section(
         if np.count_nonzero(on_wall) >= 6:
             spread = 1.4826 * float(np.median(np.abs(residual[on_wall])))
             # Shrinking slowly: the first residuals are those of a wrong centre.
-            scale = max(min(scale, 3.0 * spread if step > 2 else scale), 2.5 * floor)
+            scale = max(min(scale, 3.0 * spread if step > 1 else scale), 2.5 * floor)
         sigma_point = np.where(on_wall, max(scale / 2.5, floor), floor)
         u = residual / (sigma_point * 2.5)
         weights = 1.0 / (1.0 + u * u) ** 2 / sigma_point**2

@@ -17,17 +17,25 @@ from weldcal.welding.planes import Floats
 
 EDGE_PITCHES = 0.03  # error common to the points of an edge, in point distances
 SCATTER_PITCHES = 0.20  # what the outermost points of an edge scatter where their pixels' phases are mixed
-SLANT_PITCHES = 0.30  # error of an edge per tangent of the angle at which the face is seen
+EDGE_NOISES = 0.25  # error of an edge in the noise of the face: what flies off it is the more, the noisier the scanner
+SLANT_PITCHES = 0.15  # error of an edge per tangent of the angle at which the face is seen
 INSET_PITCHES = 0.25  # common to all edges
 USUAL_SLANT_RAD = math.radians(8.0)
 HEIGHT_FLOOR_M = 2e-6
 
 
 def outline_covariance(
-    J: Floats, off: Floats, edges: npt.NDArray[np.int64], pitch: float, prior_weight: float, slant_rad: float | None
+    J: Floats,
+    off: Floats,
+    edges: npt.NDArray[np.int64],
+    pitch: float,
+    prior_weight: float,
+    slant_rad: float | None,
+    noise: float,
 ) -> Floats:
     """(3,3) of x, y, turn from the Jacobian (M+1,4) of the outline fit, whose last row is the inset's prior, and the
-    distances (M,) of the outermost points from their edges, m. slant_rad: between the face's normal and the sight.
+    distances (M,) of the outermost points from their edges, m. slant_rad: between the face's normal and the sight; noise of the
+    face, m.
     """
     slant = math.tan(USUAL_SLANT_RAD if slant_rad is None else slant_rad)
     G = np.linalg.inv(J.T @ J) @ J.T
@@ -37,7 +45,7 @@ def outline_covariance(
         common = G[:, :-1][:, mine].sum(axis=1)
         # Along the pixel rows all points of an edge have one phase: they scatter little and err together.
         hidden = max(0.0, (SCATTER_PITCHES * pitch) ** 2 - float(np.var(off[mine])))
-        variance = hidden + pitch**2 * (EDGE_PITCHES**2 + (SLANT_PITCHES * slant) ** 2)
+        variance = hidden + pitch**2 * (EDGE_PITCHES**2 + (SLANT_PITCHES * slant) ** 2) + (EDGE_NOISES * noise) ** 2
         middle += np.outer(common, common) * variance
     middle += np.outer(G[:, -1], G[:, -1]) * (prior_weight * INSET_PITCHES * pitch) ** 2
     return np.asarray(middle[:3, :3])

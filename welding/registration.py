@@ -171,7 +171,7 @@ def _refine(
         rims, edges = _outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise WorkpieceNotFound(not_found + "too little of its outline is in view.")
-        X_PP, inset, fit_rms, in_plane = _fit_outline(rims, edges, outline, pitch, slant)
+        X_PP, inset, fit_rms, in_plane = _fit_outline(rims, edges, outline, pitch, slant, sigma)
         X_BP = X_BP @ X_PP
 
     p = into(X_BP, points)
@@ -271,7 +271,7 @@ def _outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tupl
 
 
 def _fit_outline(
-    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None
+    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None, noise: float
 ) -> tuple[RigidTransform, float, float, Floats]:
     """The motion in the plane that puts outermost points (M,2) on their edges, the inset found, the rms left, m, and
     the covariance (3,3) of x, y and turn.
@@ -300,7 +300,7 @@ def _fit_outline(
     )
     off = residuals(fit.x)[:-1]
     rms = float(np.sqrt(np.mean(np.square(off))))
-    covariance = outline_covariance(np.asarray(fit.jac), off, edges, pitch, prior, slant_rad)
+    covariance = outline_covariance(np.asarray(fit.jac), off, edges, pitch, prior, slant_rad, noise)
     return turned(*fit.x[:3]), float(fit.x[3]), rms, covariance
 
 
