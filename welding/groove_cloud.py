@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.welding.groove_corner import Corner, round_corners, split_legs
-from weldcal.welding.groove_extent import ends_at_edges, one_lap, seen_extent
+from weldcal.welding.groove_extent import ends_at_edges, refuse_flat_floor, seen_extent
 from weldcal.welding.groove_follow import (
     STATION_M,
     Slices,
@@ -62,7 +62,7 @@ def extract_groove(
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 1000:
         raise GrooveNotFound(f"The cloud has only {len(points)} points: move the workpiece into view.")
-    coarse, noise = find_grooves(points, config.search)
+    coarse, noise, pitch = find_grooves(points, config.search)
     seams: list[GrooveSeam] = []
     failures: list[WeldcalError] = []
     for groove in coarse:
@@ -74,10 +74,11 @@ def extract_groove(
         # A groove that was seen but cannot be used says more than an opening that is none.
         raise next((e for e in failures if not isinstance(e, GrooveNotFound)), failures[0])
     if not seams:
-        least = max(4.0 * noise, 0.0008)
+        depth = 2.0 * max(4.0 * noise, 0.0008)
         raise GrooveNotFound(
-            f"No groove in any flat face: one of at least {1e3 * config.search.shortest_m:.0f} mm length and at most "
-            f"{1e3 * config.search.max_width_m:.0f} mm width, deeper than {1e3 * 2.0 * least:.1f} mm, would be seen here."
+            f"No groove in any flat face: one longer than {1e3 * config.search.shortest_m:.0f} mm, deeper than "
+            f"{1e3 * depth:.1f} mm and from {1e3 * config.least_pitches * pitch:.1f} to "
+            f"{1e3 * config.search.max_width_m:.0f} mm wide would be seen with points {1e3 * pitch:.1f} mm apart."
         )
     if len(seams) == 1:
         return seams[0]
@@ -105,10 +106,9 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
     rough = cKDTree(groove.line_Q[::4]).query(f[:, :2], distance_upper_bound=0.5 * groove.width_m + BAND_M + 0.012)[0]
     f = f[np.isfinite(rough)]
     pitch, sigma = groove.pitch_m, groove.sigma_m
-    overlap = round(0.030 / STATION_M)
     line = Line(groove.line_Q).even()
     if groove.closed:
-        line = Line(np.vstack([groove.line_Q, groove.line_Q[:overlap]])).even()
+        line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
     else:
         # The farthest cells of an opening are its corners: the coarse line's ends lead there and not along it.
         trim = min(groove.width_m, 0.25 * line.length)
@@ -148,9 +148,10 @@ def _finish(
     if len(slices.s) < 5:
         raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
     pitch = groove.pitch_m
+    refuse_flat_floor(f, line, slices, profile)
     first, last, gaps = seen_extent(f, line, profile, slices, groove)
     if groove.closed:
-        first, last, gaps = one_lap(line, gaps)
+        first, last = 0.0, line.length
     ends_seen = (True, True)
     if not groove.closed:
         ends_seen = ends_at_edges(around, (first, last), line, profile)
@@ -192,7 +193,7 @@ def _finish(
         errors[name] = SIGMA_SCALE * max(1.0, scale) * np.sqrt(np.square(W) @ np.square(spread))
     for a, b in gaps:
         hidden = (at > a) & (at < b)
-        bend = max(line.tightest_bend(0.016), 2.0)
+        bend = max(line.tightest_bend((a, b)), 2.0)
         errors["centre"][hidden] += 0.25 * bend * (at[hidden] - a) * (b - at[hidden])
     # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
     lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
@@ -217,6 +218,9 @@ def _finish(
     left = np.column_stack([moved + smooth["left"][:, None] * normal, smooth["face_left"]])
     right = np.column_stack([moved + smooth["right"][:, None] * normal, smooth["face_right"]])
     depth = 0.5 * (smooth["face_left"] + smooth["face_right"]) - smooth["root"]
+    if groove.closed:
+        for one in (root, left, right):
+            _close(one)
     R, p = groove.X_AQ.rotation().matrix(), groove.X_AQ.translation()
     lines = [v @ R.T + p for v in (root, left, right)]
     corners = [c for c in corners if first < c.s < last]
@@ -261,3 +265,11 @@ def _finish(
         face_sigma=groove.sigma_m,
         n_sections=len(slices.s),
     )
+
+
+def _close(line: Floats, over: int = 8) -> None:
+    """Makes the ends of a ring (N,3) meet, in place, the difference spread over the stations beside them."""
+    gap = line[0] - line[-1]
+    share = np.linspace(0.5, 0.0, over)[:, None]
+    line[:over] -= share * gap
+    line[-over:] += share[::-1] * gap

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from weldcal.welding.groove_follow import Slices
 from weldcal.welding.groove_line import Line
+from weldcal.welding.groove_seam import GrooveNotFound
 from weldcal.welding.groove_search import CoarseGroove
 from weldcal.welding.groove_section import BAND_M, Profile
 from weldcal.welding.planes import Floats
@@ -41,16 +40,6 @@ def seen_extent(
     return first - loss, last + loss, gaps
 
 
-def one_lap(line: Line, gaps: list[tuple[float, float]]) -> tuple[float, float, list[tuple[float, float]]]:
-    """From the middle of the overlap round to itself."""
-    first = 0.015
-    start = line.at(np.array([first]))[0][0]
-    late = line.s > 0.5 * line.length
-    k = int(np.argmin(np.where(late, np.linalg.norm(line.points - start, axis=1), math.inf)))
-    last = float(line.s[k])
-    return first, last, [(max(a, first), min(b, last)) for a, b in gaps if b > first and a < last]
-
-
 def ends_at_edges(f: Floats, ends: tuple[float, float], line: Line, profile: Profile) -> tuple[bool, bool]:
     """Whether lower ground is seen beyond each end of the groove: then the plate ends there, and not only the view."""
     half_width = profile.depth / min(profile.slopes)
@@ -65,3 +54,18 @@ def ends_at_edges(f: Floats, ends: tuple[float, float], line: Line, profile: Pro
         ground = out & (f[:, 2] < -1.3 * profile.depth)
         seen.append(bool(np.count_nonzero(ground) > max(5.0, 0.5 * np.count_nonzero(out))))
     return seen[0], seen[1]
+
+
+def refuse_flat_floor(f: Floats, line: Line, slices: Slices, profile: Profile) -> None:
+    """Raises GrooveNotFound where half-way to the shoulders it is as deep as in the middle: a gap or slot, not a V."""
+    s, n, beside = line.coordinates(f[:, :2])
+    run = np.abs(n - np.interp(s, slices.s, slices.column("centre"))) / (0.5 * float(np.median(slices.column("width"))))
+    middle, half_way = beside & (run < 0.15), beside & (run > 0.4) & (run < 0.7)
+    if np.count_nonzero(middle) < 20 or np.count_nonzero(half_way) < 20:
+        return
+    ratio = float(np.median(f[half_way, 2]) / np.median(f[middle, 2]))
+    if ratio > 0.8:
+        raise GrooveNotFound(
+            f"An opening {1e3 * profile.depth:.1f} mm deep was seen whose floor is flat: it is a gap or a slot, not a "
+            "V-groove."
+        )

@@ -47,12 +47,17 @@ class Line:
         """(N,) 1/m, positive to the left."""
         return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
 
-    def tightest_bend(self, over_m: float) -> float:
-        """Largest curvature of its chords over a length, 1/m."""
+    def tightest_bend(self, gap: tuple[float, float], over_m: float = 0.016) -> float:
+        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the other."""
         step = max(1, round(over_m / (self.length / (len(self.points) - 1))))
         chords = self.points[step:] - self.points[:-step]
         heading = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
-        return float(np.max(np.abs(heading[step:] - heading[:-step]), initial=0.0)) / over_m
+        turn = np.abs(heading[step:] - heading[:-step]) / over_m
+        start = self.s[: len(turn)]
+        clear = (start + 2.0 * over_m < gap[0]) | (start > gap[1])
+        a, b = np.searchsorted(self.s, [gap[0] - over_m, gap[1]])
+        across = abs(heading[min(b, len(heading) - 1)] - heading[max(a, 0)]) / (gap[1] - gap[0] + over_m)
+        return max(float(across), float(np.max(turn[clear], initial=0.0)))
 
     def at(self, s: Floats) -> tuple[Floats, Floats]:
         """Points (M,2) and left normals (M,2) at arc lengths (M,); straight on beyond the ends."""

@@ -49,19 +49,21 @@ class CoarseGroove:
     pitch_m: float
 
 
-def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroove], float]:
-    """Every groove-like opening in faces of a cloud (N,3) m whose z is up, and the largest noise of the faces seen, m."""
+def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroove], float, float]:
+    """Every groove-like opening in faces of a cloud (N,3) m whose z is up; the largest noise and the widest distance of
+    points on the faces seen, m.
+    """
     rng = np.random.default_rng(config.seed)
     sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
     center = np.array([*np.median(sample, axis=0)])
     found: list[CoarseGroove] = []
-    noise = 0.0
+    noise = widest = 0.0
     for X in upward_planes(sample - center, config.steepest_rad, 120, rng, most=6):
         X_AQ = RigidTransform(center) @ X
-        here, noise_here = _in_plane(points, X_AQ, config)
+        here, noise_here, pitch = _in_plane(points, X_AQ, config)
         found += here
-        noise = max(noise, noise_here)
-    return _distinct(found), noise
+        noise, widest = max(noise, noise_here), max(widest, pitch)
+    return _distinct(found), noise, widest
 
 
 def _distinct(found: list[CoarseGroove]) -> list[CoarseGroove]:
@@ -79,13 +81,13 @@ def _lifted(groove: CoarseGroove) -> Floats:
     return np.asarray(line @ groove.X_AQ.rotation().matrix().T + groove.X_AQ.translation())
 
 
-def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> tuple[list[CoarseGroove], float]:
-    """The grooves of all faces in one plane, and the noise of the noisiest."""
+def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> tuple[list[CoarseGroove], float, float]:
+    """The grooves of all faces in one plane, the noise of the noisiest and the distance of points, m."""
     q = into(X_AQ, points)
     q = q[(q[:, 2] > -0.15) & (q[:, 2] < 0.006)]
     on = np.abs(q[:, 2]) < 0.003
     if np.count_nonzero(on) < 300:
-        return [], 0.0
+        return [], 0.0, 0.0
     pitch = point_pitch(q[on][:, :2])
     cell = 1.25 * pitch
     corner = q[:, :2].min(axis=0) - 6.0 * cell
@@ -129,7 +131,7 @@ def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> tup
         X_QF, sigma = _thinned_plane(near)
         in_face = into(X_QF, np.column_stack([xy, np.zeros(len(xy))]))[:, :2]
         found.append(CoarseGroove(X_AQ @ X_QF, in_face, closed, opening_m, sigma, pitch))
-    return found, noise
+    return found, noise, pitch if noise > 0.0 else 0.0
 
 
 def _thinned_plane(q: Floats) -> tuple[RigidTransform, float]:
@@ -162,7 +164,7 @@ def _lines(below: Mask, level: Mask, cell: float, config: SearchConfig) -> list[
         line = _even(_smooth(line, 4.0, closed), 0.001 / cell, closed)
         length = 0.001 * len(line)
         width = area * cell**2 / length
-        if length >= config.shortest_m and width < 0.4 * length:
+        if length >= config.shortest_m and width < min(0.4 * length, 1.5 * config.max_width_m):
             out.append((line, closed, width))
     return out
 
@@ -217,8 +219,15 @@ def _centre_line(mask: Mask) -> tuple[Floats, bool]:
         gap = np.min(np.linalg.norm(xy[:, None] - middle[None, ::3], axis=2), axis=1)
         second = way(gap > margin)
         if second:
-            return xy[out + second[::-1][1:-1]], True
+            # Both ways run into the corners of the opening at their ends: there the ring is closed across.
+            return np.vstack([_trimmed(xy[out], margin), _trimmed(xy[second[::-1]], margin)]), True
     return xy[out], False
+
+
+def _trimmed(line: Floats, margin: float) -> Floats:
+    """A line (N,2) without its first and last stretch."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    return line[(along >= margin) & (along <= along[-1] - margin)]
 
 
 def _finite(distance: Floats) -> Floats:
