@@ -138,7 +138,7 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None) -> Sea
     line = plan.root + height * plan.up
     if length_m is not None:
         steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        line = line[np.concatenate([[0.0], np.cumsum(steps)]) <= length_m]
+        line = line[np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7]
     return SeamCurve.from_points(line, up=plan.up)
 
 

@@ -155,4 +155,11 @@ def followed(
         # A section that its neighbours deny counts for little.
         weight = np.where(off > 4.0 * np.median(off) + 5e-5, 10.0, 1.0) * slices.sigma
     W = smoothing_weights(np.clip(at, slices.s[0], slices.s[-1]), slices.s, weight, width)
-    return line.moved(at, W @ r)
+    moved = line.moved(at, W @ r)
+    # Where nothing was seen the coarse line is not to be believed: the sides that were seen say how it goes on.
+    stretch = moved.length / line.length
+    for k in np.flatnonzero(np.diff(slices.s) > 0.010)[::-1]:
+        a, b = stretch * float(slices.s[k]), stretch * float(slices.s[k + 1])
+        if a > 0.005 and b < moved.length - 0.005:
+            moved = moved.bridged(a, b)
+    return moved

@@ -100,6 +100,18 @@ class Line:
         beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
         return self.s[nearest] + along, n, beside
 
+    def bridged(self, a: float, b: float, side: float = 0.015) -> Line:
+        """The line with its stretch from a to b replaced by a smooth curve that continues both sides, m."""
+        (p, before, q, after), _ = self.at(np.array([a, max(a - side, 0.0), b, min(b + side, self.length)]))
+        reach = float(np.linalg.norm(q - p))
+        u, v = p - before, after - q
+        u, v = reach * u / np.linalg.norm(u), reach * v / np.linalg.norm(v)
+        t = np.linspace(0.0, 1.0, max(4, round(reach / STEP_M)))[1:-1, None]
+        curve = (
+            (2 * t**3 - 3 * t**2 + 1) * p + (t**3 - 2 * t**2 + t) * u + (3 * t**2 - 2 * t**3) * q + (t**3 - t**2) * v
+        )
+        return Line(np.vstack([self.points[self.s <= a], curve, self.points[self.s >= b]])).even()
+
     def moved(self, s: Floats, left: Floats) -> Line:
         """The line moved to its left by amounts (M,) at arc lengths (M,), in between linearly."""
         amount = np.interp(self.s, s, left)

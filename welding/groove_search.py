@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from pydrake.math import RigidTransform
 from scipy.ndimage import gaussian_filter1d
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -190,19 +191,20 @@ def _centre_line(mask: Mask) -> tuple[Floats, bool]:
     step = np.concatenate(steps)
     shape = (len(rows), len(rows))
 
-    def graph(cost: Floats, keep: Mask) -> csr_matrix:
+    def graph(cost: Floats, keep: Mask) -> Any:
         some = keep[ends[0]] & keep[ends[1]]
         a, b = ends[0][some], ends[1][some]
-        return csr_matrix((step[some] * 0.5 * (cost[a] + cost[b]), (a, b)), shape=shape)
+        return csr_array((step[some] * 0.5 * (cost[a] + cost[b]), (a, b)), shape=shape)
 
+    shortest: Any = dijkstra
     everything = np.ones(len(rows), dtype=bool)
     plain = graph(np.ones(len(rows)), everything)
-    first = int(np.argmax(_finite(dijkstra(plain, directed=False, indices=0))))
-    last = int(np.argmax(_finite(dijkstra(plain, directed=False, indices=first))))
+    first = int(np.argmax(_finite(shortest(plain, directed=False, indices=0))))
+    last = int(np.argmax(_finite(shortest(plain, directed=False, indices=first))))
     xy = np.column_stack([columns, rows]).astype(np.float64)
 
     def way(keep: Mask) -> list[int]:
-        _, before = dijkstra(graph(dear, keep), directed=False, indices=first, return_predecessors=True)
+        _, before = shortest(graph(dear, keep), directed=False, indices=first, return_predecessors=True)
         path = [last]
         while path[-1] != first and before[path[-1]] >= 0:
             path.append(int(before[path[-1]]))
@@ -227,7 +229,7 @@ def _centre_line(mask: Mask) -> tuple[Floats, bool]:
 def _trimmed(line: Floats, margin: float) -> Floats:
     """A line (N,2) without its first and last stretch."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    return line[(along >= margin) & (along <= along[-1] - margin)]
+    return np.asarray(line[(along >= margin) & (along <= along[-1] - margin)])
 
 
 def _finite(distance: Floats) -> Floats:

@@ -68,6 +68,7 @@ workpiece:
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
   groove_error: {translation_mm: 1.5, rotation_deg: 0.3}
   hole_from_mm: 200.0
+planning: {method: cloud, search: anywhere, start_m: [0.6, -0.1, 0.0]}
 welding:
   speed_mm_s: 6.0
   deflection_mm: 1.5

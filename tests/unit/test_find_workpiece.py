@@ -15,7 +15,7 @@ from weldcal.tools.benchmarks.plan_scenes import Scene, box, cast, looking_at, s
 from weldcal.welding.find_workpiece import AmbiguousWorkpiece, FoundWorkpiece, find_workpiece
 from weldcal.welding.registration import WorkpieceNotFound
 
-SCANNER = get_scanner("phoxi_m", 618, 462)
+SCANNER = get_scanner("phoxi_m", 515, 385)
 CAD = {shape: make_workpiece(shape) for shape in ("straight", "s", "l")}
 
 
@@ -39,17 +39,17 @@ def _found(scene: Scene, off_deg: float = 70.0) -> FoundWorkpiece:
 
 def test_parts_in_any_turn_and_tilted_up_to_15_degrees_are_found_and_their_covariance_holds() -> None:
     squares = []
-    for seed, shape in ((3001, "straight"), (3002, "s"), (3003, "l"), (3004, "s")):
+    for seed, shape in ((3001, "straight"), (3002, "s"), (3003, "l")):
         scene = scan_part(CAD[shape], SCANNER, seed, tilt_rad=math.radians(15.0))
         found = _found(scene)
         v, square = _error(found, scene.X_BP)
         squares.append(square)
-        # A pixel is 1.3 mm here and the faces lean by up to 20 degrees to the sight.
+        # A pixel is 1.6 mm here and the faces lean by up to 20 degrees to the sight.
         assert np.linalg.norm(v[3:]) < 0.5e-3
         assert np.linalg.norm(v[:3]) < math.radians(0.12)
         assert found.confidence > 0.85
-    # Chi square of 24 degrees of freedom: below 43 with 99 %.
-    assert 2.0 < sum(squares) < 43.0
+    # Chi square of 18 degrees of freedom: below 35 with 99 %.
+    assert 2.0 < sum(squares) < 34.8
 
 
 def test_an_l_groove_tells_its_own_turn_without_any_hint() -> None:
@@ -69,7 +69,7 @@ def test_a_part_that_looks_the_same_turned_round_is_a_question_until_a_hint_answ
         find_workpiece(scene.cloud_B, CAD["s"])
     with pytest.raises(AmbiguousWorkpiece, match="square to the guess"):
         _found(scene, 90.0)
-    there, turned = _found(scene, 60.0), _found(scene, 180.0 + 60.0)
+    there, turned = _found(scene, 60.0), _found(scene, 240.0)
     assert _error(there, scene.X_BP)[0][2] == pytest.approx(0.0, abs=math.radians(0.1))
     # Half a turn between the two answers, about the same middle.
     half = there.X_BP.InvertAndCompose(turned.X_BP)

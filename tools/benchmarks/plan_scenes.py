@@ -51,17 +51,16 @@ def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset
     """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
     import open3d
 
+    tensor: Any = open3d.core.Tensor
     scene = open3d.t.geometry.RaycastingScene()
     for mesh in meshes:
-        vertices: Any = mesh.vertices.astype(np.float32)
-        triangles: Any = mesh.triangles.astype(np.uint32)
-        scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(triangles))
+        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
     flat = np.ones((scanner.height, scanner.width), dtype=np.float32)
     rays_C = depth_to_points(flat, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
     R, eye = X_BC.rotation().matrix(), X_BC.translation()
-    rays: Any = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
+    rays = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
     # The rays have unit depth, so what the caster calls distance is depth.
-    depth = scene.cast_rays(open3d.core.Tensor(rays))["t_hit"].numpy()
+    depth = scene.cast_rays(tensor(rays))["t_hit"].numpy()
     depth[~np.isfinite(depth)] = 0.0
     measured = apply_noise(depth, scanner, np.random.default_rng(seed))
     points_C = depth_to_points(measured, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
