@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.welding.groove_corner import Corner, round_corners, split_legs
-from weldcal.welding.groove_extent import ends_at_edges, refuse_flat_floor, seen_extent
+from weldcal.welding.groove_extent import ends_at_edges, refuse_gap, seen_extent
 from weldcal.welding.groove_follow import (
     STATION_M,
     Slices,
@@ -120,12 +120,16 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
     half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
     for step in range(4):
         lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
-        if step == 0:
+        if groove.closed:
+            # The joint of a ring is measured from one side only: each round it lies elsewhere.
+            lines = [lines[0].rolled()]
+        elif step == 0:
             lines, corners = split_legs(lines[0], profile)
-        else:
+        if step > 0:
             # One cutter made the whole groove: its angle and depth, once known, steady every slice.
             longest = max(lines, key=lambda one: one.length)
-            profile = common_profile(cut_slices(f, longest, profile, sigma, pitch, half_slice, []), profile)
+            slices = cut_slices(f, longest, profile, sigma, pitch, half_slice, [])
+            profile = common_profile(f, longest, slices, profile, sigma, pitch)
     whole = lines[0]
     if corners:
         whole, corners = round_corners(f, lines, corners, profile, sigma)
@@ -148,7 +152,7 @@ def _finish(
     if len(slices.s) < 5:
         raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
     pitch = groove.pitch_m
-    refuse_flat_floor(f, line, slices, profile)
+    refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
     first, last, gaps = seen_extent(f, line, profile, slices, groove)
     if groove.closed:
         first, last = 0.0, line.length

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from weldcal.welding.groove_follow import Slices
@@ -32,7 +34,7 @@ def seen_extent(
     # Beyond the last section that makes sense single points do not tell where the groove goes.
     first = max(first, float(slices.s[0]) - 3.0 * slices.half_slice)
     last = min(last, float(slices.s[-1]) + 3.0 * slices.half_slice)
-    jump = np.flatnonzero(np.diff(inside) > max(0.003, 3.0 * groove.pitch_m))
+    jump = np.flatnonzero(np.diff(inside) > max(0.003, 5.0 * groove.pitch_m))
     gaps = [(float(inside[k]), float(inside[k + 1])) for k in jump if first <= inside[k] and inside[k + 1] <= last]
     # Half of a pitch is lost at each end, less what many rows make up for.
     rows = max(1.0, 1.5 * half_width / groove.pitch_m)
@@ -56,8 +58,13 @@ def ends_at_edges(f: Floats, ends: tuple[float, float], line: Line, profile: Pro
     return seen[0], seen[1]
 
 
-def refuse_flat_floor(f: Floats, line: Line, slices: Slices, profile: Profile) -> None:
-    """Raises GrooveNotFound where half-way to the shoulders it is as deep as in the middle: a gap or slot, not a V."""
+def refuse_gap(f: Floats, line: Line, slices: Slices, profile: Profile, steepest_rad: float) -> None:
+    """Raises GrooveNotFound where half-way to the shoulders it is as deep as in the middle, or the walls stand upright."""
+    if max(profile.slopes) > math.tan(steepest_rad):
+        raise GrooveNotFound(
+            f"An opening {1e3 * profile.depth:.1f} mm deep was seen whose walls stand upright: it is a gap or a slot, not a "
+            "V-groove."
+        )
     s, n, beside = line.coordinates(f[:, :2])
     run = np.abs(n - np.interp(s, slices.s, slices.column("centre"))) / (0.5 * float(np.median(slices.column("width"))))
     middle, half_way = beside & (run < 0.15), beside & (run > 0.4) & (run < 0.7)

@@ -69,15 +69,25 @@ def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: Groove
         )
     if best.width < config.least_pitches * groove.pitch_m:
         raise _too_narrow(best.width, groove.pitch_m, config)
-    return Profile(best.slopes, best.depth)
+    # About a wandering line one wall looks steeper than the other; what they have in common is nearer to the truth.
+    slope = float(np.mean(best.slopes))
+    return Profile((slope, slope), best.depth)
 
 
-def common_profile(slices: Slices, profile: Profile) -> Profile:
-    """The median of the slices' profiles, from which the next ones may differ less."""
+def common_profile(f: Floats, line: Line, slices: Slices, profile: Profile, sigma: float, pitch: float) -> Profile:
+    """The profile of all points about the slices' centres: known so much better that the next slices may differ less."""
     if len(slices.s) < 5:
         return profile
-    left, right = np.median([x.slopes for x in slices.sections], axis=0)
-    return Profile((float(left), float(right)), float(np.median(slices.column("depth"))), SLOPE_SIGMA, DEPTH_SIGMA)
+    s, n, beside = line.coordinates(f[:, :2])
+    half_width = profile.depth / min(profile.slopes)
+    beside &= (s > slices.s[0]) & (s < slices.s[-1]) & (np.abs(n) < half_width + BAND_M)
+    beside &= f[:, 2] > -1.3 * profile.depth - 4.0 * sigma
+    n = n - np.interp(s, slices.s, slices.column("centre"))
+    # Slices that were steadied by the last profile would only repeat it: these points are asked anew.
+    slope = float(np.mean(profile.slopes))
+    loose = Profile((slope, slope), profile.depth, slope_sigma=0.5, depth_sigma=0.5)
+    whole = fit_section(n[beside], f[beside, 2], (0.0, loose), sigma, pitch)
+    return profile if whole is None else Profile(whole.slopes, whole.depth, SLOPE_SIGMA, DEPTH_SIGMA)
 
 
 def _too_narrow(width: float, pitch: float, config: GrooveConfig) -> GrooveTooNarrow:

@@ -100,6 +100,16 @@ class Line:
         beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
         return self.s[nearest] + along, n, beside
 
+    def rolled(self) -> Line:
+        """A ring that begins and ends half a turn further on; its former joint is closed to the mean of both ends."""
+        points = self.points.copy()
+        gap, over = points[0] - points[-1], min(20, len(points) // 4)
+        share = np.linspace(0.5, 0.0, over)[:, None]
+        points[:over] -= share * gap
+        points[-over:] += share[::-1] * gap
+        half = len(points) // 2
+        return Line(np.vstack([points[half:-1], points[: half + 1]])).even()
+
     def bridged(self, a: float, b: float, side: float = 0.015) -> Line:
         """The line with its stretch from a to b replaced by a smooth curve that continues both sides, m."""
         (p, before, q, after), _ = self.at(np.array([a, max(a - side, 0.0), b, min(b + side, self.length)]))

@@ -38,6 +38,7 @@ class GrooveConfig:
     smoothing_m    width of the Gaussian along the seam
     most_sigma_m   a root that is less certain than this, outside gaps, is refused
     longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
+    steepest_wall_rad             steeper walls cannot be measured from above: an opening that has them is a gap
     most_bridge_sigma_m           how uncertain the line may be where it is bridged
     """
 
@@ -48,7 +49,7 @@ class GrooveConfig:
     longest_gap_m: float = 0.045
     most_missing: float = 0.5
     most_bridge_sigma_m: float = 0.0015
-    steepest_wall_rad: float = math.radians(82.0)
+    steepest_wall_rad: float = math.radians(78.0)
 
 
 @dataclass(frozen=True, eq=False)

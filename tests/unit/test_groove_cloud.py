@@ -59,8 +59,8 @@ def test_the_root_is_found_within_a_fraction_of_the_pixel_pitch(
     assert np.sqrt(np.mean(side**2)) < 0.15e-3
     assert np.abs(side).max() < 0.6e-3
     assert np.sqrt(np.mean(height**2)) < 0.3e-3
-    # Edge to edge to a pixel and a half.
-    assert groove.s[-1] == pytest.approx(scene.part.length_m, abs=1.5e-3)
+    # Edge to edge, of which up to a pixel may be lost at each end.
+    assert groove.s[-1] == pytest.approx(scene.part.length_m, abs=2.6e-3)
     assert np.degrees(2.0 * groove.half_angle) == pytest.approx(45.0, abs=1.5)
     assert np.median(groove.depth) == pytest.approx(8e-3, abs=0.2e-3)
     assert groove.width == pytest.approx(2.0 * scene.part.half_width_m, abs=0.2e-3)
@@ -155,7 +155,7 @@ def test_a_thin_bar_over_the_groove_is_a_named_gap_and_a_broad_one_ends_what_is_
     (a, b), *rest = groove.gaps
     assert not rest
     assert 0.018 < b - a < 0.035
-    assert groove.s[-1] == pytest.approx(part.length_m, abs=1.5e-3)
+    assert groove.s[-1] == pytest.approx(part.length_m, abs=2.6e-3)
     side, _ = sideways(groove.root, part, scene.X_BP)
     assert np.abs(side).max() < 0.6e-3
     assert f"from {1e3 * a:.0f} to {1e3 * b:.0f} mm" in groove.words
