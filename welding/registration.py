@@ -48,13 +48,15 @@ class RegistrationConfig:
     """How far the guess may be off, and what counts as found.
 
     `max_contradicted` is the largest share of the outline at which the scan may show material beyond it or the table
-    inside it; `min_supported` the smallest share at which it must show the face ending there (the rest is unseen).
+    inside it; `min_supported` the smallest share at which it must show the face ending there (the rest is unseen);
+    `max_sigma_m` how uncertain the drawn seam may be, sideways.
     """
 
     max_shift_m: float = 0.030
     max_turn_rad: float = math.radians(10.0)
     max_contradicted: float = 0.10
     min_supported: float = 0.50
+    max_sigma_m: float = 0.00035
     min_points: int = 1000
     seed: int = 0
 
@@ -189,6 +191,13 @@ def _refine(
     inside = inside_loops(p[:, :2], [core])
     on_face = flat & inside
     covariance = pose_covariance(p[on_face], in_plane, pitch)
+    uncertain = seam_sigma(covariance, workpiece)
+    if uncertain > config.max_sigma_m:
+        raise WorkpieceNotFound(
+            f"The plate is there, but its place is only known to {1e3 * uncertain:.2f} mm from this scan (noise "
+            f"{1e3 * sigma:.2f} mm, points {1e3 * pitch:.1f} mm apart) and {1e3 * config.max_sigma_m:.2f} mm are required: "
+            "use a finer scanner or move it nearer."
+        )
     return WorkpieceRegistration(
         X_BP=X_BP,
         rms_m=float(np.sqrt(np.mean(np.square(p[on_face, 2])))),
@@ -199,7 +208,7 @@ def _refine(
         confidence=max(0.0, supported - contradicted),
         n_points=int(np.count_nonzero(on_face)),
         covariance=covariance,
-        seam_sigma_m=seam_sigma(covariance, workpiece),
+        seam_sigma_m=uncertain,
     )
 
 
