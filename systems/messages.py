@@ -143,3 +143,5 @@ class PlannedSeam(Message):
     q_retract: NDArray[np.float64] | None = None
     points_B: NDArray[np.float64] | None = None
     reason: str | None = None
+    sigma_m: float = np.nan  # of the planned root, sideways
+    words: str = ""  # what was found in the scan, in a sentence

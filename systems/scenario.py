@@ -16,6 +16,7 @@ from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.welding.laws import get_law
+from weldcal.welding.planning import PlanningMethod
 from weldcal.welding.process import WeldProcess
 
 SLOWEST_FACTOR = 0.05
@@ -94,6 +95,20 @@ class ProcessConfig:
 
 
 @dc.dataclass
+class PlanningConfig:
+    """How the seam is planned from the workpiece's scan."""
+
+    method: str = "cad"  # cad: the drawing laid over the scan; cloud: the groove found in the scan, no drawing
+    search: str = "guess"  # of the drawing: guess, near workpiece.pose_guess; anywhere, over the whole scan
+    start_m: list[float] | None = None  # a cloud's seam starts at the end nearest to this; null: nearest to the robot
+
+    def planning_method(self) -> PlanningMethod:
+        """The same for the planner; raises InputError for words it does not know."""
+        x_y_z = None if self.start_m is None else (self.start_m[0], self.start_m[1], self.start_m[2])
+        return PlanningMethod(self.method, self.search, x_y_z)
+
+
+@dc.dataclass
 class WeldingConfig:
     """The welding job."""
 
@@ -140,6 +155,7 @@ class Scenario:
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
+    planning: PlanningConfig = dc.field(default_factory=PlanningConfig)
     welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
     job: JobConfig = dc.field(default_factory=JobConfig)
     visualization: VisualizationConfig = dc.field(default_factory=VisualizationConfig)
@@ -203,6 +219,7 @@ def check_scenario(scenario: Scenario) -> None:
         )
     check_numbers(scenario)
     scenario.welding.process.process()
+    scenario.planning.planning_method()
     if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
         raise InputError(
             f"job.speed_factor must be from {SLOWEST_FACTOR:g} to 1, and it is {scenario.job.speed_factor:g}."

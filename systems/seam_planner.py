@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,14 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.feasibility import check_feasible
-from weldcal.welding.registration import register_workpiece
+from weldcal.welding.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam import SeamCurve
 from weldcal.welding.servo_state import ServoConfig
 from weldcal.welding.touch import touch_start_pose
 
 
 class SeamPlanner(LeafSystem):
-    """Registers the workpiece's CAD to its scan and takes the seam into the base with the calibrated X_BC.
+    """Plans the seam from the workpiece's scan, by its CAD or from the cloud alone, in the base by the calibrated X_BC.
 
     .. pydrake_system::
 
@@ -50,12 +51,14 @@ class SeamPlanner(LeafSystem):
         clearance_m: float,
         seam_length_m: float | None,
         X_BC_known: RigidTransform | None = None,
+        method: PlanningMethod | None = None,
         period_s: float = 0.02,
     ) -> None:
         super().__init__()
         self._arm, self._tool, self._workpiece, self._config = arm, tool, workpiece, config
         self._X_BP_guess, self._q_near, self._clearance_m = X_BP_guess, q_near, clearance_m
         self._seam_length_m, self._X_BC_known = seam_length_m, X_BC_known
+        self._method = method or PlanningMethod()
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
@@ -86,8 +89,8 @@ class SeamPlanner(LeafSystem):
         points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
         points_B = points_C @ X_BC.rotation().matrix().T + X_BC.translation()
         try:
-            found = register_workpiece(points_B, self._workpiece, self._X_BP_guess)
-            seam = tip_seam(self._workpiece, found.X_BP, self._tool, self._seam_length_m)
+            found = plan_root(points_B, self._workpiece, self._X_BP_guess, self._method, X_BC.translation())
+            seam = seam_above(found, self._tool, self._seam_length_m)
             check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)
             q_start, q_above, q_retract = arm_waypoints(
                 self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m
@@ -95,7 +98,17 @@ class SeamPlanner(LeafSystem):
         except WeldcalError as error:
             return PlannedSeam(sequence=scan.sequence, reason=str(error))
         return PlannedSeam(
-            scan.sequence, seam, found.X_BP, found.rms_m, found.confidence, q_start, q_above, q_retract, points_B
+            scan.sequence,
+            seam,
+            found.X_BP,
+            found.rms_m,
+            found.confidence,
+            q_start,
+            q_above,
+            q_retract,
+            points_B,
+            sigma_m=found.sigma_m,
+            words=found.words,
         )
 
     def _output(self, context: Context, output: Any) -> None:
@@ -114,6 +127,20 @@ def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, leng
         line, ups = line[workpiece.arc_length_m <= length_m], ups[workpiece.arc_length_m <= length_m]
     R = X_BP.rotation().matrix()
     return SeamCurve.from_points(line @ R.T + X_BP.translation(), up=ups @ R.T)
+
+
+def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None) -> SeamCurve:
+    """The same line over a root that was planned by either method: the tip sits as high as the groove's angle lets it.
+
+    Raises:
+        InputError: for a root too short for a seam.
+    """
+    height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m
+    line = plan.root + height * plan.up
+    if length_m is not None:
+        steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
+        line = line[np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7]
+    return SeamCurve.from_points(line, up=plan.up)
 
 
 def arm_waypoints(

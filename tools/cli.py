@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.cli_cell import cell as reproduce_cell
@@ -31,6 +32,7 @@ app.command("robots")(robots)
 reproduce.command("cell")(reproduce_cell)
 app.add_typer(tablet, name="tablet")
 benchmarks.command("tablet")(benchmark_tablet)
+benchmarks.command("seam-planning")(seam_planning)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

@@ -14,24 +14,29 @@ because a scanner loses its last pixel more often at the edges that face away fr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from scipy.optimize import least_squares
-from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces import Workpiece
-
-Floats = npt.NDArray[np.float64]
-Mask = npt.NDArray[np.bool_]
-
-PLANE_BAND_M = 0.0015
+from weldcal.welding.planes import (
+    PLANE_BAND_M,
+    Floats,
+    Raster,
+    into,
+    point_pitch,
+    rasterise,
+    robust_plane,
+    turned,
+    upward_planes,
+)
+from weldcal.welding.pose_covariance import moved_covariance, outline_covariance, pose_covariance, seam_sigma
 
 
 class WorkpieceNotFound(WeldcalError):
@@ -43,13 +48,15 @@ class RegistrationConfig:
     """How far the guess may be off, and what counts as found.
 
     `max_contradicted` is the largest share of the outline at which the scan may show material beyond it or the table
-    inside it; `min_supported` the smallest share at which it must show the face ending there (the rest is unseen).
+    inside it; `min_supported` the smallest share at which it must show the face ending there (the rest is unseen);
+    `max_sigma_m` how uncertain the drawn seam may be, sideways.
     """
 
     max_shift_m: float = 0.030
     max_turn_rad: float = math.radians(10.0)
     max_contradicted: float = 0.10
     min_supported: float = 0.50
+    max_sigma_m: float = 0.00035
     min_points: int = 1000
     seed: int = 0
 
@@ -64,6 +71,9 @@ class WorkpieceRegistration:
     supported, contradicted   shares of the outline where the scan confirms, or denies, that the face ends there
     confidence        supported less contradicted, 0 to 1
     n_points          points on the face
+    covariance        (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation then translation
+    seam_sigma_m      what that covariance makes of the drawn seam: rms over it of the sigma sideways in the face, m.
+                      The groove's own displacement against the outline comes on top and is not seen here.
     """
 
     X_BP: RigidTransform
@@ -74,24 +84,23 @@ class WorkpieceRegistration:
     contradicted: float
     confidence: float
     n_points: int
+    covariance: Floats
+    seam_sigma_m: float
 
+    @property
+    def words(self) -> str:
+        """What was found, for a person."""
+        return (
+            f"{100 * self.supported:.0f} % of the outline seen where it is drawn, {100 * self.contradicted:.0f} % denied; "
+            f"the drawn seam is known to {1e3 * self.seam_sigma_m:.2f} mm"
+        )
 
-@dataclass(frozen=True, eq=False)
-class _Raster:
-    """Which cells of the plane hold face points, or points well below the face; cell size and corner in metres."""
-
-    face: Mask
-    below: Mask
-    cell: float
-    corner: Floats
-
-    def look(self, cells: npt.NDArray[Any], xy: Floats) -> npt.NDArray[Any]:
-        """Values of a raster (H,W) at points (...,2); what lies outside reads as its first cell, kept empty."""
-        i = ((xy - self.corner) / self.cell).astype(np.int64)
-        height, width = cells.shape
-        inside = np.all((i >= 0) & (i < np.array([width, height])), axis=-1, keepdims=True)
-        i = i * inside
-        return np.asarray(cells[i[..., 1], i[..., 0]])
+    def turned_round(self, workpiece: Workpiece) -> WorkpieceRegistration:
+        """The same with the part turned by 180 deg about the middle of its outline."""
+        x, y = 2.0 * workpiece.outline_P.mean(axis=0)
+        turn = turned(float(x), float(y), math.pi)
+        covariance = moved_covariance(self.covariance, turn)
+        return replace(self, X_BP=self.X_BP @ turn, covariance=covariance)
 
 
 def register_workpiece(
@@ -99,13 +108,16 @@ def register_workpiece(
     workpiece: Workpiece,
     X_BP_guess: RigidTransform,
     config: RegistrationConfig | None = None,
+    eye_B: npt.ArrayLike | None = None,
 ) -> WorkpieceRegistration:
     """Finds the plate in a scan (N,3) or (H,W,3), metres in base, NaN where unmeasured, near a guess.
 
+    `eye_B` (3,): where the scanner stands; it only serves the covariance, which assumes a usual slant without it.
     A rectangle looks the same after half a turn: the guess decides. Raises WorkpieceNotFound when the scan shows no
     such plate there, InputError for a scan of the wrong shape.
     """
     config = config or RegistrationConfig()
+    eye = None if eye_B is None else np.asarray(eye_B, dtype=np.float64)
     points = np.asarray(points_B, dtype=np.float64)
     if points.ndim < 2 or points.shape[-1] != 3:
         raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
@@ -113,7 +125,7 @@ def register_workpiece(
     points = points[np.isfinite(points).all(axis=1)]
     half = 0.5 * np.array(workpiece.size_m[:2])
     reach = config.max_shift_m + float(np.hypot(*half)) * math.sin(config.max_turn_rad)
-    p = _into(X_BP_guess, points)
+    p = into(X_BP_guess, points)
     near = (np.abs(p[:, :2]) < half + reach + 0.01).all(axis=1) & (np.abs(p[:, 2]) < reach + workpiece.size_m[2])
     points, p = points[near], p[near]
     if len(points) < config.min_points:
@@ -124,45 +136,49 @@ def register_workpiece(
     rng = np.random.default_rng(config.seed)
     sample = p[rng.choice(len(p), size=min(len(p), 8000), replace=False)]
     best: tuple[float, RigidTransform] | None = None
-    for X_GQ in _planes(sample, config, rng):
-        X_QP, score = _slide(_into(X_GQ, p), workpiece, config)
+    for X_GQ in upward_planes(sample, config.max_turn_rad + math.radians(3.0), config.min_points // 4, rng):
+        X_QP, score = _slide(into(X_GQ, p), workpiece, config)
         if best is None or score > best[0]:
             best = (score, X_BP_guess @ X_GQ @ X_QP)
     if best is None:
         raise WorkpieceNotFound("The scan shows no flat face where the workpiece should be: check the guess.")
-    return _refine(points, workpiece, best[1], config)
+    return _refine(points, workpiece, best[1], config, eye)
 
 
 def _refine(
-    points: Floats, workpiece: Workpiece, X_BP: RigidTransform, config: RegistrationConfig
+    points: Floats, workpiece: Workpiece, X_BP: RigidTransform, config: RegistrationConfig, eye_B: Floats | None
 ) -> WorkpieceRegistration:
     """Plane and outline by least squares from a pose good to a few millimetres, then the check against the drawing."""
     not_found = f"The scan shows no plate of {' x '.join(f'{1e3 * v:.0f}' for v in workpiece.size_m[:2])} mm there: "
     outline = workpiece.outline_P
     core = outline * (1.0 - 0.012 / np.abs(outline).max())
-    p = _into(X_BP, points)
+    p = into(X_BP, points)
     above = inside_loops(p[:, :2], [core]) & (np.abs(p[:, 2]) < 4.0 * PLANE_BAND_M)
     if np.count_nonzero(above) < config.min_points // 2:
         raise WorkpieceNotFound(not_found + "check the guess, the workpiece and the calibration.")
-    X_PQ, sigma = _robust_plane(p[above])
+    X_PQ, sigma = robust_plane(p[above])
     X_BP = X_BP @ X_PQ
 
+    slant = None
+    if eye_B is not None:
+        sight = eye_B - X_BP.translation()
+        slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
     band = max(4.0 * sigma, 0.0003)
     pitch, inset, fit_rms = 0.0, 0.0, math.inf
     for gate in (0.008, 0.004, 0.002):
-        p = _into(X_BP, points)
+        p = into(X_BP, points)
         # Points a little below the face are the side of the plate, which would move the edges the scanner looks at.
         face = p[(p[:, 2] > -0.5 * band) & (p[:, 2] < band)][:, :2]
-        pitch = _pitch(face[inside_loops(face, [core])]) if pitch == 0.0 else pitch
+        pitch = point_pitch(face[inside_loops(face, [core])]) if pitch == 0.0 else pitch
         rims, edges = _outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise WorkpieceNotFound(not_found + "too little of its outline is in view.")
-        X_PP, inset, fit_rms = _fit_outline(rims, edges, outline, pitch)
+        X_PP, inset, fit_rms, in_plane = _fit_outline(rims, edges, outline, pitch, slant, sigma)
         X_BP = X_BP @ X_PP
 
-    p = _into(X_BP, points)
+    p = into(X_BP, points)
     flat = np.abs(p[:, 2]) < band
-    raster = _rasterise(p, flat, p[:, 2] < -0.003, pitch)
+    raster = rasterise(p, flat, p[:, 2] < -0.003, pitch)
     rims, edges = _outermost(p[flat][:, :2], outline, 0.008, pitch)
     displaced = _displaced(rims, edges, outline, inset, 0.0003 + 0.5 * pitch, raster)
     supported, contradicted = _check(raster, outline, displaced)
@@ -174,6 +190,14 @@ def _refine(
         raise WorkpieceNotFound(not_found + visible + "; clear the view or scan from higher up.")
     inside = inside_loops(p[:, :2], [core])
     on_face = flat & inside
+    covariance = pose_covariance(p[on_face], in_plane, pitch)
+    uncertain = seam_sigma(covariance, workpiece)
+    if uncertain > config.max_sigma_m:
+        raise WorkpieceNotFound(
+            f"The plate is there, but its place is only known to {1e3 * uncertain:.2f} mm from this scan (noise "
+            f"{1e3 * sigma:.2f} mm, points {1e3 * pitch:.1f} mm apart) and {1e3 * config.max_sigma_m:.2f} mm are required: "
+            "use a finer scanner or move it nearer."
+        )
     return WorkpieceRegistration(
         X_BP=X_BP,
         rms_m=float(np.sqrt(np.mean(np.square(p[on_face, 2])))),
@@ -183,95 +207,9 @@ def _refine(
         contradicted=contradicted,
         confidence=max(0.0, supported - contradicted),
         n_points=int(np.count_nonzero(on_face)),
+        covariance=covariance,
+        seam_sigma_m=uncertain,
     )
-
-
-def _into(X_AB: RigidTransform, p_A: Floats) -> Floats:
-    """Points (N,3) given in A, expressed in B."""
-    return np.asarray((p_A - X_AB.translation()) @ X_AB.rotation().matrix(), dtype=np.float64)
-
-
-def _turned(x: float, y: float, yaw: float) -> RigidTransform:
-    return RigidTransform(RotationMatrix.MakeZRotation(yaw), np.array([x, y, 0.0]))
-
-
-def _plane_frame(normal: Floats, center: Floats) -> RigidTransform:
-    """The guess frame moved on to a plane by the shortest way: z becomes the normal, x stays as near as it can."""
-    x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
-    x /= np.linalg.norm(x)
-    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
-    return RigidTransform(R, np.array([0.0, 0.0, float(normal @ center) / normal[2]]))
-
-
-def _planes(sample: Floats, config: RegistrationConfig, rng: np.random.Generator) -> list[RigidTransform]:
-    """Up to four planes facing up, most points first, as frames Q in the guess frame."""
-    planes: list[RigidTransform] = []
-    rest = sample
-    steepest = math.cos(config.max_turn_rad + math.radians(3.0))
-    for _ in range(4):
-        if len(rest) < config.min_points // 4:
-            break
-        # Triples of neighbours: all three lie on one surface far more often than three points from anywhere.
-        neighbours = min(len(rest) - 1, max(30, len(rest) // 12))
-        first = rng.integers(len(rest), size=200)
-        near = np.asarray(cKDTree(rest).query(rest[first], k=neighbours)[1])
-        second, third = (near[np.arange(len(first)), rng.integers(1, neighbours, size=len(first))] for _ in range(2))
-        a = rest[first]
-        normal = np.cross(rest[second] - a, rest[third] - a)
-        length = np.linalg.norm(normal, axis=1)
-        normal *= np.where(normal[:, 2:] < 0.0, -1.0, 1.0)
-        usable = (length > 1e-5) & (normal[:, 2] > steepest * length)
-        if not usable.any():
-            break
-        normal = normal[usable] / length[usable, None]
-        distance = rest @ normal.T - np.einsum("ij,ij->i", normal, a[usable])
-        best = int(np.argmax(np.count_nonzero(np.abs(distance) < PLANE_BAND_M, axis=0)))
-        X = _plane_frame(normal[best], a[usable][best])
-        for _ in range(3):
-            q = _into(X, rest)
-            on = np.abs(q[:, 2]) < PLANE_BAND_M
-            if np.count_nonzero(on) < 50:
-                break
-            center = rest[on].mean(axis=0)
-            n = np.linalg.svd(rest[on] - center, full_matrices=False)[2][2]
-            X = _plane_frame(n * np.sign(n[2]), center)
-        planes.append(X)
-        rest = rest[np.abs(_into(X, rest)[:, 2]) > 2.0 * PLANE_BAND_M]
-    return planes
-
-
-def _robust_plane(p: Floats) -> tuple[RigidTransform, float]:
-    """Plane through most of the points (N,3) as a frame, and their standard deviation about it (from the median)."""
-    X, sigma = RigidTransform(), 0.0
-    for _ in range(6):
-        z = _into(X, p)[:, 2]
-        sigma = 1.4826 * float(np.median(np.abs(z - np.median(z))))
-        on = np.abs(z - np.median(z)) < max(3.0 * sigma, 5e-5)
-        center = p[on].mean(axis=0)
-        _, vectors = np.linalg.eigh(np.cov((p[on] - center).T))
-        n = vectors[:, 0]
-        X = _plane_frame(n * np.sign(n[2]), center)
-    return X, sigma
-
-
-def _pitch(xy: Floats) -> float:
-    """Typical distance between neighbouring scan points on the face, m."""
-    some = xy[:: max(1, len(xy) // 1000)]
-    distance = np.asarray(cKDTree(xy).query(some, k=2)[0])
-    return max(float(np.median(distance[:, 1])), 1e-4)
-
-
-def _rasterise(p: Floats, face: Mask, below: Mask, pitch: float) -> _Raster:
-    """The points (N,3) as cells of two pitches; small gaps in the face are closed."""
-    cell = max(2.0 * pitch, 0.001)
-    corner = p[:, :2].min(axis=0) - 4.0 * cell
-    width, height = (np.ceil((p[:, :2].max(axis=0) - corner) / cell).astype(int) + 4).tolist()
-    layers = np.zeros((2, height, width), dtype=np.uint8)
-    for layer, which in zip(layers, (face, below), strict=True):
-        i = ((p[which, :2] - corner) / cell).astype(np.int64)
-        layer[i[:, 1], i[:, 0]] = 1
-    closed = cv2.morphologyEx(layers[0], cv2.MORPH_CLOSE, np.ones((3, 3), dtype=np.uint8))
-    return _Raster(closed.astype(bool), layers[1].astype(bool), cell, corner)
 
 
 def _inward(outline: Floats) -> Floats:
@@ -292,7 +230,7 @@ def _along(outline: Floats, spacing: float) -> tuple[Floats, Floats, npt.NDArray
 
 def _slide(q: Floats, workpiece: Workpiece, config: RegistrationConfig) -> tuple[RigidTransform, float]:
     """Best pose of the outline in plane frame Q by exhaustive search, coarse then fine, and its score."""
-    raster = _rasterise(q, np.abs(q[:, 2]) < PLANE_BAND_M, q[:, 2] < -0.003, _pitch(q[:, :2]))
+    raster = rasterise(q, np.abs(q[:, 2]) < PLANE_BAND_M, q[:, 2] < -0.003, point_pitch(q[:, :2]))
     solid = raster.face.astype(np.uint8)
     border = solid - cv2.erode(solid, np.ones((3, 3), dtype=np.uint8))
     gap = cv2.distanceTransform(1 - border, cv2.DIST_L2, 5) * raster.cell
@@ -321,7 +259,7 @@ def _slide(q: Floats, workpiece: Workpiece, config: RegistrationConfig) -> tuple
             k = int(np.argmax(merit))
             if merit[k] > score:
                 score, best = float(merit[k]), np.array([*centers[k, 0], yaw])
-    return _turned(*best), score
+    return turned(*best), score
 
 
 def _outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple[Floats, npt.NDArray[np.int64]]:
@@ -342,9 +280,10 @@ def _outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tupl
 
 
 def _fit_outline(
-    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float
-) -> tuple[RigidTransform, float, float]:
-    """The motion in the plane that puts outermost points (M,2) on their edges, the inset found and the rms left, m.
+    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None, noise: float
+) -> tuple[RigidTransform, float, float, Floats]:
+    """The motion in the plane that puts outermost points (M,2) on their edges, the inset found, the rms left, m, and
+    the covariance (3,3) of x, y and turn.
 
     The scanner's last point on the face lies up to a pitch inside the edge; that inset is one more unknown, the same at
     all edges and held near half a pitch, so that it cancels where opposite edges are seen.
@@ -369,11 +308,13 @@ def _fit_outline(
         bounds=(np.append(-limit, -0.1 * pitch), np.append(limit, 1.3 * pitch)),
     )
     off = residuals(fit.x)[:-1]
-    return _turned(*fit.x[:3]), float(fit.x[3]), float(np.sqrt(np.mean(np.square(off))))
+    rms = float(np.sqrt(np.mean(np.square(off))))
+    covariance = outline_covariance(np.asarray(fit.jac), off, edges, pitch, prior, slant_rad, noise)
+    return turned(*fit.x[:3]), float(fit.x[3]), rms, covariance
 
 
 def _displaced(
-    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, inset: float, tolerance: float, raster: _Raster
+    rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, inset: float, tolerance: float, raster: Raster
 ) -> set[int]:
     """Edges that most of their outermost points (M,2) put further than the tolerance from where they are drawn.
 
@@ -387,7 +328,7 @@ def _displaced(
     return {k for k in seen if abs(float(np.median(depth[ends & (edges == k)]))) > tolerance}
 
 
-def _check(raster: _Raster, outline: Floats, displaced: set[int]) -> tuple[float, float]:
+def _check(raster: Raster, outline: Floats, displaced: set[int]) -> tuple[float, float]:
     """Shares of the outline where the face ends as drawn, and where the scan shows that it does not."""
     at, inward, edge = _along(outline, 0.002)
     offset = max(0.003, 2.0 * raster.cell) * inward

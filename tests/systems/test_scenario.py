@@ -70,6 +70,7 @@ workpiece:
   hole_from_mm: 200.0
   bend_radius_mm: 250.0
   located_by: drawing
+planning: {method: cloud, search: anywhere, start_m: [0.6, -0.1, 0.0]}
 welding:
   speed_mm_s: 6.0
   deflection_mm: 1.5

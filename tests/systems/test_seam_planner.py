@@ -13,6 +13,7 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.cell import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.systems.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
+from weldcal.welding.planning import PlanningMethod
 from weldcal.welding.seam import SeamCurve
 from weldcal.welding.servo_state import ServoConfig
 from weldcal.welding.touch import touch_start_pose
@@ -42,11 +43,16 @@ def workpiece_scan() -> Scan:
 
 
 def planned(
-    scan: Scan, config: ServoConfig, job: JobCommand = JOB, X_BC: RigidTransform | None = None, offset_m: float = 0.0
+    scan: Scan,
+    config: ServoConfig,
+    job: JobCommand = JOB,
+    X_BC: RigidTransform | None = None,
+    offset_m: float = 0.0,
+    method: PlanningMethod | None = None,
 ) -> PlannedSeam:
     """What the system makes of one scan; the guess of the plate's place is off by some millimetres and a degree."""
     error = RigidTransform(RollPitchYaw(0.0, 0.0, np.radians(1.0)), [0.004 + offset_m, -0.003, 0.0])
-    system = SeamPlanner(the_arm(), TOOL, STRAIGHT, X_BP @ error, config, Q_HOME, CLEARANCE_M, 0.1, X_BC)
+    system = SeamPlanner(the_arm(), TOOL, STRAIGHT, X_BP @ error, config, Q_HOME, CLEARANCE_M, 0.1, X_BC, method)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     for name, value in {"scan": scan, "job": job, "calibration_status": CalibrationStatus()}.items():
@@ -163,3 +169,25 @@ def test_scans_of_anything_else_are_left_alone(config: ServoConfig) -> None:
     calibrating = JobCommand(scan_sequence=1, scan_purpose="calibrate")
     assert planned(nothing, config, job=calibrating).sequence == 0
     assert planned(nothing, config, job=JobCommand(scan_sequence=2, scan_purpose="workpiece")).sequence == 0
+
+
+def test_the_plate_is_found_from_anywhere_when_the_fixture_is_not_to_be_trusted(
+    workpiece_scan: Scan, config: ServoConfig, plan: PlannedSeam
+) -> None:
+    X_BC = plain_station().truth.X_BC
+    beside = planned(workpiece_scan, config, X_BC=X_BC, offset_m=0.12)
+    assert beside.seam is None
+    anywhere = planned(workpiece_scan, config, X_BC=X_BC, offset_m=0.12, method=PlanningMethod(search="anywhere"))
+    assert anywhere.X_BP is not None
+    assert plan.X_BP is not None
+    assert anywhere.X_BP.translation() == pytest.approx(plan.X_BP.translation(), abs=0.2e-3)
+    assert "confidence" in anywhere.words
+
+
+def test_a_scan_too_coarse_for_the_groove_is_a_reason_of_the_cloud_method(
+    workpiece_scan: Scan, config: ServoConfig
+) -> None:
+    answer = planned(workpiece_scan, config, X_BC=plain_station().truth.X_BC, method=PlanningMethod(method="cloud"))
+    # Pixels of 2.5 mm on a groove of 6.6 mm.
+    assert answer.seam is None
+    assert "mm apart" in (answer.reason or "") or "V-groove" in (answer.reason or "")

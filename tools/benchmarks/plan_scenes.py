@@ -1,0 +1,110 @@
+"""Scans of workpieces by ray casting: a part on a table among other things, seen by any scanner preset, seeded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from weldcal.models.mesh import TriMesh, extrude
+from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
+from weldcal.models.workpieces import Workpiece
+
+TABLE_M = 1.4
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What a scanner saw: cloud p_BS (H,W,3) m with NaN where nothing was measured, and the truth beside it."""
+
+    cloud_B: NDArray[np.float64]
+    eye_B: NDArray[np.float64]
+    X_BP: RigidTransform
+    part: Workpiece
+
+
+def box(length: float, width: float, height: float) -> TriMesh:
+    """A box standing on z = 0, m."""
+    corners = 0.5 * np.array([(-length, -width), (length, -width), (length, width), (-length, width)])
+    return extrude(corners, 0.0, height)
+
+
+def table() -> TriMesh:
+    """A table whose top is z = 0."""
+    return box(TABLE_M, TABLE_M, 0.02).transformed(RigidTransform([0.6, 0.0, -0.02]))
+
+
+def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> RigidTransform:
+    """X_BC of a camera at `eye` (3,) that looks at `target` (3,), image rows along x of the base as near as can be."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross(z, [0.0, 1.0, 0.0])
+    x /= np.linalg.norm(x)
+    return RigidTransform(RotationMatrix(np.column_stack([x, np.cross(z, x), z])), eye)
+
+
+def cast(meshes: Sequence[TriMesh], X_BC: RigidTransform, scanner: ScannerPreset, seed: int) -> NDArray[np.float64]:
+    """What the scanner at X_BC sees of meshes given in base, its noise included: (H,W,3) m in base."""
+    import open3d
+
+    tensor: Any = open3d.core.Tensor
+    scene = open3d.t.geometry.RaycastingScene()
+    for mesh in meshes:
+        scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
+    flat = np.ones((scanner.height, scanner.width), dtype=np.float32)
+    rays_C = depth_to_points(flat, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
+    R, eye = X_BC.rotation().matrix(), X_BC.translation()
+    rays = np.concatenate([np.broadcast_to(eye, rays_C.shape), rays_C @ R.T], axis=2).astype(np.float32)
+    # The rays have unit depth, so what the caster calls distance is depth.
+    depth = scene.cast_rays(tensor(rays))["t_hit"].numpy()
+    depth[~np.isfinite(depth)] = 0.0
+    measured = apply_noise(depth, scanner, np.random.default_rng(seed))
+    points_C = depth_to_points(measured, scanner.fx, scanner.fy, scanner.cx, scanner.cy)
+    return np.asarray(points_C @ R.T + eye)
+
+
+def random_pose(rng: np.random.Generator, part: Workpiece, tilt_rad: float, spread_m: float = 0.06) -> RigidTransform:
+    """X_BP of a part wedged up on the table: any turn, a tilt up to `tilt_rad` in any direction, its underside free."""
+    heading, tilt = rng.uniform(-math.pi, math.pi), tilt_rad * math.sqrt(rng.uniform())
+    axis = tilt * np.array([math.cos(heading), math.sin(heading)])
+    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
+        rng.uniform(-math.pi, math.pi)
+    )
+    corners = np.array([[*xy, -part.size_m[2]] for xy in part.outline_P])
+    lift = -float((corners @ R.matrix().T)[:, 2].min()) + 0.0005
+    x, y = np.array([0.6, 0.0]) + rng.uniform(-spread_m, spread_m, size=2)
+    return RigidTransform(R, [x, y, lift])
+
+
+def scan_part(
+    part: Workpiece,
+    scanner: ScannerPreset,
+    seed: int,
+    *,
+    distance_m: float | None = None,
+    tilt_rad: float = 0.0,
+    slant_rad: float = 0.1,
+    spread_m: float = 0.06,
+    others: Sequence[TriMesh] = (),
+    X_BP: RigidTransform | None = None,
+) -> Scene:
+    """A part in a random place and turn under a scanner that hangs roughly above it, `distance_m` away.
+
+    Everything random, the scanner's place and noise included, follows from the seed.
+    """
+    rng = np.random.default_rng([seed, 41])
+    X = random_pose(rng, part, tilt_rad, spread_m) if X_BP is None else X_BP
+    far = distance_m if distance_m is not None else min(0.93, 0.97 * scanner.far_m)
+    around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
+    target = np.array([0.6, 0.0, 0.02])
+    eye = target + far * np.array(
+        [math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)]
+    )
+    X_BC = looking_at(eye, target)
+    X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.3, 0.3)), eye)
+    cloud = cast([part.mesh.transformed(X), table(), *others], X_BC, scanner, seed)
+    return Scene(cloud, eye, X, part)

@@ -1,0 +1,305 @@
+"""Where a plate lies, without a guess: its outline laid over every flat face in every turn, then the fine registration.
+
+Coarse: the planes that face up; on each, the outline as a template (face inside, none just outside) correlated with what
+was seen, over all turns. Fine: register_workpiece from the best of these places. The answer is compared with its
+runners-up: a second place that fits as well, or a half turn that looks the same, is a question and not an answer. What
+the outline leaves open the groove decides, where it was drawn unsymmetrically and can be seen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from pydrake.math import RigidTransform
+from scipy.spatial import cKDTree
+
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces import Workpiece
+from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, turned, upward_planes
+from weldcal.welding.registration import (
+    RegistrationConfig,
+    WorkpieceNotFound,
+    WorkpieceRegistration,
+    register_workpiece,
+)
+
+
+class AmbiguousWorkpiece(WorkpieceNotFound):
+    """The scan agrees with two places of the part, or with two turns of it, and nothing decides."""
+
+
+@dataclass(frozen=True)
+class FindConfig:
+    """How the search goes, and what counts as decided.
+
+    steepest_rad     largest tilt of the part's face from the up direction
+    cell_m, turn_step_rad   of the coarse search
+    candidates       places that are registered finely
+    ambiguous        a runner-up whose score is above this share of the best one's is as good
+    groove_reach_m   how far the real groove may lie from the drawn one
+    least_groove     smallest agreement (-1 to 1) of the groove seen with the one drawn
+    """
+
+    steepest_rad: float = math.radians(20.0)
+    cell_m: float = 0.004
+    turn_step_rad: float = math.radians(4.0)
+    candidates: int = 6
+    ambiguous: float = 0.9
+    groove_reach_m: float = 0.006
+    least_groove: float = 0.2
+    fine: RegistrationConfig = field(
+        default_factory=lambda: RegistrationConfig(max_shift_m=0.010, max_turn_rad=math.radians(4.0))
+    )
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class FoundWorkpiece:
+    """Where the part is, and how sure that is.
+
+    registration  the fine registration at the place found
+    runner_up     score of the next best other place over that of this one, 0 to 1
+    groove        agreement of the groove seen with the one drawn here, -1 to 1; None where it could not be seen
+    turned_groove the same, with the part turned by 180 deg
+    confidence    0 to 1: what the outline supports less what it contradicts, less what the runner-up claims
+    words         that in words
+    """
+
+    registration: WorkpieceRegistration
+    runner_up: float
+    groove: float | None
+    turned_groove: float | None
+    confidence: float
+    words: str
+
+    @property
+    def X_BP(self) -> RigidTransform:
+        """Where the plate is."""
+        return self.registration.X_BP
+
+
+def find_workpiece(
+    points_B: npt.NDArray[np.floating],
+    workpiece: Workpiece,
+    *,
+    turn_hint_rad: float | None = None,
+    eye_B: npt.ArrayLike | None = None,
+    config: FindConfig | None = None,
+) -> FoundWorkpiece:
+    """The plate in a scan (N,3) or (H,W,3), metres in base with z up, anywhere in it and in any turn.
+
+    turn_hint_rad: the part's turn about z to within 90 deg, for parts that look the same after half a turn.
+    eye_B (3,): where the scanner stands, for the covariance.
+
+    Raises:
+        WorkpieceNotFound, AmbiguousWorkpiece: in a sentence; InputError for a scan of the wrong shape.
+    """
+    config = config or FindConfig()
+    points = np.asarray(points_B, dtype=np.float64)
+    if points.ndim < 2 or points.shape[-1] != 3:
+        raise InputError(f"A scan has the shape (N, 3) or (H, W, 3): this one is {points.shape}.")
+    points = points.reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) < config.fine.min_points:
+        raise WorkpieceNotFound(f"The scan has only {len(points)} points: move the workpiece into view.")
+    places = _places(points, workpiece, config)
+    if not places:
+        raise WorkpieceNotFound("The scan shows no flat face that could be the workpiece: move it into view.")
+    fits: list[tuple[float, WorkpieceRegistration]] = []
+    refusal: WorkpieceNotFound | None = None
+    for _, X_BP in places:
+        if any(_same_place(X_BP, f.X_BP, workpiece) for _, f in fits):
+            continue
+        try:
+            found = register_workpiece(points, workpiece, X_BP, config.fine, eye_B)
+        except WorkpieceNotFound as error:
+            refusal = refusal or error
+            continue
+        if not any(_same_place(found.X_BP, f.X_BP, workpiece) for _, f in fits):
+            fits.append((found.confidence, found))
+    if not fits:
+        raise refusal or WorkpieceNotFound("The scan shows no such workpiece: check which one this is.")
+    # Each place in both turns, the groove's word counted beside the outline's.
+    judged = []
+    for score, found in fits:
+        turns = [found] if not _half_turn_fits(workpiece) else [found, found.turned_round(workpiece)]
+        grooves = _groove_agreement(points, workpiece, [t.X_BP for t in turns], config)
+        judged.append((score, turns, grooves))
+    judged.sort(key=lambda j: -(j[0] + max((g for g in j[2] if g is not None), default=0.0)))
+    score, turns, grooves = judged[0]
+    other = 0.0
+    if len(judged) > 1:
+        mine, theirs = (s * (1.0 + max((g for g in gs if g is not None), default=0.0)) for s, _, gs in judged[:2])
+        other = max(0.0, theirs) / max(mine, 1e-9)
+    if other > config.ambiguous:
+        a, b = (1e3 * j[1][0].X_BP.translation() for j in judged[:2])
+        raise AmbiguousWorkpiece(
+            f"Two places in the scan look equally like the {workpiece.name}: near ({a[0]:.0f}, {a[1]:.0f}) and "
+            f"({b[0]:.0f}, {b[1]:.0f}) mm; cover or remove one, or give a guess of where the part is."
+        )
+    return _decided(workpiece, score, turns, grooves, other, turn_hint_rad, config)
+
+
+def _decided(
+    workpiece: Workpiece,
+    score: float,
+    turns: list[WorkpieceRegistration],
+    grooves: list[float | None],
+    other: float,
+    turn_hint_rad: float | None,
+    config: FindConfig,
+) -> FoundWorkpiece:
+    """Which of the two turns it is, and the answer with its confidence; or why that cannot be said."""
+    seen = [g for g in grooves if g is not None]
+    if seen and max(seen) < config.least_groove:
+        raise WorkpieceNotFound(
+            f"A plate of the size of the {workpiece.name} is there, but its groove is not where the drawing has one: "
+            "check which workpiece this is."
+        )
+    chosen, why = 0, "its outline fits in one turn only"
+    if len(turns) == 2:
+        a, b = grooves
+        if a is not None and b is not None and abs(a - b) > 0.25:
+            chosen, why = (0, 1)[b > a], "the groove tells its two turns apart"
+        elif turn_hint_rad is not None:
+            headings = [_heading(t.X_BP) for t in turns]
+            off = [abs(math.remainder(h - turn_hint_rad, 2.0 * math.pi)) for h in headings]
+            chosen, why = int(np.argmin(off)), "the hint says which of its two turns it is"
+            if abs(off[0] - off[1]) < math.radians(20.0):
+                raise AmbiguousWorkpiece(
+                    "The part looks the same turned by 180 deg and lies square to the guess of its turn: give a guess "
+                    "within 80 deg of the truth."
+                )
+        else:
+            what = "its groove cannot be seen" if a is None else "so does its groove"
+            raise AmbiguousWorkpiece(
+                f"The part looks the same turned by 180 deg: its outline is symmetric and {what}; give a guess of its "
+                "turn to within 80 deg."
+            )
+    found = turns[chosen]
+    confidence = float(np.clip(found.confidence * (1.0 - max(0.0, other - 0.5)), 0.0, 1.0))
+    word = "high" if confidence > 0.85 else "fair" if confidence > 0.65 else "low"
+    words = f"{word} confidence {confidence:.2f}: {found.words}; the next best place is {100 * other:.0f} % as good, and {why}"
+    turned_groove = grooves[1 - chosen] if len(grooves) == 2 else None
+    return FoundWorkpiece(found, other, grooves[chosen], turned_groove, confidence, words)
+
+
+def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
+    """Rough poses of the outline on the faces in view, best first."""
+    rng = np.random.default_rng(config.seed)
+    sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
+    center = np.median(sample, axis=0)
+    places: list[tuple[float, RigidTransform]] = []
+    for X in upward_planes(sample - center, config.steepest_rad, 120, rng, most=6):
+        X_BQ = RigidTransform(center) @ X
+        q = into(X_BQ, points)
+        places += [(score, X_BQ @ X_QP) for score, X_QP in _correlate(q, workpiece, config)]
+    places.sort(key=lambda place: -place[0])
+    return places[: config.candidates]
+
+
+def _correlate(q: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
+    """The few best poses of the outline in one plane: turns by template, places by correlation."""
+    cell = config.cell_m
+    reach = 0.5 * float(np.hypot(*workpiece.size_m[:2]))
+    corner = q[:, :2].min(axis=0) - 0.3 * reach
+    size = np.ceil((q[:, :2].max(axis=0) + 0.3 * reach - corner) / cell).astype(int)
+    i = ((q[:, :2] - corner) / cell).astype(np.int64)
+    seen = np.zeros((size[1], size[0]), dtype=np.float32)
+    face = np.abs(q[:, 2]) < 2.0 * PLANE_BAND_M
+    lower = q[:, 2] < -0.004
+    seen[i[lower, 1], i[lower, 0]] = -1.0
+    seen[i[face, 1], i[face, 0]] = 1.0
+    pad = math.ceil(reach / cell) + 4
+    seen = cv2.copyMakeBorder(seen, pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=0.0)
+    corner = corner - pad * cell
+    if min(seen.shape) <= 2 * pad:
+        return []
+    best: list[tuple[float, RigidTransform]] = []
+    turns = np.arange(0.0, math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi, config.turn_step_rad)
+    for turn in turns:
+        template, share = _template(workpiece.outline_P, float(turn), pad, cell)
+        score = cv2.matchTemplate(seen, template, cv2.TM_CCORR)
+        for _ in range(2):
+            k = int(np.argmax(score))
+            row, column = divmod(k, score.shape[1])
+            value = float(score[row, column]) / share
+            if value < 0.3:
+                break
+            place = corner + (np.array([column, row]) + pad + 0.5) * cell
+            best.append((value, turned(float(place[0]), float(place[1]), float(turn))))
+            cv2.circle(score, (column, row), round(0.5 * reach / cell), -1e9, -1)
+    best.sort(key=lambda place: -place[0])
+    kept: list[tuple[float, RigidTransform]] = []
+    for value, X in best:
+        if len(kept) < 4 and not any(_same_place(X, other, workpiece) for _, other in kept):
+            kept.append((value, X))
+    return kept
+
+
+def _template(outline: Floats, turn: float, pad: int, cell: float) -> tuple[npt.NDArray[np.float32], float]:
+    """+1 inside the outline, minus as much in all in a ring just outside, and the score of a perfect match."""
+    c, s = math.cos(turn), math.sin(turn)
+    corners = outline @ np.array([[c, s], [-s, c]]) / cell + pad + 0.5
+    inside = np.zeros((2 * pad + 1, 2 * pad + 1), dtype=np.uint8)
+    cv2.fillPoly(inside, [np.round(corners * 16).astype(np.int32)], 1, shift=4)
+    width = 2 * round(0.014 / cell) + 1
+    ring = cv2.dilate(inside, np.ones((width, width), dtype=np.uint8)) - inside
+    template = inside.astype(np.float32) - ring.astype(np.float32) * (inside.sum() / max(int(ring.sum()), 1))
+    return template.astype(np.float32), 2.0 * float(inside.sum())
+
+
+def _half_turn_fits(workpiece: Workpiece) -> bool:
+    """Whether the outline looks the same after half a turn about its middle, to 2 mm."""
+    outline = workpiece.outline_P
+    middle = outline.mean(axis=0)
+    distance, _ = cKDTree(outline).query(2.0 * middle - outline)
+    return bool(np.max(distance) < 0.002)
+
+
+def _heading(X: RigidTransform) -> float:
+    x = X.rotation().matrix()[:, 0]
+    return math.atan2(x[1], x[0])
+
+
+def _same_place(A: RigidTransform, B: RigidTransform, workpiece: Workpiece) -> bool:
+    """Whether two poses put the part into the same place, half turns of a symmetric part left out."""
+    E = A.InvertAndCompose(B)
+    turn = abs(math.remainder(_heading(E), math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi))
+    return float(np.linalg.norm(E.translation())) < 0.012 and turn < math.radians(8.0)
+
+
+def _groove_agreement(
+    points: Floats, workpiece: Workpiece, poses: list[RigidTransform], config: FindConfig
+) -> list[float | None]:
+    """For each pose: the drawn seam's share with a groove below it, less the share of what is below it elsewhere."""
+    half_width = workpiece.half_width_m
+    inner = 0.5 * np.array(workpiece.size_m[:2]) - 0.008
+    out: list[float | None] = []
+    for X_BP in poses:
+        p = into(X_BP, points)
+        inside = (np.abs(p[:, :2]) < inner).all(axis=1)
+        plane = p[inside & (np.abs(p[:, 2]) < 0.004)]
+        if len(plane) < 300:
+            out.append(None)
+            continue
+        _, sigma = robust_plane(plane)
+        pitch = point_pitch(plane[:, :2])
+        low = p[inside & (p[:, 2] < -max(5.0 * sigma, 0.001)) & (p[:, 2] > -workpiece.size_m[2] + 0.004)][:, :2]
+        drawn = workpiece.seam_P[(np.abs(workpiece.seam_P[:, :2]) < inner).all(axis=1)][::4, :2]
+        if len(low) < 40 or len(drawn) < 20:
+            out.append(None)
+            continue
+        reach = config.groove_reach_m
+        seen = np.asarray(cKDTree(plane[:, :2]).query(drawn)[0]) < 3.0 * half_width
+        hit = np.asarray(cKDTree(low).query(drawn)[0]) < max(reach, pitch)
+        miss = np.asarray(cKDTree(workpiece.seam_P[::4, :2]).query(low)[0]) > half_width + reach
+        if np.count_nonzero(seen) < 0.3 * len(drawn):
+            out.append(None)
+            continue
+        out.append(float(np.mean(hit[seen]) - np.mean(miss)))
+    return out

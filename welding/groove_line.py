@@ -1,0 +1,190 @@
+"""Lines in the face's plane along which a groove is measured: arc length and offset of points, smoothing, corners."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from weldcal.welding.planes import Floats, Mask
+
+STEP_M = 0.0005
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A smooth line through points (N,2) m, about evenly spaced; s = 0 at its first point."""
+
+    points: Floats
+
+    @cached_property
+    def s(self) -> Floats:
+        """Arc length (N,) m at the points."""
+        steps = np.linalg.norm(np.diff(self.points, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    @property
+    def length(self) -> float:
+        """m."""
+        return float(self.s[-1])
+
+    @cached_property
+    def tangents(self) -> Floats:
+        """(N,2) unit."""
+        t = np.gradient(self.points, self.s, axis=0)
+        return np.asarray(t / np.linalg.norm(t, axis=1, keepdims=True))
+
+    @cached_property
+    def normals(self) -> Floats:
+        """(N,2) unit, to the left."""
+        return np.column_stack([-self.tangents[:, 1], self.tangents[:, 0]])
+
+    @cached_property
+    def curvatures(self) -> Floats:
+        """(N,) 1/m, positive to the left."""
+        return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
+
+    def tightest_bend(self, gap: tuple[float, float], over_m: float = 0.016) -> float:
+        """Largest curvature of the line's chords outside a gap, and of its turn from one side of the gap to the other."""
+        step = max(1, round(over_m / (self.length / (len(self.points) - 1))))
+        chords = self.points[step:] - self.points[:-step]
+        heading = np.unwrap(np.arctan2(chords[:, 1], chords[:, 0]))
+        turn = np.abs(heading[step:] - heading[:-step]) / over_m
+        start = self.s[: len(turn)]
+        clear = (start + 2.0 * over_m < gap[0]) | (start > gap[1])
+        a, b = np.searchsorted(self.s, [gap[0] - over_m, gap[1]])
+        across = abs(heading[min(b, len(heading) - 1)] - heading[max(a, 0)]) / (gap[1] - gap[0] + over_m)
+        return max(float(across), float(np.max(turn[clear], initial=0.0)))
+
+    def at(self, s: Floats) -> tuple[Floats, Floats]:
+        """Points (M,2) and left normals (M,2) at arc lengths (M,); straight on beyond the ends."""
+        inside = np.clip(s, 0.0, self.length)
+        points = np.column_stack([np.interp(inside, self.s, self.points[:, k]) for k in range(2)])
+        normals = np.column_stack([np.interp(inside, self.s, self.normals[:, k]) for k in range(2)])
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        along = np.column_stack([normals[:, 1], -normals[:, 0]])
+        return points + (s - inside)[:, None] * along, normals
+
+    def extended(self, before: float, after: float) -> Line:
+        """Straight on beyond both ends, as the last 10 mm head."""
+        points = self.points
+        for distance, end in ((before, 0), (after, -1)):
+            if distance <= 0.0:
+                continue
+            k = max(1, min(len(points) - 1, round(0.010 / (self.length / (len(points) - 1)))))
+            tip = points[end]
+            heading = tip - points[k if end == 0 else -1 - k]
+            heading /= np.linalg.norm(heading)
+            more = tip + np.arange(STEP_M, distance + STEP_M, STEP_M)[:, None] * heading
+            points = np.vstack([more[::-1], points]) if end == 0 else np.vstack([points, more])
+        return Line(points).even()
+
+    def even(self, step: float = STEP_M) -> Line:
+        """The same line, sampled evenly."""
+        s = np.linspace(0.0, self.length, max(4, round(self.length / step) + 1))
+        return Line(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
+
+    def coordinates(self, xy: Floats) -> tuple[Floats, Floats, Mask]:
+        """(s, n) of points (M,2) by their nearest point on the line, and which lie within 30 mm beside it."""
+        nearest = np.asarray(cKDTree(self.points).query(xy, distance_upper_bound=0.03)[1])
+        far = nearest == len(self.points)
+        nearest = np.where(far, 0, nearest)
+        gap = xy - self.points[nearest]
+        along = np.sum(gap * self.tangents[nearest], axis=1)
+        n = np.sum(gap * self.normals[nearest], axis=1)
+        # Towards the centre of a bend the line runs faster than the point.
+        along = np.clip(along / np.maximum(1.0 - n * self.curvatures[nearest], 0.3), -2.0 * STEP_M, 2.0 * STEP_M)
+        beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
+        return self.s[nearest] + along, n, beside
+
+    def rolled(self) -> Line:
+        """A ring that begins and ends half a turn further on; its former joint is closed to the mean of both ends."""
+        points = self.points.copy()
+        gap, over = points[0] - points[-1], min(20, len(points) // 4)
+        share = np.linspace(0.5, 0.0, over)[:, None]
+        points[:over] -= share * gap
+        points[-over:] += share[::-1] * gap
+        half = len(points) // 2
+        return Line(np.vstack([points[half:-1], points[: half + 1]])).even()
+
+    def bridged(self, a: float, b: float, side: float = 0.015) -> Line:
+        """The line with its stretch from a to b replaced by a smooth curve that continues both sides, m."""
+        (p, before, q, after), _ = self.at(np.array([a, max(a - side, 0.0), b, min(b + side, self.length)]))
+        reach = float(np.linalg.norm(q - p))
+        u, v = p - before, after - q
+        u, v = reach * u / np.linalg.norm(u), reach * v / np.linalg.norm(v)
+        t = np.linspace(0.0, 1.0, max(4, round(reach / STEP_M)))[1:-1, None]
+        curve = (
+            (2 * t**3 - 3 * t**2 + 1) * p + (t**3 - 2 * t**2 + t) * u + (3 * t**2 - 2 * t**3) * q + (t**3 - t**2) * v
+        )
+        return Line(np.vstack([self.points[self.s <= a], curve, self.points[self.s >= b]])).even()
+
+    def moved(self, s: Floats, left: Floats) -> Line:
+        """The line moved to its left by amounts (M,) at arc lengths (M,), in between linearly."""
+        amount = np.interp(self.s, s, left)
+        return Line(self.points + amount[:, None] * self.normals).even()
+
+
+def smoothing_weights(at: Floats, s: Floats, sigma: Floats, width: float) -> Floats:
+    """(M,N) weights that turn values at s (N,) into smoothed values at `at` (M,): local parabolas under a Gaussian.
+
+    The Gaussian is `width` m wide, wider where fewer than four values are near; a straight line where they are all on
+    one side (an end), so that nothing is extrapolated by its curvature.
+    """
+    rows = np.zeros((len(at), len(s)))
+    for k, place in enumerate(at):
+        distance = s - place
+        reach = np.sort(np.abs(distance))
+        h = max(width, float(reach[min(4, len(s) - 1)]) / 1.5)
+        weight = np.exp(-0.5 * np.square(distance / h)) / np.square(sigma)
+        x = distance / h
+        columns = [np.ones(len(s)), x]
+        if np.count_nonzero(x < -0.3) >= 2 and np.count_nonzero(x > 0.3) >= 2 and len(s) >= 5:
+            columns.append(x * x)
+        D = np.column_stack(columns)
+        DW = D.T * weight
+        A = DW @ D
+        A += 1e-9 * np.trace(A) * np.eye(len(A))
+        rows[k] = np.linalg.solve(A, DW)[0]
+    return rows
+
+
+def tight_turns(line: Line, turn_rad: float = math.radians(40.0), within_m: float = 0.010) -> list[float]:
+    """Arc lengths m where a line turns by more than an angle within a short length."""
+    heading = np.unwrap(np.arctan2(line.tangents[:, 1], line.tangents[:, 0]))
+    step = max(1, round(within_m / (line.length / (len(line.points) - 1))))
+    if len(heading) <= step:
+        return []
+    turn = np.abs(heading[step:] - heading[:-step])
+    corners = []
+    while len(turn) and turn.max() > turn_rad:
+        k = int(np.argmax(turn))
+        corners.append(float(line.s[k + step // 2]))
+        turn[max(0, k - 2 * step) : k + 2 * step] = 0.0
+    return sorted(corners)
+
+
+def filleted(a: Floats, apex: Floats, b: Floats, radius: float) -> Floats:
+    """Points (N,2) from a to b over a corner rounded with a radius (0: sharp), spaced 0.25 mm round it, m."""
+    u, v = (a - apex) / np.linalg.norm(a - apex), (b - apex) / np.linalg.norm(b - apex)
+    half = 0.5 * math.acos(float(np.clip(u @ v, -1.0, 1.0)))
+    tangent = min(radius / math.tan(half), 0.9 * float(np.linalg.norm(a - apex)), 0.9 * float(np.linalg.norm(b - apex)))
+    radius = tangent * math.tan(half)
+    if radius < 1e-5:
+        return np.vstack([a, apex, b])
+    middle = u + v
+    centre = apex + middle / np.linalg.norm(middle) * radius / math.sin(half)
+    start, stop = apex + tangent * u - centre, apex + tangent * v - centre
+    turn = math.pi - 2.0 * half
+    share = np.linspace(0.0, 1.0, max(3, math.ceil(radius * turn / 0.00025)))[:, None]
+    arc = (np.sin((1.0 - share) * turn) * start + np.sin(share * turn) * stop) / math.sin(turn)
+    return np.vstack([a, centre + arc, b])
+
+
+def meeting_point(p: Floats, t: Floats, q: Floats, w: Floats) -> Floats:
+    """Where the lines p + a t and q + b w meet in the plane."""
+    a, _ = np.linalg.solve(np.column_stack([t, -w]), q - p)
+    return np.asarray(p + a * t)

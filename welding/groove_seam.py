@@ -1,0 +1,124 @@
+"""A measured V-groove: its lines with their sigmas, the limits it is held to, and the named reasons to refuse it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.models.errors import WeldcalError
+from weldcal.welding.groove_search import SearchConfig
+from weldcal.welding.planes import Floats
+from weldcal.welding.seam import SeamCurve
+
+
+class GrooveNotFound(WeldcalError):
+    """The cloud shows no V-groove."""
+
+
+class SeveralGrooves(WeldcalError):
+    """The cloud shows more than one V-groove and nothing says which is meant."""
+
+
+class GrooveTooNarrow(WeldcalError):
+    """The scanner's points lie too far apart for this groove."""
+
+
+class GrooveUncertain(WeldcalError):
+    """The groove is there, but not known well enough to weld."""
+
+
+@dataclass(frozen=True)
+class GrooveConfig:
+    """Limits of the extraction.
+
+    least_pitches  a groove must be this many point distances wide
+    smoothing_m    width of the Gaussian along the seam
+    most_sigma_m   a root that is less certain than this, outside gaps, is refused
+    longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
+    steepest_wall_rad             steeper walls cannot be measured from above: an opening that has them is a gap
+    most_bridge_sigma_m           how uncertain the line may be where it is bridged
+    """
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    least_pitches: float = 3.0
+    smoothing_m: float = 0.0045
+    most_sigma_m: float = 0.0005
+    longest_gap_m: float = 0.045
+    most_missing: float = 0.5
+    most_bridge_sigma_m: float = 0.0015
+    steepest_wall_rad: float = math.radians(78.0)
+
+
+@dataclass(frozen=True, eq=False)
+class GrooveSeam:
+    """A V-groove, by arc length from its start, every millimetre; metres and radians, in the cloud's frame A.
+
+    curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm
+    root, left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root
+    depth, angle         (N,) of the root below the face, and between the walls
+    sigma, sigma_height  (N,) standard deviations of the root sideways and in height
+    gaps                 (from, to) arc lengths that were bridged and not seen;
+    corners, apexes      arc lengths of tight corners, and (K,3) where the two sides meet there
+    ends_seen            whether first and last end lie at the edge of the face, not at the edge of what was seen
+    start                in words, which end is the start
+    X_AF                 the face: origin on it, z up out of it
+    """
+
+    curve: SeamCurve
+    root: Floats
+    left: Floats
+    right: Floats
+    s: Floats
+    depth: Floats
+    angle: Floats
+    sigma: Floats
+    sigma_height: Floats
+    gaps: tuple[tuple[float, float], ...]
+    corners: tuple[float, ...]
+    apexes: Floats
+    closed: bool
+    ends_seen: tuple[bool, bool]
+    start: str
+    X_AF: RigidTransform
+    pitch: float
+    face_sigma: float
+    n_sections: int
+
+    @property
+    def width(self) -> float:
+        """Median width of the opening, m."""
+        return float(np.median(np.linalg.norm(self.left - self.right, axis=1)))
+
+    @property
+    def half_angle(self) -> float:
+        """Half the median angle between the walls, rad."""
+        return 0.5 * float(np.median(self.angle))
+
+    @property
+    def typical_sigma(self) -> float:
+        """Rms over the seam of the root's sigma sideways, m."""
+        return float(np.sqrt(np.mean(np.square(self.sigma))))
+
+    @property
+    def confidence(self) -> float:
+        """Share of the seam that was seen and not bridged, 0 to 1; an end that may lie out of sight takes a tenth."""
+        hidden = sum(b - a for a, b in self.gaps) / float(self.s[-1])
+        return max(0.0, 1.0 - hidden - 0.1 * self.ends_seen.count(False))
+
+    @property
+    def words(self) -> str:
+        """What was found, for a person."""
+        kind = "closed V-groove" if self.closed else "V-groove"
+        text = (
+            f"a {kind} {1e3 * self.s[-1]:.0f} mm long, {1e3 * self.width:.1f} mm wide, "
+            f"{1e3 * float(np.median(self.depth)):.1f} mm deep, {math.degrees(2.0 * self.half_angle):.0f} deg; its root is "
+            f"known to {1e3 * self.typical_sigma:.2f} mm; {self.start}"
+        )
+        for a, b in self.gaps:
+            text += f"; not seen from {1e3 * a:.0f} to {1e3 * b:.0f} mm"
+        for seen, end in zip(self.ends_seen, ("beginning", "end"), strict=True):
+            text += "" if seen else f"; its {end} is not at the plate's edge and may lie out of sight"
+        return text

@@ -1,0 +1,107 @@
+"""One call from a scan to the groove's root: by the drawing laid over the scan, or from the cloud alone."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.math import RigidTransform
+
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces import Workpiece
+from weldcal.welding.find_workpiece import find_workpiece
+from weldcal.welding.groove_cloud import extract_groove
+from weldcal.welding.planes import Floats
+from weldcal.welding.registration import register_workpiece
+
+METHODS = ("cad", "cloud")
+SEARCHES = ("guess", "anywhere")
+
+
+@dataclass(frozen=True)
+class PlanningMethod:
+    """How a seam is planned.
+
+    method   cad: the drawing registered to the scan; cloud: the groove found in the scan, no drawing
+    search   of the drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns apart)
+    start_B  (x, y, z) m: a cloud's seam starts at its end nearest to this; without it nearest to the robot's base
+    """
+
+    method: str = "cad"
+    search: str = "guess"
+    start_B: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.method not in METHODS:
+            raise InputError(f"planning.method must be one of {', '.join(METHODS)}, not '{self.method}'.")
+        if self.search not in SEARCHES:
+            raise InputError(f"planning.search must be one of {', '.join(SEARCHES)}, not '{self.search}'.")
+
+
+@dataclass(frozen=True, eq=False)
+class RootPlan:
+    """The groove's root in base, in the direction of travel.
+
+    root, up      (N,3) m and unit; half_angle_rad between a wall and the groove's middle plane
+    X_BP          where the drawing lies, where one was used
+    sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, which the real one may miss
+    rms_m         of the face's points about their plane; confidence 0 to 1; words: what was found, in a sentence
+    """
+
+    root: Floats
+    up: Floats
+    half_angle_rad: float
+    X_BP: RigidTransform | None
+    sigma_m: float
+    rms_m: float
+    confidence: float
+    words: str
+
+
+def plan_root(
+    points_B: npt.NDArray[np.floating],
+    workpiece: Workpiece,
+    X_BP_guess: RigidTransform,
+    method: PlanningMethod | None = None,
+    eye_B: npt.ArrayLike | None = None,
+) -> RootPlan:
+    """The root of the groove in a scan (N,3) or (H,W,3), metres in base; eye_B (3,): where the scanner stands.
+
+    The cloud method takes nothing from `workpiece`; of several grooves it chooses the one nearest to the guess.
+
+    Raises:
+        WeldcalError: every refusal of registration, search and extraction, in a sentence.
+    """
+    method = method or PlanningMethod()
+    if method.method == "cloud":
+        groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
+        return RootPlan(
+            root=groove.curve.position(np.linspace(0.0, groove.curve.length, len(groove.curve.knots))),
+            up=groove.X_AF.rotation().matrix()[:, 2],
+            half_angle_rad=groove.half_angle,
+            X_BP=None,
+            sigma_m=groove.typical_sigma,
+            rms_m=groove.face_sigma,
+            confidence=groove.confidence,
+            words=groove.words,
+        )
+    if method.search == "anywhere":
+        x = X_BP_guess.rotation().matrix()[:, 0]
+        found = find_workpiece(points_B, workpiece, turn_hint_rad=math.atan2(x[1], x[0]), eye_B=eye_B)
+        registration, confidence, words = found.registration, found.confidence, found.words
+    else:
+        registration = register_workpiece(points_B, workpiece, X_BP_guess, eye_B=eye_B)
+        confidence, words = registration.confidence, registration.words
+    X_BP = registration.X_BP
+    return RootPlan(
+        root=workpiece.seam_P @ X_BP.rotation().matrix().T + X_BP.translation(),
+        up=X_BP.rotation().matrix()[:, 2],
+        half_angle_rad=workpiece.half_angle_rad,
+        X_BP=X_BP,
+        sigma_m=registration.seam_sigma_m,
+        rms_m=registration.rms_m,
+        confidence=confidence,
+        words=words,
+    )
