@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 from weldcal.calibration.circle import fuse
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.face import Face, FlangeFitConfig, Refusal, faces_on_plane
+from weldcal.calibration.frame_search import search_frame, typical_pitches, window_about
 from weldcal.calibration.plane import local_planes
 from weldcal.calibration.rim import plane_axes
 from weldcal.calibration.scene import Scene, crop, islands
+from weldcal.calibration.segmented import fit_segmented
 from weldcal.models.flanges import FlangeStandard
 
 __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit_flange"]
@@ -74,7 +76,15 @@ def fit_flange(
     if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3:
         raise FlangeNotFound(f"A cloud must be (N, 3) or (H, W, 3); this one has the shape {cloud.shape}.")
     refusal = Refusal()
-    if guess is not None:
+    if guess is None and cloud.ndim == 2:
+        face = fit_segmented(cloud, standard, config)
+        if face is not None:
+            return _result(face)
+    if cloud.ndim == 3:
+        found = _organised(cloud, standard, guess, config, refusal)
+        if found is None:
+            _explain_unit(cloud, standard, config)
+    elif guess is not None:
         found = _find(crop(cloud, guess.center_C, guess.radius_m), standard, guess, config, refusal)
     else:
         found = _search(crop(cloud), standard, config, refusal)
@@ -83,6 +93,28 @@ def fit_flange(
     if found is None:
         raise FlangeNotFound(refusal.text)
     return found
+
+
+def _organised(
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+) -> FlangeFit | None:
+    """A scan with its pixel grid: the whole of it, or the window about a guess."""
+    if guess is not None:
+        pitches = typical_pitches(cloud)
+        if pitches is None:
+            refusal.note(0, "The cloud holds no valid point.")
+            return None
+        inside = window_about(cloud, guess.center_C, guess.radius_m, max(1, int(guess.radius_m / (6.0 * pitches[0]))))
+        if inside is None:
+            refusal.note(
+                0,
+                f"Only 0 valid points lie within {1e3 * guess.radius_m:.0f} mm of the expected flange; the flange needs "
+                f"{config.min_points}.",
+            )
+            return None
+        cloud = inside
+    face = search_frame(cloud, standard, config, refusal)
+    return None if face is None else _result(face)
 
 
 def _search(scene: Scene, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> FlangeFit | None:
