@@ -157,7 +157,7 @@ def _edges(
             )
         )
     )
-    points, beyond, slide = _crossings(w, plane, axes)
+    points, off, beyond, slide = _crossings(w, plane, axes)
     clear = [clear_band(standard, pitch, True), clear_band(standard, pitch, False)]
     widths = [2.0 * pitch + 0.0012] * 2
     radii = [radius, standard.face_inner_radius_m]
@@ -167,9 +167,11 @@ def _edges(
     for k in range(2):  # the second time about the circles found in the first, and clear of the holes
         d = points - offset
         rho = np.sqrt((d * d).sum(axis=1))
+        # the far side of a screw hole and a lone pixel's far side face the wrong way
+        outward = (d * off).sum(axis=1)
         rims, lowered = [], []
-        for r, width in zip(radii, widths, strict=True):
-            near = np.abs(rho - r) < width
+        for r, width, way in zip(radii, widths, (outward, -outward), strict=True):
+            near = (np.abs(rho - r) < width) & (way > 0.0)
             low = lowered_by(beyond[near], height)
             lowered.append(low)
             rims.append(d[near] - low * slide[near])
@@ -197,9 +199,9 @@ def _edges(
     return out[0], out[1] if len(out) > 1 else None, pitch
 
 
-def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, Array]:
-    """Where the face ends between neighbours that both say something: places (N, 2) m, how far beyond lies above the
-    plane (N,) m, and how far a place moves per metre that the plane is raised (N, 2)."""
+def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, Array, Array]:
+    """Where the face ends between neighbours that both say something: places (N, 2) m, the step off the face (N, 2) m,
+    how far beyond lies above the plane (N,) m, and how far a place moves per metre that the plane is raised (N, 2)."""
     width = w.x.shape[1]
     across = (w.face[:, 1:] != w.face[:, :-1]) & w.known[:, 1:] & w.known[:, :-1]
     down = (w.face[1:] != w.face[:-1]) & w.known[1:] & w.known[:-1]
@@ -209,11 +211,12 @@ def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, 
     second = np.concatenate([v * width + u + 1, (q + 1) * width + r])
     x, y, face, z, slope = (a.ravel() for a in (w.x, w.y, w.face, w.z, w.slope))
     rx, ry = (a.ravel()[first] for a in w.rays)
-    off = np.where(face[first], second, first)
+    on, off = np.where(face[first], first, second), np.where(face[first], second, first)
     ray = np.column_stack([rx, ry, np.ones(len(first))])
     points = 0.5 * np.column_stack([x[first] + x[second], y[first] + y[second]])
     beyond = np.asarray(z[off] * slope[off] - float(plane.normal @ plane.point), dtype=np.float64)
-    return points, beyond, np.asarray((ray @ axes) / slope[first][:, None])
+    step = np.column_stack([x[off] - x[on], y[off] - y[on]])
+    return points, step, beyond, np.asarray((ray @ axes) / slope[first][:, None])
 
 
 def _labelled(
