@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.face import Face, FlangeFitConfig, Refusal
-from weldcal.calibration.plane import local_planes
 from weldcal.calibration.rim import plane_axes
 from weldcal.calibration.window import measure_window
 from weldcal.models.flanges import FlangeStandard
@@ -22,6 +22,8 @@ _BEND_M = 2.5e-4  # least depth by which three neighbours must bend to be no pla
 _BEND_SIGMAS = (5.0, 3.5)  # of that noise's third; first the one that breaks no face, then the one that stops at less
 _WIDEST = 3.0  # of the flange's diameter: a part that leaked onto its surroundings
 _ROUND = 0.03  # of the flange's diameter: most of an outline lies so close to its circle
+_VERY_ROUND = 0.012  # such a part is tried before the rest is looked at
+_TRIPLES = 40
 _MOST = 60  # parts that are looked at closely
 
 
@@ -125,34 +127,46 @@ def flat_parts(
     with np.errstate(invalid="ignore"):
         flat = (bend < np.maximum(_BEND_M * np.square(inverse[1:-1, 1:-1]), sigmas * noise)).astype(np.uint8)
     _count, labels, stats, _centroids = cv2.connectedComponentsWithStats(flat, connectivity=4, ltype=cv2.CV_32S)
-    size, area = stats[:, cv2.CC_STAT_WIDTH] * 1.0, stats[:, cv2.CC_STAT_AREA]
-    size = np.hypot(size, stats[:, cv2.CC_STAT_HEIGHT])
-    order = np.argsort(-area)
-    parts = []
-    looked = 0
-    for k in order.tolist():
-        if k == 0 or area[k] < 25:
-            continue
-        if looked == _MOST:
-            break
+    parts: list[Part] = []
+    for k in _likeliest(labels, stats, z, grid, standard):
         x, y, w, h = stats[k, :4].tolist()
         inside = labels[y : y + h, x : x + w] == k
-        window = grid[y + 1 : y + 1 + h, x + 1 : x + 1 + w]
-        if size[k] > 40 and not _about_the_size(window, inside, standard):
-            continue
-        looked += 1
-        parts += _parts(window[inside], standard, config)
+        for part in _parts(grid[y + 1 : y + 1 + h, x + 1 : x + 1 + w][inside], standard, config):
+            if part.misfit < _VERY_ROUND:
+                yield part
+            else:
+                parts.append(part)
     yield from sorted(parts, key=lambda p: p.misfit)
 
 
-def _about_the_size(window: Array, inside: NDArray[np.bool_], standard: FlangeStandard) -> bool:
-    """Whether a part's extent, judged from a few of its rows and columns, is of the flange's order."""
-    v, u = np.nonzero(inside[:: max(1, inside.shape[0] // 16), :: max(1, inside.shape[1] // 16)])
-    if len(v) < 4:
-        return True
-    p = window[:: max(1, inside.shape[0] // 16), :: max(1, inside.shape[1] // 16)][v, u]
-    extent = float(np.linalg.norm(p.max(axis=0) - p.min(axis=0)))
-    return 0.5 * standard.outer_m < extent < _WIDEST * standard.outer_m
+def _likeliest(
+    labels: NDArray[np.int32], stats: NDArray[np.int32], z: NDArray[np.float32], grid: Array, standard: FlangeStandard
+) -> list[int]:
+    """Labels of the parts whose box in the image could hold the flange, the most flange-like box first."""
+    some = grid[:: max(1, z.shape[0] // 24), :: max(1, z.shape[1] // 24)]
+    u = np.arange(0, z.shape[1], max(1, z.shape[1] // 24), dtype=float)
+    ray = some[..., 0] / some[..., 2]
+    known = np.isfinite(ray)
+    if int(known.sum()) < 2:
+        return []
+    # metres per pixel and metre of depth, from the rays' own spread
+    uu = np.broadcast_to(u, ray.shape)[known]
+    per_pixel = float(np.ptp(ray[known])) / max(float(np.ptp(uu)), 1.0)
+    count = len(stats)
+    first = np.full(count, -1)
+    flat = labels.ravel()
+    step = max(1, flat.size // 20000)
+    first[flat[::step]] = np.arange(0, flat.size, step)
+    first[0] = -1
+    rows, columns = np.divmod(np.maximum(first, 0), labels.shape[1])
+    depth = z[rows + 1, columns + 1].astype(float)
+    diagonal = np.hypot(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) * depth * per_pixel
+    expected = np.sqrt(2.0) * standard.outer_m
+    with np.errstate(invalid="ignore"):
+        able = (first >= 0) & (diagonal > 0.35 * expected) & (diagonal < _WIDEST * standard.outer_m)
+    able &= stats[:, cv2.CC_STAT_AREA] >= 25
+    ks = np.flatnonzero(able)
+    return [int(k) for k in ks[np.argsort(np.abs(np.log(diagonal[ks] / (0.9 * expected))), kind="stable")][:_MOST]]
 
 
 def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> list[Part]:
@@ -164,18 +178,29 @@ def _parts(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> 
     if rms < config.hypothesis_tolerance_m:
         return [] if whole is None else [whole]
     out = []
-    for p, n, support in local_planes(
-        points, reach=0.9 * standard.outer_m, tolerance=config.hypothesis_tolerance_m, seed=config.seed, hypotheses=60,
-        keep=3, sample=300,
-    ):  # fmt: skip
-        if support < 12:
+    for _ in range(3):
+        if len(points) < 40:
             break
-        on = points[np.abs((points - p) @ n) < 2.0 * config.hypothesis_tolerance_m]
-        on = on[((on - np.median(on, axis=0)) ** 2).sum(axis=1) < standard.outer_m**2]
-        part = _part(on, standard, config)[0] if len(on) > 20 else None
+        few = points[:: max(1, len(points) // 240)]
+        a, b, c = (few[k] for k in (_draws(config.seed) * len(few)).astype(np.intp))
+        normals = np.cross(b - a, c - a)
+        length = np.sqrt((normals * normals).sum(axis=1))
+        normals /= np.maximum(length, 1e-12)[:, None]
+        off = np.abs(normals @ few.T - (normals * a).sum(axis=1)[:, None])
+        best = int(np.argmax((off < config.hypothesis_tolerance_m).sum(axis=1) * (length > 1e-5)))
+        on = np.abs((points - a[best]) @ normals[best]) < 2.0 * config.hypothesis_tolerance_m
+        mine = points[on]
+        mine = mine[((mine - np.median(mine, axis=0)) ** 2).sum(axis=1) < standard.outer_m**2]
+        part = _part(mine, standard, config)[0] if len(mine) > 20 else None
         if part is not None:
             out.append(part)
+        points = points[~on]
     return out
+
+
+@cache
+def _draws(seed: int) -> Array:
+    return np.random.default_rng(seed).random((3, _TRIPLES))
 
 
 def _part(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[Part | None, float]:
@@ -206,7 +231,7 @@ def _hull_circle(hull: Array, bounds: tuple[float, float]) -> tuple[Array, float
         return None
     n = len(hull)
     # every triple of about a dozen corners, spread over the outline
-    some = hull[np.unique(np.linspace(0, n - 1, 14).round().astype(int))]
+    some = hull[np.unique(np.linspace(0, n - 1, 11).round().astype(int))]
     m = len(some)
     i, j, k = (t.ravel() for t in np.meshgrid(*[np.arange(m)] * 3, indexing="ij"))
     keep = (i < j) & (j < k)
