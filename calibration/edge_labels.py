@@ -13,7 +13,7 @@ from weldcal.calibration.errors import CircleFitError
 Array = NDArray[np.float64]
 
 _WRONG = 0.02  # share of labels that may be plainly wrong (flying pixels)
-_SCALES = (0.5, 0.25, 0.12, 0.06)  # width of the border, in pitches: from easy to sharp
+_SCALES = (0.4, 0.16, 0.06)  # width of the border, in pitches: from easy to sharp
 
 
 def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch: float, *, outer: bool) -> CircleFit:
@@ -48,7 +48,7 @@ def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, A
     """Fisher scoring with step halving at one border width: parameters (cx, cy, r), information (3, 3), log
     likelihood."""
     value, gradient, information = _likelihood(xy, side, theta, width)
-    for _ in range(6):
+    for _ in range(4):
         step = np.linalg.solve(information + np.diag(1e-10 * np.diag(information) + 1e-30), gradient)
         for _ in range(6):
             new = _likelihood(xy, side, theta + step, width)
@@ -60,7 +60,7 @@ def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, A
         theta = theta + step
         gain = new[0] - value
         value, gradient, information = new
-        if gain < 1e-2:
+        if gain < 2e-2:
             break
     return theta, information, value
 

@@ -15,6 +15,7 @@ from weldcal.calibration.plane import local_planes
 from weldcal.calibration.rim import plane_axes
 from weldcal.calibration.scene import Scene, crop, islands
 from weldcal.calibration.segmented import fit_segmented
+from weldcal.calibration.window import measure_window
 from weldcal.models.flanges import FlangeStandard
 
 __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit_flange"]
@@ -112,9 +113,27 @@ def _organised(
                 f"{config.min_points}.",
             )
             return None
+        if guess.normal_C is not None:
+            face = _where_it_was(cloud, standard, guess, max(pitches), config)
+            if face is not None:
+                return _result(face)
         cloud = inside
     face = search_frame(cloud, standard, config, refusal)
     return None if face is None else _result(face)
+
+
+def _where_it_was(
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess, pitch: float, config: FlangeFitConfig
+) -> Face | None:
+    """The flange within a few millimetres of a guessed pose, as when it is tracked; None where it must be searched."""
+    assert guess.normal_C is not None
+    reach = 0.5 * standard.outer_m + 2.0 * pitch + 0.003
+    window = window_about(cloud, guess.center_C, reach, max(1, int(reach / (6.0 * pitch))))
+    if window is None:
+        return None
+    center, normal = np.asarray(guess.center_C, dtype=float), np.asarray(guess.normal_C, dtype=float)
+    face = measure_window(window, center, normal, standard.face_outer_radius_m, standard, config, Refusal())
+    return face if face is not None and face.coverage > _GOOD_COVERAGE and face.bore is not None else None
 
 
 def _search(scene: Scene, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> FlangeFit | None:

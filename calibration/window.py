@@ -22,6 +22,7 @@ Mask = NDArray[np.bool_]
 _PLANE_POINTS = 4000
 _FLAT_M = 3e-4  # rms of a face from its plane that a scanner's own distortion may leave
 _FLAT_NOISE = 2.5  # and in multiples of its noise: a ball bends more
+_BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
 _LABELLED = 1.2  # pitches about an edge whose pixels place it; farther ones say nothing that nearer ones do not
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
@@ -130,12 +131,14 @@ def _window(z: Array, valid: Mask, rays: tuple[Array, Array], plane: PlaneFit, a
     along = float(n @ p) / slope
     x, y = (along * (a[0] * rx + a[1] * ry + a[2]) - float(a @ p) for a in axes.T)
     with np.errstate(invalid="ignore"):
-        face = np.abs(z * slope - float(n @ p)) < height
+        above = z * slope - float(n @ p)
+        face = np.abs(above) < height
+        hidden = above > max(3.0 * height, _BEFORE_M)
     gap = (~valid).view(np.uint8)
     void = cv2.morphologyEx(
         cv2.copyMakeBorder(gap, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=1), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
     )[2:-2, 2:-2]
-    return _Window(z, rays, x, y, slope, face, valid | (void > 0))
+    return _Window(z, rays, x, y, slope, face, (valid | (void > 0)) & ~hidden)
 
 
 def _edges(

@@ -33,7 +33,7 @@ class Coverage:
 
     def chance(self) -> tuple[float, float]:
         """Shares between which 99 % of such studies fall where the regions are exact."""
-        low, high = binom.ppf([0.005, 0.995], self.runs, LEVEL) / self.runs
+        low, high = (binom.ppf(q, self.runs, LEVEL) / self.runs for q in (0.005, 0.995))
         return float(low), float(high)
 
 
@@ -42,11 +42,13 @@ def simulated_sightings(
 ) -> tuple[list[Observation], RigidTransform]:
     """Sightings (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``sigma_m`` and ``sigma_rad`` an
     axis, the fit by what its own covariance says (0.02 to 0.06 mm)."""
-    X_BC = RigidTransform(RollPitchYaw(*rng.uniform([2.8, -0.3, -3.1], [3.4, 0.3, 3.1])), rng.uniform(-0.6, 1.0, 3))
+    X_BC = RigidTransform(
+        RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
+    )
     out = []
     for k in range(n):
         p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
-        X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), *rng.uniform(0.0, 2.0 * np.pi, 2))
+        X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
         A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
         covariance = A @ A.T
         normal_sigma = rng.uniform(2e-5, 2e-4)
@@ -82,7 +84,7 @@ def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no
         inside_point += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < limits[1]
         # the same noise as a sighting of this run has, at a place that it did not use
         other = np.random.default_rng([seed, poses, k, 2])
-        place = other.uniform([-0.18, -0.13, 0.5], [0.18, 0.13, 0.9])
+        place = other.uniform(np.array([-0.18, -0.13, 0.5]), np.array([0.18, 0.13, 0.9]))
         seen = place + 1e-4 * other.standard_normal(3) + 4e-5 * other.standard_normal(3)
         true.append(float(np.linalg.norm(estimate.X_BC @ seen - X_BC @ place)))
         stated += estimate.held_out.position_m.tolist()
