@@ -23,6 +23,7 @@ _PLANE_POINTS = 4000
 _FLAT_M = 3e-4  # rms of a face from its plane that a scanner's own distortion may leave
 _FLAT_NOISE = 2.5  # and in multiples of its noise: a ball bends more
 _BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
+_RING_SEEN = 0.6
 _LABELLED = 1.2  # pitches about an edge whose pixels place it; farther ones say nothing that nearer ones do not
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
@@ -274,8 +275,9 @@ def _face(
         pitch=pitch,
         coverage=float(np.count_nonzero(np.bincount(sector, minlength=72))) / 72.0,
         count=count,
-        core_share=float(np.count_nonzero(core & w.face)) / max(int(np.count_nonzero(core)), 1),
-        ring_share=count / max(on_ring, 1),
+        # a bore that is hidden is no bore seen; a ring of which less than half is seen is no ring
+        core_share=1.0 - float(np.count_nonzero(core & w.known & ~w.face)) / max(int(np.count_nonzero(core)), 1),
+        ring_share=count / max(on_ring, int(_RING_SEEN * np.count_nonzero(ring)), 1),
     )
     face = judge(measured, standard, config, refusal)
     if face is None:
