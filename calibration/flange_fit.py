@@ -77,9 +77,13 @@ def fit_flange(
     if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3:
         raise FlangeNotFound(f"A cloud must be (N, 3) or (H, W, 3); this one has the shape {cloud.shape}.")
     refusal = Refusal()
-    if guess is None and cloud.ndim == 2:
-        face = fit_segmented(cloud, standard, config)
-        if face is not None:
+    if cloud.ndim == 2:
+        part = cloud if guess is None else crop(cloud, guess.center_C, guess.radius_m).points
+        face = fit_segmented(part, standard, config)
+        toward = None if guess is None else guess.normal_C
+        if face is not None and (
+            toward is None or float(face.plane.normal @ toward) > float(np.cos(config.max_guess_tilt_rad))
+        ):
             return _result(face)
     if cloud.ndim == 3:
         found = _organised(cloud, standard, guess, config, refusal)

@@ -67,7 +67,7 @@ def fit_segmented(points: Array, standard: FlangeStandard, config: FlangeFitConf
     except CircleFitError:
         return None
     outer_fit, bore = fits
-    seen = _share(rims[0][outer_fit.inliers])
+    seen = _share(rims[0][outer_fit.inliers], sector_count(radius, pitch))
     core = 0.7 * standard.bore_radius_m
     filled = int(np.count_nonzero(rho2 < core**2)) / core**2
     density = on_ring * np.pi / face_area
@@ -183,7 +183,8 @@ def _extreme(dx: Array, dy: Array, rho2: Array, sectors: int, outer: bool) -> Ar
     return np.array([dx[last], dy[last]]).T
 
 
-def _share(edge: Array) -> float:
-    """Share of 72 directions in which an edge point (N, 2) lies."""
-    sector = ((np.arctan2(edge[:, 1], edge[:, 0]) + np.pi) * (72 / (2.0 * np.pi))).astype(np.intp) % 72
-    return float(np.count_nonzero(np.bincount(sector, minlength=72))) / 72.0
+def _share(edge: Array, sectors: int) -> float:
+    """Share of the directions in which an edge point (N, 2) lies, in sectors wide enough to hold two of them."""
+    parts = min(72, max(12, sectors // 2))
+    sector = ((np.arctan2(edge[:, 1], edge[:, 0]) + np.pi) * (parts / (2.0 * np.pi))).astype(np.intp) % parts
+    return float(np.count_nonzero(np.bincount(sector, minlength=parts))) / parts
