@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,6 +93,51 @@ def fit_circle(
         float(np.sqrt(np.mean((e * s)[inliers] ** 2))),
         inliers,
     )
+
+
+def refine_circles(edges: Sequence[Array], radii: Sequence[float], *, noise_floor: float) -> list[CircleFit]:
+    """Circles about the origin of their points (N_k, 2) [m], as ``fit_circle`` refines them from radii [m] that are
+    right to a millimetre or so, all at once: most of a small fit's time is the number of its steps, not their size."""
+    longest = max(len(e) for e in edges)
+    q = np.zeros((len(edges), 2, longest))
+    real = np.zeros((len(edges), longest), dtype=bool)
+    for k, e in enumerate(edges):
+        q[k, :, : len(e)], real[k, : len(e)] = e.T, True
+    n = real.sum(axis=1)
+    rows = np.arange(len(edges))
+    theta = np.column_stack([np.zeros((len(edges), 2)), radii])
+    J = np.empty((len(edges), 3, longest))
+    J[:, 2] = 1.0
+    for k in range(7):
+        d = q - theta[:, :2, None]
+        rho = np.sqrt((d * d).sum(axis=1)) + 1e-15
+        e = rho - theta[:, 2:]
+        size = np.abs(e)
+        if k < 3:
+            scale = np.maximum(_MAD * np.sort(np.where(real, size, np.inf), axis=1)[rows, n // 2], noise_floor)
+        t = e / (_TUKEY * scale[:, None])
+        inside = np.maximum(1.0 - t * t, 0.0) * real
+        w = inside * inside
+        J[:, :2] = d / rho[:, None]
+        weighted = J * w[:, None]
+        normal = weighted @ J.transpose(0, 2, 1)
+        if not (np.abs(np.linalg.det(normal)) > 1e-9 * normal[:, 2, 2] ** 3).all():
+            raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
+        step = np.linalg.solve(normal, weighted @ e[:, :, None])[:, :, 0]
+        theta = theta + step
+        if k > 2 and float(np.abs(step).max()) < 1e-2 * noise_floor:
+            break
+    psi = e * w
+    dpsi = np.where(inside > 0.0, inside * (1.0 - 5.0 * t * t), 0.0).sum(axis=1) / n
+    variance = (psi * psi).sum(axis=1) / np.maximum(n - 3, 1) / np.maximum(dpsi, 0.2) ** 2
+    J *= real[:, None]
+    covariance = variance[:, None, None] * np.linalg.inv(J @ J.transpose(0, 2, 1))
+    out = []
+    for k in range(len(edges)):
+        inliers = inside[k, : n[k]] > 0.0
+        rms = float(np.sqrt((e[k, : n[k]] ** 2 * inliers).sum() / max(int(inliers.sum()), 1)))
+        out.append(CircleFit(theta[k, :2], float(theta[k, 2]), covariance[k], rms, inliers))
+    return out
 
 
 def _covariance(d: Array, rho: Array, e: Array, s: Array, scale: float, free: int) -> Array:

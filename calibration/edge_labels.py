@@ -13,7 +13,7 @@ from weldcal.calibration.errors import CircleFitError
 Array = NDArray[np.float64]
 
 _WRONG = 0.02  # share of labels that may be plainly wrong (flying pixels)
-_SCALES = (1.0, 0.5, 0.25, 0.12, 0.06)  # width of the border, in pitches: from easy to sharp
+_SCALES = (0.4, 0.16, 0.06)  # width of the border, in pitches: from easy to sharp
 
 
 def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch: float, *, outer: bool) -> CircleFit:
@@ -25,14 +25,16 @@ def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch
     is not pulled. The covariance is the inverse of the expected information. Raises CircleFitError where it does not
     converge.
     """
+    places = np.ascontiguousarray(xy.T)
     side = np.where(on_face, -1.0, 1.0) * (1.0 if outer else -1.0)
     theta = np.array([*start.center, start.radius])
     best: tuple[float, Array, Array, float] | None = None
     for scale in _SCALES:
         width = scale * pitch
-        theta, information, value = _climb(xy, side, theta, width)
-        if best is None or value > best[0]:
-            best = (value, theta, information, width)
+        theta, information, value = _climb(places, side, theta, width)
+        if best is not None and value < best[0]:
+            break  # sharper than the border is
+        best = (value, theta, information, width)
     assert best is not None
     _, theta, information, width = best
     if np.linalg.cond(information) > 1e8 or float(np.linalg.norm(theta[:2] - start.center)) > 1.5 * pitch:
@@ -46,8 +48,8 @@ def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, A
     """Fisher scoring with step halving at one border width: parameters (cx, cy, r), information (3, 3), log
     likelihood."""
     value, gradient, information = _likelihood(xy, side, theta, width)
-    for _ in range(12):
-        step = np.linalg.lstsq(information, gradient, rcond=1e-10)[0]
+    for _ in range(4):
+        step = np.linalg.solve(information + np.diag(1e-10 * np.diag(information) + 1e-30), gradient)
         for _ in range(6):
             new = _likelihood(xy, side, theta + step, width)
             if new[0] >= value:
@@ -58,18 +60,20 @@ def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, A
         theta = theta + step
         gain = new[0] - value
         value, gradient, information = new
-        if gain < 1e-4:
+        if gain < 2e-2:
             break
     return theta, information, value
 
 
 def _likelihood(xy: Array, side: Array, theta: Array, width: float) -> tuple[float, Array, Array]:
-    d = xy - theta[:2]
-    rho = np.maximum(np.hypot(d[:, 0], d[:, 1]), 1e-12)
-    z = side * (rho - theta[2]) / width
+    dx, dy = xy[0] - theta[0], xy[1] - theta[1]
+    rho = np.sqrt(dx * dx + dy * dy) + 1e-15
+    z = side * (rho - theta[2]) * (1.0 / width)
     p = _WRONG + (1.0 - 2.0 * _WRONG) * ndtr(z)
-    slope = (1.0 - 2.0 * _WRONG) * np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
-    J = -np.column_stack([d / rho[:, None], np.ones(len(d))]) * (side / width)[:, None]
-    gradient = J.T @ (slope / p)
-    information = (J * (slope**2 / (p * (1.0 - p)))[:, None]).T @ J
+    slope = ((1.0 - 2.0 * _WRONG) / np.sqrt(2.0 * np.pi)) * np.exp(-0.5 * z * z)
+    across = side * (-1.0 / width)
+    J = np.array([dx / rho, dy / rho, np.ones(len(rho))]) * across
+    score = slope / p
+    gradient = J @ score
+    information = (J * (score * slope / (1.0 - p))) @ J.T
     return float(np.log(p).sum()), gradient, information

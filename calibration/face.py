@@ -20,6 +20,9 @@ Array = NDArray[np.float64]
 _CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
 _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so
 _WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
+_FILLED = 0.4  # share of the bore's core that must not be face
+_HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it
+_FULL = 0.85  # and must be where the bore's edge itself was not found
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
 
@@ -62,6 +65,21 @@ class Face:
     coverage: float
     n_points: int
     quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """What the tests of a flange need: its plane and edges, the pitch between points m, the share of the outer edge seen,
+    the points on the face, and the shares of the bore's core and of the ring between the edges that are face."""
+
+    plane: PlaneFit
+    outer: CircleFit
+    bore: CircleFit | None
+    pitch: float
+    coverage: float
+    count: int
+    core_share: float
+    ring_share: float
 
 
 def thickness(plane: PlaneFit) -> float:
@@ -108,7 +126,7 @@ def faces_on_plane(
     return faces
 
 
-def _bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[float, float]:
+def edge_bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[float, float]:
     """Radii that the outer edge may have: between the flat face and the cylinder, and some slack."""
     slack = max(config.radius_tolerance * standard.outer_radius_m, 1.5 * pitch)
     return standard.face_outer_radius_m - slack, standard.outer_radius_m + slack
@@ -118,7 +136,7 @@ def _first_circle(
     part: Array, pitch: float, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal
 ) -> CircleFit | None:
     """The outer edge of a connected part (N, 2), roughly."""
-    bounds = _bounds(pitch, standard, config)
+    bounds = edge_bounds(pitch, standard, config)
     extent = float(np.ptp(part, axis=0).max())
     wanted = f"the flange has {1e3 * standard.outer_m:.0f} mm"
     if extent < bounds[0]:
@@ -149,7 +167,7 @@ def _measure(
     refusal: Refusal,
 ) -> Face | None:
     """Plane and edges in turn, twice; then the tests."""
-    bounds = _bounds(pitch, standard, config)
+    bounds = edge_bounds(pitch, standard, config)
     slack = bounds[1] - standard.outer_radius_m
     bore: CircleFit | None = None
     xy, count = np.zeros((0, 2)), 0
@@ -169,13 +187,17 @@ def _measure(
             center = (center3 - plane.point) @ np.column_stack(plane_axes(plane.normal))
             t = thickness(plane)
             xy, edges, pixels = scene.edges(plane, t, center3, 0.7 * standard.outer_m, labels=final)
-            outer = _edge(xy, edges, pixels, center, outer.radius, pitch, t, _clear(standard, pitch, True), outer=True)
+            outer = _edge(
+                xy, edges, pixels, center, outer.radius, pitch, t, clear_band(standard, pitch, True), outer=True
+            )
         except (PlaneFitError, CircleFitError) as e:
             refusal.note(4, str(e))
             return None
         try:
             radius = standard.face_inner_radius_m if bore is None else bore.radius
-            bore = _edge(xy, edges, pixels, outer.center, radius, pitch, t, _clear(standard, pitch, False), outer=False)
+            bore = _edge(
+                xy, edges, pixels, outer.center, radius, pitch, t, clear_band(standard, pitch, False), outer=False
+            )
         except CircleFitError:
             bore = None
         if bore is not None and (
@@ -183,7 +205,25 @@ def _measure(
             or float(np.linalg.norm(bore.center - outer.center)) > 0.25 * slack + pitch
         ):
             bore = None
-    return _tested(plane, outer, bore, xy, count, pitch, standard, config, refusal)
+    rho = np.linalg.norm(xy - outer.center, axis=1)
+    density = count / (outer.radius**2 - standard.bore_radius_m**2)
+    core = 0.7 * standard.bore_radius_m
+    span = (standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch)
+    middle = (span[0] + 0.75 * (span[1] - span[0]), span[1])  # where every ring of the size has its face
+    full = np.count_nonzero((rho > middle[0]) & (rho < middle[1])) / (middle[1] ** 2 - middle[0] ** 2)
+    measured = Measured(
+        plane=plane,
+        outer=outer,
+        bore=bore,
+        pitch=pitch,
+        coverage=coverage(xy[np.abs(rho - outer.radius) < 2.0 * pitch + 0.0005], outer.center),
+        count=count,
+        core_share=int((rho < core).sum()) / core**2 / max(density, 1e-9),
+        ring_share=np.count_nonzero((rho > span[0]) & (rho < span[1]))
+        / (span[1] ** 2 - span[0] ** 2)
+        / max(full, 1e-9),
+    )
+    return judge(measured, standard, config, refusal)
 
 
 def _between(d: Array, normal: Array, inner: float, outer: float, height: float) -> NDArray[np.bool_]:
@@ -192,7 +232,7 @@ def _between(d: Array, normal: Array, inner: float, outer: float, height: float)
     return np.asarray((rho2 < outer**2) & (rho2 > inner**2) & (np.abs(h) < height))
 
 
-def _clear(standard: FlangeStandard, pitch: float, outer: bool) -> float:
+def clear_band(standard: FlangeStandard, pitch: float, outer: bool) -> float:
     """Half width (m) of the ring about an edge that holds no screw hole."""
     gaps = [
         standard.face_outer_radius_m - np.hypot(x, y) - r
@@ -201,6 +241,17 @@ def _clear(standard: FlangeStandard, pitch: float, outer: bool) -> float:
         for x, y, r in standard.openings()
     ]
     return float(max(min([2.5 * pitch, *gaps]), 1.2 * pitch))
+
+
+def lowered_by(beyond: Array, height: float) -> float:
+    """How far below its plane (m) a face ``height`` thick ends at an edge, from the heights (N,) past the edge.
+
+    Where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
+    sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole.
+    """
+    beyond = beyond[np.isfinite(beyond)]
+    share = float(np.mean((beyond < 0.0) & (beyond > -_CHAMFER_M))) if len(beyond) else 0.0
+    return height if share > _CHAMFER_SHARE else 0.0
 
 
 def _edge(
@@ -225,12 +276,7 @@ def _edge(
     near = np.abs(rho - radius) < width
     if int(near.sum()) < 12:
         raise CircleFitError("Too little of the edge was seen.")
-    # where a chamfer continues the face, the face "ends" one thickness below its plane, and a slanting ray moves that
-    # sideways; away from the scanner a chamfer is foreshortened below a pixel, so the edge is judged as a whole
-    beyond = edges.beyond[near]
-    beyond = beyond[np.isfinite(beyond)]
-    share = float(np.mean((beyond < 0.0) & (beyond > -_CHAMFER_M))) if len(beyond) else 0.0
-    lowered = height if share > _CHAMFER_SHARE else 0.0
+    lowered = lowered_by(edges.beyond[near], height)
     points = edges.points[near] - lowered * edges.slide[near]
     sigma = np.hypot((edges.step[near] * d[near]).sum(axis=1) / rho[near], 0.3 * pitch)
     start = fit_circle(points, sigma=sigma, initial=(center, radius), noise_floor=0.03 * pitch)
@@ -243,45 +289,37 @@ def _edge(
     return replace(fit, covariance=_SHARED * fit.covariance)
 
 
-def _tested(
-    plane: PlaneFit,
-    outer: CircleFit,
-    bore: CircleFit | None,
-    xy: Array,
-    count: int,
-    pitch: float,
-    standard: FlangeStandard,
-    config: FlangeFitConfig,
-    refusal: Refusal,
-) -> Face | None:
+def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> Face | None:
     """The face if its size, its edge and its bore are a flange's; else None, with the reason noted."""
-    bounds = _bounds(pitch, standard, config)
-    rho = np.linalg.norm(xy - outer.center, axis=1)
-    seen = coverage(xy[np.abs(rho - outer.radius) < 2.0 * pitch + 0.0005], outer.center)
-    core = 0.7 * standard.bore_radius_m
-    filled = int((rho < core).sum()) / core**2
-    density = max(count, 1) / (outer.radius**2 - standard.bore_radius_m**2)
-    rough = max(config.max_rim_rms_m, 0.7 * pitch)
-    if not bounds[0] < outer.radius < bounds[1]:
+    bounds = edge_bounds(m.pitch, standard, config)
+    rough = max(config.max_rim_rms_m, 0.7 * m.pitch)
+    if not bounds[0] < m.outer.radius < bounds[1]:
         refusal.note(
             5,
-            f"The circle found is {2e3 * outer.radius:.1f} mm across; the flange has {1e3 * standard.outer_m:.0f} mm.",
+            f"The circle found is {2e3 * m.outer.radius:.1f} mm across; the flange has {1e3 * standard.outer_m:.0f} mm.",
         )
-    elif count < config.min_points:
-        refusal.note(5, f"Only {count} points lie on the face; the flange needs {config.min_points}.")
-    elif seen < config.min_coverage:
-        refusal.note(
-            6, f"Only {100 * seen:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are needed."
-        )
-    elif outer.rms > rough:
+    elif m.count < config.min_points:
+        refusal.note(5, f"Only {m.count} points lie on the face; the flange needs {config.min_points}.")
+    elif m.coverage < config.min_coverage:
         refusal.note(
             6,
-            f"The edge is too rough: {1e3 * outer.rms:.2f} mm rms from its circle; at most {1e3 * rough:.2f} mm is "
+            f"Only {100 * m.coverage:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are needed.",
+        )
+    elif m.outer.rms > rough:
+        refusal.note(
+            6,
+            f"The edge is too rough: {1e3 * m.outer.rms:.2f} mm rms from its circle; at most {1e3 * rough:.2f} mm is "
             "allowed.",
         )
-    elif filled > 0.4 * density:
+    elif m.core_share > _FILLED:
         refusal.note(6, f"The disc found has no bore of {1e3 * standard.bore_m:.1f} mm: it is not the flange.")
+    elif m.ring_share < (_HOLLOW if m.bore is not None else _FULL):
+        refusal.note(
+            6,
+            f"Only {100 * m.ring_share:.0f} % of the ring between the edge and a bore of {1e3 * standard.bore_m:.1f} mm is "
+            "face: it is another ring, not the flange.",
+        )
     else:
-        quality = seen + (1.0 if bore is not None else 0.0) - outer.rms / rough
-        return Face(plane, outer, bore, seen, count, quality)
+        quality = m.coverage + (1.0 if m.bore is not None else 0.0) - m.outer.rms / rough
+        return Face(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
     return None

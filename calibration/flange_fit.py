@@ -10,9 +10,12 @@ from numpy.typing import NDArray
 from weldcal.calibration.circle import fuse
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.face import Face, FlangeFitConfig, Refusal, faces_on_plane
+from weldcal.calibration.frame_search import search_frame, typical_pitches, window_about
 from weldcal.calibration.plane import local_planes
 from weldcal.calibration.rim import plane_axes
 from weldcal.calibration.scene import Scene, crop, islands
+from weldcal.calibration.segmented import fit_segmented
+from weldcal.calibration.window import measure_window
 from weldcal.models.flanges import FlangeStandard
 
 __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit_flange"]
@@ -74,7 +77,19 @@ def fit_flange(
     if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3:
         raise FlangeNotFound(f"A cloud must be (N, 3) or (H, W, 3); this one has the shape {cloud.shape}.")
     refusal = Refusal()
-    if guess is not None:
+    if cloud.ndim == 2:
+        part = cloud if guess is None else crop(cloud, guess.center_C, guess.radius_m).points
+        face = fit_segmented(part, standard, config)
+        toward = None if guess is None else guess.normal_C
+        if face is not None and (
+            toward is None or float(face.plane.normal @ toward) > float(np.cos(config.max_guess_tilt_rad))
+        ):
+            return _result(face)
+    if cloud.ndim == 3:
+        found = _organised(cloud, standard, guess, config, refusal)
+        if found is None:
+            _explain_unit(cloud, standard, config)
+    elif guess is not None:
         found = _find(crop(cloud, guess.center_C, guess.radius_m), standard, guess, config, refusal)
     else:
         found = _search(crop(cloud), standard, config, refusal)
@@ -83,6 +98,46 @@ def fit_flange(
     if found is None:
         raise FlangeNotFound(refusal.text)
     return found
+
+
+def _organised(
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+) -> FlangeFit | None:
+    """A scan with its pixel grid: the whole of it, or the window about a guess."""
+    if guess is not None:
+        pitches = typical_pitches(cloud)
+        if pitches is None:
+            refusal.note(0, "The cloud holds no valid point.")
+            return None
+        inside = window_about(cloud, guess.center_C, guess.radius_m, max(1, int(guess.radius_m / (6.0 * pitches[0]))))
+        if inside is None:
+            refusal.note(
+                0,
+                f"Only 0 valid points lie within {1e3 * guess.radius_m:.0f} mm of the expected flange; the flange needs "
+                f"{config.min_points}.",
+            )
+            return None
+        if guess.normal_C is not None:
+            face = _where_it_was(cloud, standard, guess, max(pitches), config)
+            if face is not None:
+                return _result(face)
+        cloud = inside
+    face = search_frame(cloud, standard, config, refusal)
+    return None if face is None else _result(face)
+
+
+def _where_it_was(
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess, pitch: float, config: FlangeFitConfig
+) -> Face | None:
+    """The flange within a few millimetres of a guessed pose, as when it is tracked; None where it must be searched."""
+    assert guess.normal_C is not None
+    reach = 0.5 * standard.outer_m + 2.0 * pitch + 0.003
+    window = window_about(cloud, guess.center_C, reach, max(1, int(reach / (6.0 * pitch))))
+    if window is None:
+        return None
+    center, normal = np.asarray(guess.center_C, dtype=float), np.asarray(guess.normal_C, dtype=float)
+    face = measure_window(window, center, normal, standard.face_outer_radius_m, standard, config, Refusal())
+    return face if face is not None and face.coverage > _GOOD_COVERAGE and face.bore is not None else None
 
 
 def _search(scene: Scene, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> FlangeFit | None:

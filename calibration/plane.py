@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 
 _TUKEY = 4.685
 _MAD = 1.4826
+_FEW = 1200  # points that find the plane, before all of them make it precise
 
 
 @dataclass(frozen=True)
@@ -33,41 +34,46 @@ def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, no
     Raises PlaneFitError when fewer than 10 points remain or they lie on a line.
     """
     p0, n = start
-    distance = (points - p0) @ n
+    distance = points @ n - float(p0 @ n)
     use = points[np.abs(distance) < tolerance]
     if len(use) < 10:
         raise PlaneFitError("Fewer than 10 points lie near the plane.")
     # about the centroid: raw coordinates 0.5 m away would cost digits in the scatter matrix
-    origin = use.mean(axis=0)
-    use = use - origin
-    q = use[:: max(1, len(use) // 2500)]
-    d = q @ n
-    w = np.ones(len(q))
-    mean, values, scale = np.zeros(3), np.ones(3), tolerance
-    for _ in range(10):
+    origin = use[:: max(1, len(use) // _FEW)].mean(axis=0)
+    everything = np.ascontiguousarray(use.T) - origin[:, None]
+    q = np.ascontiguousarray(everything[:, :: max(1, len(use) // _FEW)])
+    at = np.zeros(3)
+    values, scale = np.ones(3), tolerance
+    for k in range(10):
+        d = n @ q - float(n @ at)
+        if k:
+            few = np.abs(d[:: max(1, len(d) // _FEW)])
+            scale = max(_MAD * float(np.partition(few, len(few) // 2)[len(few) // 2]), noise_floor)
+            t = d * (1.0 / (_TUKEY * scale))
+            w = np.maximum(1.0 - t * t, 0.0)
+            w *= w
+        else:
+            w = np.ones(q.shape[1])
         total = float(w.sum())
         if total < 5.0:
             raise PlaneFitError("Too few points agree on a plane.")
-        mean = (w @ q) / total
-        centred = q - mean
-        values, vectors = np.linalg.eigh((centred * w[:, None]).T @ centred / total)
+        weighted = q * w
+        at = weighted.sum(axis=1) / total
+        values, vectors = np.linalg.eigh(weighted @ q.T / total - at[:, None] * at)
         if values[1] < 1e-12:
             raise PlaneFitError("The points lie on a line.")
-        previous, n = n, vectors[:, 0] * np.sign(vectors[:, 0] @ n or 1.0)
-        settled = float(np.linalg.norm(n - previous)) < 1e-5
-        if settled and len(q) == len(use):
+        previous, n = n, vectors[:, 0] * (np.sign(vectors[:, 0] @ n) or 1.0)
+        settled = k > 1 and float(np.abs(n - previous).max()) < 3e-5
+        if settled and q is everything:
             break
-        if settled:
-            q = use  # a part of the points found the plane; all of them make it precise
-        d = (q - mean) @ n
-        scale = max(_MAD * float(np.median(np.abs(d))), noise_floor)
-        w = np.maximum(1.0 - (d / (_TUKEY * scale)) ** 2, 0.0) ** 2
-    d = (q - mean) @ n
+        if settled or k == 4:
+            q = everything  # a part of the points found the plane; all of them make it precise
+    d = n @ everything - float(n @ at)
     inside = np.abs(d) < _TUKEY * scale
-    count = int(inside.sum())
-    rms = float(np.sqrt(np.mean(d[inside] ** 2)))
+    count = int(np.count_nonzero(inside))
+    rms = float(np.sqrt((d * d * inside).sum() / max(count, 1)))
     normal_sigma = rms / np.sqrt(max(count - 3, 1)) * float(np.sqrt(0.5 / values[1] + 0.5 / values[2]))
-    return PlaneFit(origin + mean, n, rms, count, normal_sigma)
+    return PlaneFit(origin + at, n, rms, count, normal_sigma)
 
 
 def local_planes(

@@ -206,6 +206,18 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
     return "p[" + ", ".join(f"{v:.9f}" for v in (*X_BC.translation(), *rotation_vector(X_BC.rotation()))) + "]\n"
 
 
+def correction_note(result: CalibrationResult) -> str | None:
+    """One sentence for who reads X_BC without this program: it belongs to corrected points; None where it does not."""
+    c = result.scanner_correction
+    if c is None:
+        return None
+    gx, gy = c["gradient_per_m"]
+    return (
+        "X_BC belongs to corrected scanner points: multiply every point (x, y, z), in metres, by "
+        f"{c['scale']:.7f} {gx:+.7f} x {gy:+.7f} y before it is used; without that, calibrate with --no-scanner-correction."
+    )
+
+
 def export_json(result: CalibrationResult) -> str:
     """X_BC and covariance for other programs."""
     qw, qx, qy, qz = _wxyz(result.X_BC)
@@ -217,6 +229,8 @@ def export_json(result: CalibrationResult) -> str:
             "xyz": [float(v) for v in result.X_BC.translation()],
             "quaternion_wxyz": [qw, qx, qy, qz],
             "covariance_rotation_translation": np.asarray(result.covariance).tolist(),
+            "scanner_correction": result.scanner_correction,
+            "note": correction_note(result),
         },
         indent=2,
     )
@@ -224,10 +238,14 @@ def export_json(result: CalibrationResult) -> str:
 
 def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
     """Write every export into ``folder``; returns the paths."""
+    note = correction_note(result)
+    comment = "" if note is None else f"# {note}\n"
     files = {
-        "scanner.urdf.xacro": export_urdf(result.X_BC),
-        "static_transform.sh": export_ros2(result.X_BC),
-        "ur_pose.script": export_ur_pose(result.X_BC),
+        # two hyphens may not stand in an XML comment
+        "scanner.urdf.xacro": ("" if note is None else f"<!-- {note.replace('--', '')} -->\n")
+        + export_urdf(result.X_BC),
+        "static_transform.sh": comment + export_ros2(result.X_BC),
+        "ur_pose.script": comment + export_ur_pose(result.X_BC),
         "X_BC.json": export_json(result),
     }
     for name, text in files.items():

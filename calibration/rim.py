@@ -43,10 +43,13 @@ class EdgePoints:
 
 def plane_axes(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors that complete ``normal`` (3,) to a right-handed orthonormal frame; deterministic."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    e1 = np.cross(helper, normal)
-    e1 /= np.linalg.norm(e1)
-    return e1, np.cross(normal, e1)
+    x, y, z = (float(v) for v in normal)
+    least = min((abs(x), 0), (abs(y), 1), (abs(z), 2))[1]
+    # the cross product of the axis that lies flattest with the normal, written out: np.cross costs 20 microseconds
+    e = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))[least]
+    length = (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]) ** 0.5
+    a, b, c = e[0] / length, e[1] / length, e[2] / length
+    return np.array([a, b, c]), np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
 
 class RayModel:
@@ -68,6 +71,13 @@ class RayModel:
     def _basis(self, u: Array | NDArray[np.intp], v: Array | NDArray[np.intp]) -> Array:
         a, b = (u - self._origin[0]) / self._scale, (v - self._origin[1]) / self._scale
         return np.column_stack([np.ones(len(a)), a, b, a * a, a * b, b * b])
+
+    def grid(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Rays x/z and y/z, each (len(v), len(u)), of a whole grid of pixels."""
+        a, b = (u - self._origin[0]) / self._scale, ((v - self._origin[1]) / self._scale)[:, None]
+        c = self._coefficients.T
+        x, y = ((k[0] + k[1] * a + k[3] * a * a) + b * (k[2] + k[4] * a) + k[5] * (b * b) for k in c)
+        return x, y
 
     def on_plane(self, u: Array, v: Array, point: Array, normal: Array) -> Array:
         """Points (N, 3) m where the rays through pixels (u, v) meet a plane."""
@@ -139,11 +149,16 @@ def sector_edges(xy: Array, center: Array, pitch: float, *, outer: bool, band: t
         return np.zeros((0, 2))
     d, rho, xy = d[near], rho[near], xy[near]
     radius = 0.5 * (band[0] + band[1])
-    sectors = int(np.clip(2.0 * np.pi * radius / (_SECTOR_PITCHES * pitch), 24, 720))
+    sectors = sector_count(radius, pitch)
     sector = np.floor((np.arctan2(d[:, 1], d[:, 0]) + np.pi) / (2.0 * np.pi) * sectors).astype(int) % sectors
     order = np.lexsort((-rho if outer else rho, sector))
     first = np.unique(sector[order], return_index=True)[1]
     return np.asarray(xy[order[first]])
+
+
+def sector_count(radius: float, pitch: float) -> int:
+    """Into how many sectors an edge of that radius is divided."""
+    return int(np.clip(2.0 * np.pi * radius / (_SECTOR_PITCHES * pitch), 24, 720))
 
 
 def coverage(points: Array, center: Array, sectors: int = 72) -> float:

@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 _LEAST_POSES = 8  # nine unknowns, and as many held-out errors as make a comparison
 _LEAST_PATTERNS = 6
+_FEWEST_PATTERNS = 3  # below eight poses, where the hole circle alone decides
+_FEW_RATIO_SIGMA = 1.2e-3  # of one hole circle's size
+_USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
 _STARTS = 30  # random starts of an estimate: these sightings are cleared of gross outliers
 _BLIND_SCALE = 2e-3  # a scale known worse than this is as good as unknown: scanners are right to 0.2 %
 _BLIND_GRADIENT = 2e-2
@@ -90,6 +93,9 @@ def self_calibrate(
     motion: CorrectionEstimate | None = None
     holes: CorrectionEstimate | None = None
     if n < _LEAST_POSES:
+        few = _from_few(observations, patterns, rigid_held_out_m, seed)
+        if few is not None:
+            return few
         return refused(f"No scanner correction: {n} poses do not determine one; take {_LEAST_POSES} or more.")
     motion = from_motion(observations, {}, seed=seed)
     if motion.sigma[0] > _BLIND_SCALE or float(motion.sigma[1:].max()) > _BLIND_GRADIENT:
@@ -130,6 +136,55 @@ def self_calibrate(
         tilt,
         f"The scanner is corrected: {both}; held-out errors fall from {1e3 * before:.3f} to {1e3 * after:.3f} mm (mean). "
         "X_BC belongs to scans that are corrected so.",
+        True,
+    )
+
+
+def from_few_holes(
+    observations: Sequence[Observation], patterns: Mapping[str, HolePattern]
+) -> CorrectionEstimate | None:
+    """Correction from the hole circles of few scans, held towards none by what scanners are usually off; None below three."""
+    A, ratio = _circles([patterns[o.id] for o in observations if o.id in patterns])
+    if len(ratio) < _FEWEST_PATTERNS:
+        return None
+    inverse = np.linalg.inv(A.T @ A / _FEW_RATIO_SIGMA**2 + np.diag(1.0 / _USUAL**2))
+    v = inverse @ (A.T @ (1.0 / ratio - 1.0)) / _FEW_RATIO_SIGMA**2
+    return CorrectionEstimate(_correction(v), np.asarray(inverse))
+
+
+def _from_few(
+    observations: Sequence[Observation], patterns: Mapping[str, HolePattern], rigid_held_out_m: Array, seed: int
+) -> SelfCalibration | None:
+    """The verdict below eight poses: the hole circles alone, believed where errors at poses left out of correction and
+    calibration fall; None where they do not."""
+    holes = from_few_holes(observations, patterns)
+    n = len(observations)
+    if holes is None or n < 4:
+        return None
+    errors, tilts = np.full((2, n), np.nan)
+    config = SolveConfig(seed=seed, leave_one_out=False, hypotheses=_STARTS, min_poses=3, allow_coplanar=True)
+    for i, o in enumerate(observations):
+        rest = [other for other in observations if other is not o]
+        found = from_few_holes(rest, patterns)
+        correction = ScannerCorrection() if found is None else found.correction
+        try:
+            X = estimate_eye_on_base([correction.observation(other) for other in rest], config).X_BC
+        except InputError:
+            return None
+        seen = [correction.observation(o)]
+        errors[i], tilts[i] = float(position_errors(X, seen)[0]), float(tilt_errors(X, seen)[0])
+    before, after = float(np.mean(rigid_held_out_m)), float(np.mean(errors))
+    if not after < _GAIN * before:
+        return None
+    return SelfCalibration(
+        holes.correction,
+        None,
+        holes,
+        errors,
+        tilts,
+        f"The scanner is corrected by the flange's hole circle alone, as {n} poses are too few for the robot's motion to "
+        f"confirm it: {_percent(holes)}; held-out errors fall from {1e3 * before:.3f} to {1e3 * after:.3f} mm (mean). X_BC "
+        "belongs to scans that are corrected so.",
         True,
     )
 

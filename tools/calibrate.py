@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.advice import sampling_advice
 from weldcal.calibration.dataset import Dataset, load_dataset
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange_fit import FlangeFit
@@ -106,6 +107,7 @@ class CalibrationReport:
     k_fold_mm: dict[str, float]
     seconds: float
     out: Path
+    advice: tuple[str, ...] = ()
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `--json` (keys of the design's "calibrate" line, and Algorithm 1's figure beside them)."""
@@ -125,6 +127,7 @@ class CalibrationReport:
             "unobservable": list(r.unobservable),
             "seconds": self.seconds,
             "k_fold_mm": self.k_fold_mm,
+            "advice": list(self.advice),
             "algorithm1": None
             if a is None
             else {
@@ -236,6 +239,7 @@ def calibrate_dataset(
         _summary(1e3 * folds[np.isfinite(folds)]),
         time.monotonic() - started,
         Path(out),
+        sampling_advice(estimate, corrected),
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
@@ -33,6 +34,7 @@ reproduce.command("cell")(reproduce_cell)
 app.add_typer(tablet, name="tablet")
 benchmarks.command("tablet")(benchmark_tablet)
 benchmarks.command("seam-planning")(seam_planning)
+mount_flange(benchmarks)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
@@ -77,6 +79,13 @@ SpeedFactorOption = Annotated[
 ]
 AddressOption = Annotated[
     str, typer.Option("--address", metavar="ADDRESS", help="Loopback address 127.x.y.z of the emulated controller.")
+]
+CorrectionOption = Annotated[
+    bool,
+    typer.Option(
+        "--scanner-correction/--no-scanner-correction",
+        help="Of a dataset: look for the scanner's own scale error, or take its scans as they are.",
+    ),
 ]
 RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
 ScenarioOption = Annotated[
@@ -166,6 +175,7 @@ def calibrate(
         bool,
         typer.Option("--centres", help="Also write centres.csv: the flange centre found in each scan of a dataset."),
     ] = False,
+    scanner_correction: CorrectionOption = True,
     dry_run: DryRunOption = False,
     pace: PaceOption = None,
     speed_factor: SpeedFactorOption = None,
@@ -183,7 +193,14 @@ def calibrate(
 
             folder = out or fresh_folder("calibrate", dataset.resolve().name, seed)
             report = calibrate_dataset(
-                dataset, folder, robot=robot, flange=flange, seed=seed, progress=progress, centres=centres
+                dataset,
+                folder,
+                robot=robot,
+                flange=flange,
+                seed=seed,
+                progress=progress,
+                centres=centres,
+                correct_scanner=scanner_correction,
             )
             summary = report.summary()
             if report.algorithm1 is not None:
@@ -214,6 +231,7 @@ def verify(
     flange: Annotated[
         str | None, typer.Option("--flange", metavar="NAME", help="Flange standard, where the dataset does not say it.")
     ] = None,
+    scanner_correction: CorrectionOption = True,
     seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
@@ -223,7 +241,9 @@ def verify(
         from weldcal.tools.verify import verify_dataset
 
         folder = out or fresh_folder("verify", dataset.resolve().name, seed)
-        report = verify_dataset(result, dataset, folder, flange=flange, seed=seed, progress=progress)
+        report = verify_dataset(
+            result, dataset, folder, flange=flange, seed=seed, progress=progress, correct_scanner=scanner_correction
+        )
     finish("verify", report.summary(), folder, json_wanted=json)
 
 

@@ -88,6 +88,12 @@ class VerifyReport:
         }
 
 
+_UNCORRECTED = (
+    "The result's scanner correction was left out, as asked: its X_BC belongs to corrected points, so these errors are those "
+    "of a program that does not correct its scans."
+)
+
+
 def verify_dataset(
     result: Path,
     dataset: Path,
@@ -96,11 +102,14 @@ def verify_dataset(
     flange: str | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    correct_scanner: bool = True,
 ) -> VerifyReport:
     """Judge a calibration (its folder or calibration.yaml) on a dataset folder; write verification.json and report.html.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
-    is found is named and takes no part in the figures. ``flange`` overrides dataset.yaml; the fits follow ``seed``. Nothing is written unless at least one
+    is found is named and takes no part in the figures. Without ``correct_scanner`` the scans are taken as a program takes
+    them that does not know of the result's correction. ``flange`` overrides dataset.yaml; the fits follow ``seed``. Nothing
+    is written unless at least one
     scan could be judged.
     Raises InputError, one sentence, for everything a user may have mistaken.
     """
@@ -108,7 +117,7 @@ def verify_dataset(
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file; give a folder for the verification.")
     calibration = load_result(Path(result))
-    correction = correction_from_document(calibration.scanner_correction)
+    correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
     data = load_dataset(Path(dataset))
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(
@@ -124,7 +133,9 @@ def verify_dataset(
         raise InputError(f"None of the {len(seen.refused)} scans can be judged; for the first, {first}: {reason}")
     observations = tuple(o if correction is None else correction.observation(o) for o in seen.observations)
     poses = _judge(calibration, data, observations)
+    uncorrected = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
     warnings = (
+        *uncorrected,
         *(f"{id} was not judged: {reason}" for id, reason in seen.refused),
         *_differences(calibration, data, standard.designation),
         *_doubts(calibration, data, observations, poses),

@@ -116,9 +116,18 @@ def test_poses_that_do_not_determine_a_scale_are_refused_with_a_sentence() -> No
     narrow = _verdict(*_cell(WRONG, spread=0.12))
     assert narrow.accepted is None
     assert "positions vary too little" in narrow.sentence
-    few = _verdict(*_cell(WRONG, n=7))
+    few = _verdict(_cell(WRONG, n=7)[0], {})
     assert few.accepted is None
     assert "take 8 or more" in few.sentence
+
+
+def test_below_eight_poses_the_hole_circle_decides_where_held_out_errors_fall() -> None:
+    few = _verdict(*_cell(WRONG, n=7))
+    assert few.accepted is not None
+    assert few.motion is None
+    assert "hole circle alone" in few.sentence
+    # seven circles of 0.12 % each, held back by what scanners usually are: half the error is gone at least
+    assert abs(few.accepted.scale - WRONG.scale) < 0.5 * abs(WRONG.scale - 1.0)
 
 
 def test_the_held_out_error_of_a_pose_never_saw_it() -> None:

@@ -60,6 +60,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         residuals=_residual_bars(report),
         field=_residual_field(report),
         seconds=report.seconds,
+        advice=report.advice,
     )
 
 

@@ -1,0 +1,90 @@
+"""Which poses to add next, and when to stop: what the poses taken so far leave open, in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.observability import turn_deg
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.solve import CalibrationEstimate, point_error_covariance
+
+Array = NDArray[np.float64]
+
+_TURN_DEG = 15.0  # orientations that differ by less hardly tell a bias of the centre from a shift of the camera
+_FLAT = 0.25  # of the widest spread of positions: less in a direction leaves the rotation about the others weak
+_WEAK_FACTOR = 1.5  # of the error in the middle: a corner that is worse is worth a pose
+_LITTLE = 0.1  # gain by one more pose, as a share of the error, that is not worth a scan
+
+
+def sampling_advice(
+    estimate: CalibrationEstimate, observations: Sequence[Observation], *, required_m: float | None = None
+) -> tuple[str, ...]:
+    """Advice from an estimate and the sightings that made it (those left out as outliers count for nothing).
+
+    Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
+    field a scanned point is worst known, and what one more pose like these would gain; with ``required_m`` (standard
+    deviation of a scanned point, 3-D) it says when that is reached. Distances in B.
+    """
+    used = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
+    if len(used) < 2:
+        return ("Add poses: fewer than two can be used.",)
+    p = np.array([o.p_BR for o in used])
+    middle = p.mean(axis=0)
+    spread = np.linalg.svd(p - middle, full_matrices=False)
+    width = spread[1] / np.sqrt(len(used))
+    out = []
+    for k in (1, 2):
+        if width[k] < _FLAT * width[0]:
+            out.append(
+                f"Spread the poses along {_direction(spread[2][k])} of the robot's base: they vary by only "
+                f"{1e3 * width[k]:.0f} mm there (rms), by {1e3 * width[0]:.0f} mm along {_direction(spread[2][0])}."
+            )
+    turned = turn_deg([o.X_BR for o in used])
+    if turned < _TURN_DEG:
+        out.append(
+            f"Turn and tilt the flange between poses, by 20 degrees and more: these differ by {turned:.1f} degrees, so a "
+            "constant error of the flange centre or of the tool's offset cannot be seen."
+        )
+    sigma = sigma_at(estimate, middle)
+    corners = middle + 1.5 * np.vstack([spread[2] * width[:, None], -spread[2] * width[:, None]])
+    errors = np.array([sigma_at(estimate, c) for c in corners])
+    worst = int(np.argmax(errors))
+    if errors[worst] > _WEAK_FACTOR * sigma:
+        x, y, z = 1e3 * corners[worst]
+        out.append(
+            f"The next pose tells most near ({x:.0f}, {y:.0f}, {z:.0f}) mm of the base: a scanned point is known to "
+            f"{1e3 * errors[worst]:.2f} mm there and to {1e3 * sigma:.2f} mm in the middle."
+        )
+    n = len(used)
+    gain = 1.0 - np.sqrt(n / (n + 1.0))
+    if required_m is not None and sigma <= required_m and not out:
+        out.append(f"Stop: a scanned point is known to {1e3 * sigma:.2f} mm, {1e3 * required_m:.2f} mm were asked for.")
+    elif gain < _LITTLE and not out:
+        out.append(
+            f"Stop here if {1e3 * sigma:.2f} mm is enough: one more pose would improve that by {100 * gain:.0f} %, and the "
+            f"scatter of a single scan, {1e3 * estimate.sigma_position_m:.2f} mm an axis, by nothing."
+        )
+    elif gain >= _LITTLE:
+        want = int(np.ceil(1.0 / (1.0 - (1.0 - _LITTLE) ** 2)))
+        out.append(
+            f"Add poses up to {want} or more: each still improves {1e3 * sigma:.2f} mm by {100 * gain:.0f} % or more."
+        )
+    return tuple(out)
+
+
+def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:
+    """Standard deviation (3-D, m) of a scanned point that is seen at ``p_BQ`` (3,) m."""
+    return float(np.sqrt(np.trace(point_error_covariance(estimate, p_BQ))))
+
+
+def _direction(axis: Array) -> str:
+    """The base axis that a direction follows most, or the two that share it."""
+    order = np.argsort(-np.abs(axis))
+    names = "xyz"
+    if abs(axis[order[0]]) > 0.9:
+        return names[int(order[0])]
+    first, second = sorted((int(order[0]), int(order[1])))
+    return f"{names[first]} and {names[second]}"

@@ -1,0 +1,57 @@
+"""One scan that shows the holes gives the scanner's whole pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.few_poses import axis_turn, estimate_from_whole_poses
+from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.holes import HolePattern, find_holes
+from weldcal.calibration.observation import Observation, observation_from_fit
+from weldcal.models.flanges import face_points, get_flange
+
+STANDARD = get_flange("iso9409-1-50-4-m6")
+X_BC = RigidTransform(RollPitchYaw(3.0, 0.1, 0.5), [-0.6, -0.2, 1.3])
+TURN = np.radians(0.9)
+
+
+def _sightings(n: int) -> tuple[list[Observation], dict[str, HolePattern]]:
+    """Scans of a flange whose holes are drilled 0.9 degrees off the robot's flange frame."""
+    rng = np.random.default_rng(2)
+    observations, patterns = [], {}
+    for k in range(n):
+        R = RollPitchYaw(np.pi + 0.1 * k, 0.1, 0.7 * k).ToRotationMatrix()
+        X_CR = RigidTransform(R, [0.05 * k - 0.04, 0.02, 0.5 + 0.03 * k])
+        p = face_points(STANDARD, 0.0004)
+        p = p + 3e-5 * rng.standard_normal(p.shape)
+        drilled = X_CR @ RigidTransform(RotationMatrix.MakeZRotation(TURN), np.zeros(3))
+        points = (drilled @ p.T).T
+        fit = fit_flange(points, STANDARD)
+        pattern = find_holes(points, fit, STANDARD)
+        assert pattern is not None
+        observations.append(observation_from_fit(f"p{k}", X_BC @ X_CR, fit))
+        patterns[f"p{k}"] = pattern
+    return observations, patterns
+
+
+def test_one_scan_is_enough_where_the_turn_of_the_holes_is_known() -> None:
+    observations, patterns = _sightings(3)
+    turn, spread = axis_turn(observations, patterns, X_BC)
+    assert turn == pytest.approx(TURN, abs=np.radians(0.1))
+    assert spread < np.radians(0.1)
+    one = estimate_from_whole_poses(observations[:1], patterns, turn)
+    three = estimate_from_whole_poses(observations, patterns, turn)
+    # at the flange a centre's noise is left; 0.1 degrees of turn over 0.1 m would be 0.17 mm at another place
+    for X, limit in ((one.X_BC, 3e-4), (three.X_BC, 1.5e-4)):
+        error = [np.linalg.norm(X @ o.p_CR - o.p_BR) for o in observations]
+        assert max(error) < limit
+    assert three.ids == ("p0", "p1", "p2")
+
+
+def test_scans_without_holes_are_refused() -> None:
+    observations, _ = _sightings(1)
+    with pytest.raises(TooFewPoses, match="holes"):
+        estimate_from_whole_poses(observations, {})

@@ -1,0 +1,175 @@
+"""Whole scanner frames with a flange whose place is known, or with none but much that resembles one: ray-cast, noisy,
+seeded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from weldcal.models.flanges import FlangeStandard, flange_mesh, flange_ring
+from weldcal.models.mesh import TriMesh, merge, revolve
+from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
+
+Array = NDArray[np.float64]
+
+_THICK_M = 0.012
+_SEGMENTS = 96  # of bodies that are no flange
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One scan (H, W, 3) m with NaN where nothing was measured, and the pose X_CR of the flange in it (None: no flange)."""
+
+    points_C: Array
+    X_CR: RigidTransform | None
+
+
+def facing(p_CR: Array, tilt_rad: float, azimuth_rad: float, turn_rad: float) -> RigidTransform:
+    """A feature pose whose outward normal leans ``tilt_rad`` from the line of sight, turned about its own axis."""
+    to_scanner = -p_CR / np.linalg.norm(p_CR)
+    x = np.cross([0.0, 1.0, 0.0], to_scanner)
+    x /= np.linalg.norm(x)
+    R = RotationMatrix(np.column_stack([x, np.cross(to_scanner, x), to_scanner]))
+    lean = RollPitchYaw(0.0, tilt_rad, 0.0).ToRotationMatrix()
+    return RigidTransform(
+        R @ RotationMatrix.MakeZRotation(azimuth_rad) @ lean @ RotationMatrix.MakeZRotation(turn_rad), p_CR
+    )
+
+
+def random_place(
+    scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, max_tilt_deg: float = 32.0
+) -> RigidTransform:
+    """A feature pose X_CR in the middle of the working range and wholly inside the image."""
+    z = rng.uniform(scanner.near_m + 0.06, min(scanner.far_m - 0.1, 1.5 * scanner.optimum_m))
+    margin = 0.5 * standard.outer_m + 0.01
+    half = [0.5 * size * z / f - margin for size, f in ((scanner.width, scanner.fx), (scanner.height, scanner.fy))]
+    p = np.array([rng.uniform(-half[0], half[0]), rng.uniform(-half[1], half[1]), z])
+    return facing(p, np.radians(rng.uniform(0.0, max_tilt_deg)), *rng.uniform(0.0, 2.0 * np.pi, 2))
+
+
+def flange_frame(
+    scanner: ScannerPreset,
+    standard: FlangeStandard,
+    rng: np.random.Generator,
+    *,
+    X_CR: RigidTransform | None = None,
+    clutter: int = 6,
+    wrist: bool = True,
+) -> Frame:
+    """A frame with the flange on an arm's wrist, a table behind, and ``clutter`` things about it that do not hide it."""
+    X_CR = random_place(scanner, standard, rng) if X_CR is None else X_CR
+    bodies = [flange_mesh(standard, _THICK_M).transformed(X_CR)]
+    if wrist:
+        bodies += [m.transformed(X_CR) for m in _wrist(standard, rng)]
+    bodies += _surroundings(scanner, standard, rng, clutter, clear_of=X_CR)
+    return Frame(_scan(bodies, scanner, rng), X_CR)
+
+
+def empty_frame(
+    scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, clutter: int = 9
+) -> Frame:
+    """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends)."""
+    bodies = _surroundings(scanner, standard, rng, clutter, clear_of=None)
+    for k in range(3):
+        bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
+    return Frame(_scan(bodies, scanner, rng), None)
+
+
+def _wrist(standard: FlangeStandard, rng: np.random.Generator) -> list[TriMesh]:
+    """The last links of an arm behind the flange: a housing wider than it, and a tube across."""
+    r, step = standard.outer_radius_m, -_THICK_M + rng.uniform(0.0, 0.005)
+    housing = _solid([(1.43 * r, step), (1.43 * r, step - 0.06)])
+    across = _solid([(1.3 * r, -0.09), (1.3 * r, 0.09)])
+    X = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, rng.uniform(0, np.pi)), [0.0, 0.0, step - 0.06 - 1.3 * r])
+    return [housing, across.transformed(X)]
+
+
+def _lookalike(standard: FlangeStandard, rng: np.random.Generator, kind: int) -> TriMesh:
+    """What a flange must not be taken for."""
+    r = standard.outer_radius_m
+    if kind == 0:  # a plain disc of just that size, or nearly
+        return _solid([(r * rng.uniform(0.9, 1.1), 0.0), (r, -_THICK_M)])
+    if kind == 1:  # a ring of another size
+        factor = rng.choice([rng.uniform(0.6, 0.85), rng.uniform(1.18, 1.6)])
+        return flange_mesh(flange_ring(2.0 * r * factor, 2.0 * r * factor * 0.5), _THICK_M, segments=_SEGMENTS)
+    wall = rng.uniform(0.08, 0.2) * r  # a tube's end, of just that size outside
+    return flange_mesh(flange_ring(2.0 * r, 2.0 * (r - wall) - 0.002, chamfer_m=0.0005), 0.1, segments=_SEGMENTS)
+
+
+def _surroundings(
+    scanner: ScannerPreset,
+    standard: FlangeStandard,
+    rng: np.random.Generator,
+    count: int,
+    clear_of: RigidTransform | None,
+) -> list[TriMesh]:
+    """A table and loose things, none of which stands between the scanner and the flange."""
+    far = scanner.far_m
+    while True:
+        X_CT = RigidTransform(RollPitchYaw(*rng.uniform(-0.4, 0.4, 2), 0.0), [0.0, 0.0, rng.uniform(0.9, 1.15) * far])
+        # the flange stands clear before the table
+        if clear_of is None or float((X_CT.inverse() @ clear_of.translation())[2]) < -0.15:
+            break
+    out = [box(4.0 * far, 4.0 * far, 0.02).transformed(X_CT)]
+    while len(out) < count + 1:
+        size = rng.uniform(0.02, 0.12, 3)
+        kind = int(rng.integers(3))
+        thing = (
+            box(*size)
+            if kind == 0
+            else _solid([(0.5 * size[0], 0.0), (0.5 * size[0], -size[1])])
+            if kind == 1
+            else _ball(0.5 * size[0])
+        )
+        z = rng.uniform(scanner.near_m + 0.05, far)
+        half = 0.5 * z * np.array([scanner.width / scanner.fx, scanner.height / scanner.fy])
+        p = np.array([rng.uniform(-half[0], half[0]), rng.uniform(-half[1], half[1]), z])
+        if clear_of is not None:
+            q = clear_of.translation()
+            apart = float(np.linalg.norm(p[:2] / p[2] - q[:2] / q[2]))
+            if apart < (0.7 * standard.outer_m + 0.6 * float(np.linalg.norm(size))) / min(p[2], q[2]):
+                continue
+        out.append(thing.transformed(RigidTransform(RollPitchYaw(*rng.uniform(-np.pi, np.pi, 3)), p)))
+    return out
+
+
+def box(x: float, y: float, z: float) -> TriMesh:
+    """A box (m) about its middle."""
+    corners = np.array([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)]) * [x, y, z]
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [t for a, b, c, d in sides for t in ((a, b, c), (a, c, d))]
+    return TriMesh(corners, np.array(triangles))
+
+
+def _solid(outline: list[tuple[float, float]]) -> TriMesh:
+    """A turned body closed at both ends: (radius, z) from the top down."""
+    profile = [(0.0, outline[0][1]), *outline, (0.0, outline[-1][1])]
+    return revolve(np.array(profile), _SEGMENTS)
+
+
+def _ball(radius: float) -> TriMesh:
+    a = np.linspace(0.5 * np.pi, -0.5 * np.pi, 25)
+    profile = np.column_stack([radius * np.cos(a), radius * np.sin(a)])
+    profile[[0, -1], 0] = 0.0
+    return revolve(profile, _SEGMENTS)
+
+
+def _scan(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
+    """The frame that the scanner returns of these bodies."""
+    all_of_it = merge(*bodies)
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    scene.add_triangles(
+        o3d.core.Tensor.from_numpy(all_of_it.vertices.astype(np.float32)),
+        o3d.core.Tensor.from_numpy(all_of_it.triangles.astype(np.uint32)),
+    )
+    rays = np.zeros((scanner.height, scanner.width, 6), dtype=np.float32)
+    rays[..., 3] = ((np.arange(scanner.width) - scanner.cx) / scanner.fx)[None, :]
+    rays[..., 4] = ((np.arange(scanner.height) - scanner.cy) / scanner.fy)[:, None]
+    rays[..., 5] = 1.0
+    depth = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)["t_hit"].numpy()
+    depth = np.where(np.isfinite(depth), depth, 0.0).astype(np.float32)
+    return depth_to_points(apply_noise(depth, scanner, rng), scanner.fx, scanner.fy, scanner.cx, scanner.cy)
