@@ -1,0 +1,229 @@
+"""From sightings to the one fit to trust: starts, gross outliers, candidates, and the choice by errors left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_centre, noise_of, settled_centre
+from weldcal.calibration.handeye.problem import Problem, State, residuals
+from weldcal.calibration.handeye.se3 import mean_of
+from weldcal.calibration.handeye.starts import closed_forms, grid
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers go
+_WORST_SHARE = 0.25  # of the extent: residuals beyond it are no calibration
+_SUBSETS = 60
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to weigh the sightings: the loss, and how much less than estimated the translations count."""
+
+    name: str
+    loss: Loss
+    ratio: float = 1.0
+
+
+CANDIDATES = (
+    Candidate("least squares", Loss.SQUARES),
+    Candidate("Student's t", Loss.STUDENT),
+    Candidate("least squares, rotations first", Loss.SQUARES, 4.0),
+    Candidate("Student's t, rotations first", Loss.STUDENT, 4.0),
+)
+_LEVEL = 0.01  # of the paired t test at which two candidates count as different
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen answer, how it was found, and what the candidates reached: name -> (deg, length) rms of errors left out.
+
+    ``covariance`` of the free poses, 6 each in the order X, Y, Z, in the tangent of se3.moved.
+    """
+
+    state: State
+    covariance: Array
+    fit: Fit
+    method: str
+    start: str
+    scores: dict[str, tuple[float, float]]
+
+
+def solve(
+    problem: Problem,
+    known: State,
+    *,
+    seed: int = 0,
+    starts: tuple[State, ...] = (),
+    max_outliers: float = 0.40,
+    candidates: tuple[Candidate, ...] = CANDIDATES,
+) -> Choice:
+    """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
+
+    The candidate is chosen by errors left out of the fit: the one whose worse column (degrees or length, each relative
+    to the best candidate of that column) is best, so that neither is bought with the other. Raises InconsistentPoses
+    where no rigid poses explain enough sightings.
+    """
+    state, name = _start(problem, known, seed, starts)
+    keep = gate(problem, state)
+    base: Fit | None = None
+    tried_sets: set[bytes] = set()
+    centre = np.zeros(3)
+    for _ in range(10):
+        noise = noise_of(problem, *residuals(problem, state, centre), keep) if base is None else base.noise
+        base = fit(problem, state, centre=centre, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-3)
+        state = base.state
+        tried_sets.add(keep.tobytes())
+        centre = noise_centre(problem, state, keep)
+        new = _within(problem, base)
+        if new.tobytes() in tried_sets or int(new.sum()) < 4:
+            break
+        keep = new
+    assert base is not None
+    need = max(3, int(np.ceil((1.0 - max_outliers) * len(problem) - 1e-9)))
+    if int(keep.sum()) < need and len(problem) > 4:
+        raise InconsistentPoses(
+            f"Only {int(keep.sum())} of {len(problem)} poses agree on one answer; check units, pose order, the quaternion"
+            " order, and which pose is stated from which frame."
+        )
+    seen = bool((problem.full | problem.normal).any())
+    turned = float(np.sqrt(base.noise.rotation)) if seen else 0.0
+    if np.sqrt(base.noise.translation) > _WORST_SHARE * extent(problem) or turned > 0.35:
+        raise InconsistentPoses(
+            f"The poses disagree by {np.degrees(turned):.1f} deg and "
+            f"{100.0 * np.sqrt(base.noise.translation) / extent(problem):.0f} % of their own extent; check units, pose "
+            "order, the quaternion order, and which pose is stated from which frame."
+        )
+    tight, tight_noise, centre = settled_centre(problem, base.state, base.noise, keep, centre)
+    fits: dict[str, Fit] = {}
+    # only full poses hold the rotation of X without their translations
+    tried = [c for c in candidates if bool(problem.full.all()) or c.ratio == 1.0] or list(candidates)
+    for c in tried:
+        noise = replace(tight_noise, ratio=c.ratio)
+        fits[c.name] = fit(problem, tight, centre=centre, noise=noise, loss=c.loss, keep=keep)
+    agreed = _alike(fits)
+    best = fits[agreed[0]]
+    state, covariance = best.state, best.scaled.covariance()
+    if len(agreed) > 1:
+        chosen = [fits[k] for k in agreed]
+        parts = [mean_of([f.state[k] for f in chosen]) if problem.free[k] else known[k] for k in range(3)]
+        state = parts[0], parts[0] if problem.tied else parts[1], parts[2]
+        covariance = (
+            sum((f.scaled.cross_covariance(o.scaled) for f in chosen for o in chosen), np.zeros_like(covariance))
+            / len(chosen) ** 2
+        )
+    scores = {k: _left_out(f) for k, f in fits.items()}
+    return Choice(state, 0.5 * (covariance + covariance.T), best, " + ".join(agreed), name, scores)
+
+
+def gate(problem: Problem, state: State, centre: Array | None = None) -> Flags:
+    """Sightings (n,) whose residuals lie within the gate, the noise taken from the medians."""
+    w, d = residuals(problem, state, centre)
+    everything = np.ones(len(problem), dtype=bool)
+    if len(problem) <= 4:
+        return everything
+    noise = noise_of(problem, w, d, everything)
+    return _inside(problem, w, d, noise.rotation, noise.translation)
+
+
+def _within(problem: Problem, base: Fit) -> Flags:
+    if len(problem) <= 4:
+        return np.ones(len(problem), dtype=bool)
+    return _inside(problem, base.w, base.d, base.noise.rotation, base.noise.translation)
+
+
+def _inside(problem: Problem, w: Array, d: Array, rotation: float, translation: float) -> Flags:
+    own_w, own_d = 0.0, 0.0
+    if problem.covariance is not None:
+        diagonal = np.diagonal(problem.covariance, axis1=1, axis2=2)
+        own_w, own_d = diagonal[:, :3].max(axis=1), diagonal[:, 3:].max(axis=1)
+    square = np.maximum((w**2).sum(axis=1) / (rotation + own_w), (d**2).sum(axis=1) / (translation + own_d))
+    return np.asarray(square < 3.0 * _GATE**2)
+
+
+def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...]) -> tuple[State, str]:
+    rng = np.random.default_rng(seed)
+    pool = [("given", s) for s in starts] + closed_forms(problem, known)
+    best, cost, name = _best(problem, pool, 2)
+    if best is not None and _clean(problem, best):
+        return best, name
+    # gross outliers or a closed form that failed: minimal sets, then turns of the cube
+    size = 8 if all(problem.free) else 3 if problem.full.all() else 5
+    subsets: list[tuple[str, State]] = []
+    if len(problem) > size + 1:
+        for _ in range(_SUBSETS):
+            rows = rng.choice(len(problem), size, replace=False)
+            forms = closed_forms(problem.pick(rows), known)
+            subsets += [(f"minimal sets, {n}", s) for n, s in forms[:2]]
+    other, other_cost, other_name = _best(problem, subsets + grid(problem, known, rng), 6)
+    if best is None or (other is not None and other_cost < cost * (1.0 - 1e-6)):
+        best, cost, name = other, other_cost, other_name
+    if best is None:
+        raise InconsistentPoses("No rigid poses explain the measurements; check units, pose order and frames.")
+    return best, name
+
+
+def _best(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[State | None, float, str]:
+    """The start with the least cost after a descent from the most promising ones."""
+    if not pool:
+        return None, np.inf, ""
+    length = extent(problem)
+    ranked: list[tuple[float, int, str, State]] = []
+    for name, state in pool:
+        if not all(np.isfinite(X).all() for X in state):
+            continue
+        w, d = residuals(problem, state)
+        s = 4.0 * (w**2).sum(axis=1) + 16.0 * (d**2).sum(axis=1) / length**2
+        ranked.append((float((s / (1.0 + s)).sum()), len(ranked), name, state))
+    ranked.sort(key=lambda r: r[:2])
+    best: tuple[State | None, float, str] = (None, np.inf, "")
+    for _, _, name, state in ranked[:tries]:
+        state, cost = descend(problem, state)
+        if cost < best[1] * (1.0 - 1e-6):
+            best = (state, cost, name)
+        elif cost < best[1] * (1.0 + 1e-4):
+            break  # the same valley from another start
+    return best
+
+
+def _clean(problem: Problem, state: State) -> bool:
+    w, d = residuals(problem, state)
+    noise = noise_of(problem, w, d, np.ones(len(problem), dtype=bool))
+    turned = np.sqrt(noise.rotation) if (problem.full | problem.normal).any() else 0.0
+    few = int((~gate(problem, state)).sum()) <= max(0.02 * len(problem), 1)
+    return few and np.sqrt(noise.translation) < 0.05 * extent(problem) and bool(turned < 0.1)
+
+
+def _left_out(f: Fit) -> tuple[float, float]:
+    w, d = f.left_w[f.keep], f.left_d[f.keep]
+    return float(np.degrees(np.sqrt((w**2).sum(axis=1).mean()))), float(np.sqrt((d**2).sum(axis=1).mean()))
+
+
+def _alike(fits: dict[str, Fit]) -> list[str]:
+    """The candidate with the least regret, and those whose errors left out cannot be told apart from the best of either
+    column (paired t test of the squares)."""
+    squares = {
+        k: np.column_stack([(f.left_w[f.keep] ** 2).sum(axis=1), (f.left_d[f.keep] ** 2).sum(axis=1)])
+        for k, f in fits.items()
+    }
+    means = {k: s.mean(axis=0) for k, s in squares.items()}
+    least = np.maximum(np.min(list(means.values()), axis=0), 1e-300)
+    order = sorted(fits, key=lambda k: (float(max(means[k] / least)), list(fits).index(k)))
+    column_best = [list(means)[int(np.argmin([m[c] for m in means.values()]))] for c in range(2)]
+    limit = float(student.ppf(1.0 - 0.5 * _LEVEL, max(len(squares[order[0]]) - 1, 1)))
+    out = [order[0]]
+    for k in order[1:]:
+        apart = False
+        for c in range(2):
+            difference = squares[k][:, c] - squares[column_best[c]][:, c]
+            error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
+            apart |= bool(float(difference.mean()) > limit * error)
+        if not apart:
+            out.append(k)
+    return out
