@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_centre, noise_of, settled_centre
+from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_of, settled_centre
 from weldcal.calibration.handeye.problem import Problem, State, residuals
 from weldcal.calibration.handeye.se3 import mean_of
 from weldcal.calibration.handeye.starts import closed_forms, grid
@@ -74,13 +75,11 @@ def solve(
     keep = gate(problem, state)
     base: Fit | None = None
     tried_sets: set[bytes] = set()
-    centre = np.zeros(3)
     for _ in range(10):
-        noise = noise_of(problem, *residuals(problem, state, centre), keep) if base is None else base.noise
-        base = fit(problem, state, centre=centre, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-3)
+        noise = noise_of(problem, *residuals(problem, state), keep) if base is None else base.noise
+        base = fit(problem, state, centre=np.zeros(3), noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
         state = base.state
         tried_sets.add(keep.tobytes())
-        centre = noise_centre(problem, state, keep)
         new = _within(problem, base)
         if new.tobytes() in tried_sets or int(new.sum()) < 4:
             break
@@ -100,13 +99,15 @@ def solve(
             f"{100.0 * np.sqrt(base.noise.translation) / extent(problem):.0f} % of their own extent; check units, pose "
             "order, the quaternion order, and which pose is stated from which frame."
         )
-    tight, tight_noise, centre = settled_centre(problem, base.state, base.noise, keep, centre)
+    tight, tight_noise, centre = settled_centre(problem, base.state, base.noise, keep)
     fits: dict[str, Fit] = {}
     # only full poses hold the rotation of X without their translations
     tried = [c for c in candidates if bool(problem.full.all()) or c.ratio == 1.0] or list(candidates)
     for c in tried:
-        noise = replace(tight_noise, ratio=c.ratio)
-        fits[c.name] = fit(problem, tight, centre=centre, noise=noise, loss=c.loss, keep=keep)
+        near = next((f for k, f in reversed(fits.items()) if f.loss is c.loss), None)
+        noise = replace(tight_noise if near is None else near.noise, ratio=c.ratio)
+        begin = tight if near is None else near.state
+        fits[c.name] = fit(problem, begin, centre=centre, noise=noise, loss=c.loss, keep=keep)
     agreed = _alike(fits)
     best = fits[agreed[0]]
     state, covariance = best.state, best.scaled.covariance()
@@ -149,18 +150,23 @@ def _inside(problem: Problem, w: Array, d: Array, rotation: float, translation: 
 
 def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...]) -> tuple[State, str]:
     rng = np.random.default_rng(seed)
-    pool = [("given", s) for s in starts] + closed_forms(problem, known)
-    best, cost, name = _best(problem, pool, 2)
-    if best is not None and _clean(problem, best):
-        return best, name
+    best: State | None = None
+    cost, name = np.inf, ""
+    # a closed form that fits well needs no second opinion
+    for found in chain([[("given", s) for s in starts]], ([form] for form in closed_forms(problem, known))):
+        state, new, given = _best(problem, found, 2)
+        if state is not None and new < cost:
+            best, cost, name = state, new, given
+            if _clean(problem, best):
+                return best, name
     # gross outliers or a closed form that failed: minimal sets, then turns of the cube
     size = 8 if all(problem.free) else 3 if problem.full.all() else 5
     subsets: list[tuple[str, State]] = []
     if len(problem) > size + 1:
         for _ in range(_SUBSETS):
             rows = rng.choice(len(problem), size, replace=False)
-            forms = closed_forms(problem.pick(rows), known)
-            subsets += [(f"minimal sets, {n}", s) for n, s in forms[:2]]
+            forms = islice(closed_forms(problem.pick(rows), known), 2)
+            subsets += [(f"minimal sets, {n}", s) for n, s in forms]
     other, other_cost, other_name = _best(problem, subsets + grid(problem, known, rng), 6)
     if best is None or (other is not None and other_cost < cost * (1.0 - 1e-6)):
         best, cost, name = other, other_cost, other_name

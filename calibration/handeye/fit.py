@@ -114,52 +114,43 @@ def noise_of(problem: Problem, w: Array, d: Array, keep: Flags) -> Noise:
     return Noise(max(rotation, _TINY), max(translation, floor))
 
 
-def noise_centre(problem: Problem, state: State, keep: Flags) -> Array:
-    """The point (3,) of the target T whose displacement is least tied to the rotation noise; zero without full poses.
-
-    A camera errs about the middle of a board, not about the origin someone gave it. Solved together with the free
-    positions, their rotations given: linear, so it moves with any choice of frames.
-    """
-    rows = keep & problem.full
-    if int(rows.sum()) < 5:
-        return np.zeros(3)
-    sub = problem.pick(rows)
-    lin = linearise(sub, state, np.zeros(3))
-    n = len(sub)
-    turn = exp_rotation(lin.w) - np.eye(3)  # displacement of p: (R_D - 1) p + t
-    positions = [c + k for c in range(3, problem.size, 6) for k in range(3)]
-    A = np.concatenate([turn, lin.Jd[:, :, positions]], axis=2).reshape(3 * n, -1)
-    scale = np.maximum(np.sqrt((A**2).sum(axis=0)), 1e-30)
-    if float(np.sqrt((lin.w**2).sum(axis=1).mean())) < 1e-9:
-        return np.zeros(3)
-    return np.asarray((-np.linalg.lstsq(A / scale, lin.d.reshape(-1), rcond=1e-9)[0] / scale)[:3])
-
-
 def settled_centre(
-    problem: Problem, state: State, noise: Noise, keep: Flags, centre: Array, tolerance: float = 1e-13
+    problem: Problem, state: State, noise: Noise, keep: Flags, tolerance: float = 1e-7
 ) -> tuple[State, Noise, Array]:
-    """Least squares and noise centre made to agree: what they settle at does not depend on the frames started from."""
+    """Least squares for the unknowns and the noise centre together.
+
+    The centre (3,) is the point of the target T whose displacement is least: a camera errs about the middle of a board,
+    not about the origin someone gave it. An unknown like the others, it moves with any choice of frames. Zero where full
+    poses are too few, or exact.
+    """
     sub = problem if keep.all() else problem.pick(keep)
-    everything = np.ones(len(sub), dtype=bool)
-    length = extent(sub)
-    floor = length**2 * _TINY
+    floor = extent(sub) ** 2 * _TINY
     noise = replace(noise, ratio=1.0)
-    best = np.inf
+    centre = np.zeros(3)
+    open_centre = int(sub.full.sum()) >= 5
+    before = np.inf
+    lin = linearise(sub, state, centre)
     for _ in range(60):
-        lin = linearise(sub, state, centre)
-        s = Scaled(sub, lin, noise, Loss.SQUARES)
-        change = -s.V @ s.g
-        state = sub.step(state, change)
-        noise = s.variances(linearise(sub, state, centre), noise, floor)
-        new = noise_centre(sub, state, everything)
-        size = float(np.sqrt(max(float(change @ s.A @ change), 0.0))) + float(np.linalg.norm(new - centre)) / length
-        centre = new
-        if size < tolerance or (size < 1e-10 and size >= 0.5 * best):
-            break
-        if noise.translation <= floor and noise.rotation <= _TINY:  # exact data have no centre of noise
+        if noise.translation <= floor and noise.rotation <= _TINY:
             return state, noise, np.zeros(3)
-        best = min(best, size)
+        extra = _centre_columns(sub, lin) if open_centre else None
+        s = Scaled(sub, lin, noise, Loss.SQUARES, extra)
+        change = -s.V @ s.g
+        size = float(np.sqrt(max(float(change @ s.A @ change), 0.0)))
+        state = sub.step(state, change[: sub.size])
+        if open_centre:
+            centre = centre + change[sub.size :]
+        lin = linearise(sub, state, centre)
+        noise = s.variances(lin, noise, floor)
+        if size < tolerance or (size < 1e-7 and size >= 0.5 * before):
+            break
+        before = size
     return state, noise, centre
+
+
+def _centre_columns(problem: Problem, lin: Linearised) -> Array:
+    """Derivative (n, 3, 3) of the displacement (R_D - 1) c + t by the centre c."""
+    return np.where(problem.full[:, None, None], exp_rotation(lin.w) - np.eye(3), 0.0)
 
 
 def fit(
@@ -171,7 +162,7 @@ def fit(
     loss: Loss,
     keep: Flags,
     iterations: int = 60,
-    tolerance: float = 1e-13,
+    tolerance: float = 1e-6,
 ) -> Fit:
     """Newton's method with the mean slope of the loss from a good start; the variances are re-estimated at every step.
 
@@ -184,7 +175,7 @@ def fit(
     s = Scaled(sub, lin, noise, loss)
     before = np.inf
     for _ in range(iterations):
-        change = -s.V @ s.g
+        change = -s.newton() @ s.g
         size = float(np.sqrt(max(float(change @ s.A @ change), 0.0)))
         state = sub.step(state, change)
         lin = linearise(sub, state, centre)
@@ -192,11 +183,11 @@ def fit(
         settled = abs(new.rotation / noise.rotation - 1.0) + abs(new.translation / noise.translation - 1.0)
         noise = new
         s = Scaled(sub, lin, noise, loss)
-        if size < tolerance and settled < 100.0 * tolerance:
+        if size < tolerance and settled < tolerance:
             break
         if size < 0.1 and noise.translation <= floor and noise.rotation <= _TINY:  # exact data
             break
-        if size < 1e-8 and settled < 1e-8 and size >= 0.5 * before:  # rounding: nothing left to gain
+        if size < 1e-7 and settled < 1e-7 and size >= 0.5 * before:  # rounding: nothing left to gain
             break
         before = size
     w, d = residuals(problem, state, centre)
@@ -208,7 +199,10 @@ def fit(
 class Scaled:
     """One linearisation in units of its noise: normal equations, robust weights, covariance, errors left out."""
 
-    def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss) -> None:
+    def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, extra: Array | None = None) -> None:
+        if extra is not None:  # columns of further unknowns that only displace
+            Jw = np.concatenate([lin.Jw, np.zeros_like(extra)], axis=2)
+            lin = Linearised(lin.w, lin.d, Jw, np.concatenate([lin.Jd, extra], axis=2))
         n = len(problem)
         self.loss, self.noise, self.n = loss, noise, n
         self.numbers_w = np.where(problem.full, 3.0, np.where(problem.normal, 2.0, 0.0))
@@ -236,6 +230,28 @@ class Scaled:
         taken_w = self.slope_w * float(np.einsum("ij,ji->", self.V, self.Gw))
         taken_d = self.slope_d / self.inflate * float(np.einsum("ij,ji->", self.V, self.Gd))
         self.free_w, self.free_d = max(self.total_w - taken_w, 0.3), max(self.total_d - taken_d, 0.3)
+
+    def newton(self) -> Array:
+        """Inverse of the exact second derivative of the robust cost (Gauss-Newton in the residuals); that of the mean
+        slope where the exact one is not positive."""
+        if self.loss is Loss.SQUARES:
+            return self.V
+        N = np.zeros_like(self.A)
+        for J, e, q, m, w, inflate in (
+            (self.Jw, self.ew, self.qw, self.m_w, self.ww, 1.0),
+            (self.Jd, self.ed, self.qd, 3.0, self.wd, self.inflate),
+        ):
+            N += _gram(J * np.sqrt(w / inflate)[:, None, None])
+            if self.loss is Loss.STUDENT:
+                bend = 2.0 * w / (_STUDENT + q)
+            else:
+                bend = np.where(q > m * _HUBER**2, w / np.maximum(q, 1e-300), 0.0)
+            along = (np.swapaxes(J, 1, 2) @ e[:, :, None])[:, :, 0] * np.sqrt(bend / inflate)[:, None]
+            N -= along.T @ along
+        s = 1.0 / np.sqrt(np.maximum(np.diag(self.A), 1e-300))
+        if float(np.linalg.eigvalsh(N * s[:, None] * s)[0]) < -RANK:
+            return self.V
+        return inverse_information(N)
 
     def _whiten(self, lin: Linearised) -> tuple[Array, Array]:
         assert self.root is not None

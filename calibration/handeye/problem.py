@@ -127,7 +127,7 @@ def linearise(problem: Problem, state: State, centre: Array) -> Linearised:
             Q = RLt @ (Y[:3, :3] @ problem.H[:, :3, :3])
             origin = Y[:3, :3] @ problem.H[:, :3, 3].T
             v = point - origin.T - Y[:3, 3]  # from the frame that carries Z to the point
-            local = np.einsum("nji,nj->ni", Y[:3, :3] @ problem.H[:, :3, :3], v) - Z[:3, 3]
+            local = (v[:, None, :] @ (Y[:3, :3] @ problem.H[:, :3, :3]))[:, 0] - Z[:3, 3]
             delta[:, :, rot] -= Q
             shift[:, :, rot] += Q @ skew(local)
             shift[:, :, pos] -= Q
@@ -139,12 +139,12 @@ def _evaluate(problem: Problem, state: State, centre: Array) -> tuple[Array, Arr
     full, normal = problem.full, problem.normal
     everywhere = bool(full.all())
     p = np.broadcast_to(centre, (len(problem), 3)) if everywhere else np.where(full[:, None], centre, 0.0)
-    g = np.einsum("nij,nj->ni", problem.G[:, :3, :3], p) + problem.G[:, :3, 3]
+    g = (problem.G[:, :3, :3] @ p[:, :, None])[:, :, 0] + problem.G[:, :3, 3]
     FX = problem.F @ X
-    point = np.einsum("nij,nj->ni", FX[:, :3, :3], g) + FX[:, :3, 3]
+    point = (FX[:, :3, :3] @ g[:, :, None])[:, :, 0] + FX[:, :3, 3]
     L = Y @ problem.H @ Z
     RL = L[:, :3, :3]
-    d = np.einsum("nji,nj->ni", RL, point - L[:, :3, 3]) - p
+    d = ((point - L[:, :3, 3])[:, None, :] @ RL)[:, 0] - p
     RD = np.swapaxes(RL, 1, 2) @ (FX[:, :3, :3] @ problem.G[:, :3, :3])
     w = log_rotation(RD)
     turn = left_jacobian_inverse(w)

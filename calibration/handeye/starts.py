@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,8 +154,8 @@ def with_positions(problem: Problem, rotations: Rotations, state: State) -> Stat
     return pose(RX, positions[0]), pose(RY, positions[1]), pose(RZ, positions[2])
 
 
-def closed_forms(problem: Problem, state: State) -> list[tuple[str, State]]:
-    """All closed-form starts that fit the unknowns and the kind of sightings, with their names; empty when none does.
+def closed_forms(problem: Problem, state: State) -> Iterator[tuple[str, State]]:
+    """The closed-form starts that fit the unknowns and the kind of sightings, with their names, one after the other.
 
     ``state`` holds the known poses (identity where unknown).
     """
@@ -171,12 +171,10 @@ def closed_forms(problem: Problem, state: State) -> list[tuple[str, State]]:
             methods = [("Kronecker of three", kronecker_three)]
         elif problem.free == (True, False, False):
             methods = [("mean", _mean_x)]
-    out = []
     for name, method in methods:
-        out.append((name, with_positions(problem, method(poses, state), state)))
+        yield name, with_positions(problem, method(poses, state), state)
     if len(poses) < len(problem) and problem.free[0] and not problem.free[2]:
-        out.append(("points", with_positions(problem, relaxed_points(problem, state), state)))
-    return out
+        yield "points", with_positions(problem, relaxed_points(problem, state), state)
 
 
 def grid(problem: Problem, state: State, rng: np.random.Generator, n: int = 24) -> list[tuple[str, State]]:
