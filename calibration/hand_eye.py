@@ -232,7 +232,7 @@ def solve_problem(
     blocks = {NAMES[k]: slice(6 * row, 6 * row + 6) for row, k in enumerate(problem.blocks)}
     return HandEyeResult(
         equation=equation,
-        poses={name: _transform(state[NAMES.index(name)]) for name in blocks},
+        poses={name: as_transform(state[NAMES.index(name)]) for name in blocks},
         covariance={name: covariance[b, b] for name, b in blocks.items()},
         joint_covariance=covariance,
         degrees_of_freedom=min(s.free_w, s.free_d) if s.total_w else s.free_d,
@@ -368,7 +368,8 @@ def _same_length(a: Array, b: Array) -> None:
         raise InputError(f"There are {len(a)} robot poses and {len(b)} camera poses; give one of each per sample.")
 
 
-def _transform(X: Array) -> RigidTransform:
+def as_transform(X: Array) -> RigidTransform:
+    """A pose (4, 4) as RigidTransform, its rotation projected."""
     return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 

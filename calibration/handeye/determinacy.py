@@ -237,7 +237,8 @@ def _name(
 ) -> str:
     blocks = (v / scale).reshape(-1, 6)
     sizes = np.linalg.norm(blocks.reshape(-1, 2, 3), axis=2)
-    row, kind = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
+    # the camera's pose first, where it moves about as much as another's
+    row, kind = np.unravel_index(int(np.argmax(sizes > 0.5 * sizes.max())), sizes.shape)
     name = NAMES[problem.blocks[int(row)]]
     label = labels.get(name, name)
     u = blocks[int(row), 3 * int(kind) : 3 * int(kind) + 3]

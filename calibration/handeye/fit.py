@@ -242,10 +242,8 @@ class Scaled:
             (self.Jd, self.ed, self.qd, 3.0, self.wd, self.inflate),
         ):
             N += _gram(J * np.sqrt(w / inflate)[:, None, None])
-            if self.loss is Loss.STUDENT:
-                bend = 2.0 * w / (_STUDENT + q)
-            else:
-                bend = np.where(q > m * _HUBER**2, w / np.maximum(q, 1e-300), 0.0)
+            outside = np.where(q > m * _HUBER**2, w / np.maximum(q, 1e-300), 0.0)
+            bend = 2.0 * w / (_STUDENT + q) if self.loss is Loss.STUDENT else outside
             along = (np.swapaxes(J, 1, 2) @ e[:, :, None])[:, :, 0] * np.sqrt(bend / inflate)[:, None]
             N -= along.T @ along
         s = 1.0 / np.sqrt(np.maximum(np.diag(self.A), 1e-300))
