@@ -216,7 +216,7 @@ def solve_problem(
     s = choice.fit.scaled
     noise = choice.fit.noise
     found = determinacy(
-        used, choice.state, s.Gw + s.Gd, choice.covariance, length, float(np.sqrt(noise.rotation)), labels
+        used, choice.state, s.information(), choice.covariance, length, float(np.sqrt(noise.rotation)), labels
     )
     _refuse_open(problem, found.directions, found.names, config)
     state = without_drift(used, choice.state, found)

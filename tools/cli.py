@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools import console
+from weldcal.tools import cli_hand_eye, console
 from weldcal.tools.studies.cli_reproduce import reproduce
 
 app = typer.Typer(
@@ -23,6 +23,8 @@ app = typer.Typer(
 benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
+app.add_typer(cli_hand_eye.hand_eye, name="hand-eye")
+benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

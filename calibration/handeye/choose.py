@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_of, settled_centre
+from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_of
 from weldcal.calibration.handeye.problem import Problem, State, residuals
-from weldcal.calibration.handeye.se3 import mean_of
+from weldcal.calibration.handeye.se3 import exp_rotation, mean_of
 from weldcal.calibration.handeye.starts import closed_forms, grid
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers go
-_WORST_SHARE = 0.25  # of the extent: residuals beyond it are no calibration
+_WORST_SHARE = 0.1  # of the extent: residuals beyond it are no calibration
+_WORST_TURN_RAD = 0.2
 _SUBSETS = 60
 
 
@@ -38,7 +39,7 @@ CANDIDATES = (
     Candidate("least squares, rotations first", Loss.SQUARES, 4.0),
     Candidate("Student's t, rotations first", Loss.STUDENT, 4.0),
 )
-_LEVEL = 0.01  # of the paired t test at which two candidates count as different
+_LEVEL = 0.01  # of all paired t tests together (Bonferroni) at which candidates count as different
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def solve(
     tried_sets: set[bytes] = set()
     for _ in range(10):
         noise = noise_of(problem, *residuals(problem, state), keep) if base is None else base.noise
-        base = fit(problem, state, centre=np.zeros(3), noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
+        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
         state = base.state
         tried_sets.add(keep.tobytes())
         new = _within(problem, base)
@@ -93,21 +94,22 @@ def solve(
         )
     seen = bool((problem.full | problem.normal).any())
     turned = float(np.sqrt(base.noise.rotation)) if seen else 0.0
-    if np.sqrt(base.noise.translation) > _WORST_SHARE * extent(problem) or turned > 0.35:
+    if np.sqrt(base.noise.translation) > _WORST_SHARE * extent(problem) or turned > _WORST_TURN_RAD:
         raise InconsistentPoses(
             f"The poses disagree by {np.degrees(turned):.1f} deg and "
             f"{100.0 * np.sqrt(base.noise.translation) / extent(problem):.0f} % of their own extent; check units, pose "
             "order, the quaternion order, and which pose is stated from which frame."
         )
-    tight, tight_noise, centre = settled_centre(problem, base.state, base.noise, keep)
     fits: dict[str, Fit] = {}
     # only full poses hold the rotation of X without their translations
     tried = [c for c in candidates if bool(problem.full.all()) or c.ratio == 1.0] or list(candidates)
     for c in tried:
-        near = next((f for k, f in reversed(fits.items()) if f.loss is c.loss), None)
-        noise = replace(tight_noise if near is None else near.noise, ratio=c.ratio)
-        begin = tight if near is None else near.state
-        fits[c.name] = fit(problem, begin, centre=centre, noise=noise, loss=c.loss, keep=keep)
+        near = next((f for f in reversed(fits.values()) if f.loss is c.loss), next(iter(fits.values()), base))
+        noise = replace(near.noise, ratio=c.ratio)
+        # the first candidate finds the noise centre for all
+        fits[c.name] = fit(
+            problem, near.state, centre=near.centre, noise=noise, loss=c.loss, keep=keep, hold_centre=bool(fits)
+        )
     agreed = _alike(fits)
     best = fits[agreed[0]]
     state, covariance = best.state, best.scaled.covariance()
@@ -119,7 +121,7 @@ def solve(
             sum((f.scaled.cross_covariance(o.scaled) for f in chosen for o in chosen), np.zeros_like(covariance))
             / len(chosen) ** 2
         )
-    scores = {k: _left_out(f) for k, f in fits.items()}
+    scores = {k: _rms(s) for k, s in _left_out(fits).items()}
     return Choice(state, 0.5 * (covariance + covariance.T), best, " + ".join(agreed), name, scores)
 
 
@@ -206,23 +208,32 @@ def _clean(problem: Problem, state: State) -> bool:
     return few and np.sqrt(noise.translation) < 0.05 * extent(problem) and bool(turned < 0.1)
 
 
-def _left_out(f: Fit) -> tuple[float, float]:
-    w, d = f.left_w[f.keep], f.left_d[f.keep]
-    return float(np.degrees(np.sqrt((w**2).sum(axis=1).mean()))), float(np.sqrt((d**2).sum(axis=1).mean()))
+def _left_out(fits: dict[str, Fit]) -> dict[str, Array]:
+    """Squares (n, 2) of the errors left out, rotation and displacement, all at the noise centre of the first fit."""
+    centre = next(iter(fits.values())).centre
+    out = {}
+    for k, f in fits.items():
+        w, d = f.left_w[f.keep], f.left_d[f.keep]
+        d = d + np.where(f.scaled.full[:, None], (exp_rotation(w) - np.eye(3)) @ (centre - f.centre), 0.0)
+        out[k] = np.column_stack([(w**2).sum(axis=1), (d**2).sum(axis=1)])
+    return out
+
+
+def _rms(squares: Array) -> tuple[float, float]:
+    rms = np.sqrt(squares.mean(axis=0))
+    return float(np.degrees(rms[0])), float(rms[1])
 
 
 def _alike(fits: dict[str, Fit]) -> list[str]:
     """The candidate with the least regret, and those whose errors left out cannot be told apart from the best of either
     column (paired t test of the squares)."""
-    squares = {
-        k: np.column_stack([(f.left_w[f.keep] ** 2).sum(axis=1), (f.left_d[f.keep] ** 2).sum(axis=1)])
-        for k, f in fits.items()
-    }
+    squares = _left_out(fits)
     means = {k: s.mean(axis=0) for k, s in squares.items()}
     least = np.maximum(np.min(list(means.values()), axis=0), 1e-300)
     order = sorted(fits, key=lambda k: (float(max(means[k] / least)), list(fits).index(k)))
     column_best = [list(means)[int(np.argmin([m[c] for m in means.values()]))] for c in range(2)]
-    limit = float(student.ppf(1.0 - 0.5 * _LEVEL, max(len(squares[order[0]]) - 1, 1)))
+    tests = 2.0 * max(len(fits) - 1, 1)
+    limit = float(student.ppf(1.0 - 0.5 * _LEVEL / tests, max(len(squares[order[0]]) - 1, 1)))
     out = [order[0]]
     for k in order[1:]:
         apart = False

@@ -244,7 +244,7 @@ def _name(
     u = blocks[int(row), 3 * int(kind) : 3 * int(kind) + 3]
     u = u / np.linalg.norm(u)
     u = u * np.sign(u[int(np.argmax(np.abs(u)))])
-    where = "(" + ", ".join(f"{c:+.2f}" for c in u) + ")"
+    where = "(" + ", ".join(f"{c + 0.0:+.2f}" for c in np.round(u, 2)) + ")"
     word = "translation" if kind == 1 else "rotation"
     # the axis as the frame that carries X sees it: turned by any of the poses, it is the same where it is common
     seen = problem.F[0, :3, :3].T @ axis if name == "X" else axis

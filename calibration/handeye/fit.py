@@ -114,40 +114,6 @@ def noise_of(problem: Problem, w: Array, d: Array, keep: Flags) -> Noise:
     return Noise(max(rotation, _TINY), max(translation, floor))
 
 
-def settled_centre(
-    problem: Problem, state: State, noise: Noise, keep: Flags, tolerance: float = 1e-7
-) -> tuple[State, Noise, Array]:
-    """Least squares for the unknowns and the noise centre together.
-
-    The centre (3,) is the point of the target T whose displacement is least: a camera errs about the middle of a board,
-    not about the origin someone gave it. An unknown like the others, it moves with any choice of frames. Zero where full
-    poses are too few, or exact.
-    """
-    sub = problem if keep.all() else problem.pick(keep)
-    floor = extent(sub) ** 2 * _TINY
-    noise = replace(noise, ratio=1.0)
-    centre = np.zeros(3)
-    open_centre = int(sub.full.sum()) >= 5
-    before = np.inf
-    lin = linearise(sub, state, centre)
-    for _ in range(60):
-        if noise.translation <= floor and noise.rotation <= _TINY:
-            return state, noise, np.zeros(3)
-        extra = _centre_columns(sub, lin) if open_centre else None
-        s = Scaled(sub, lin, noise, Loss.SQUARES, extra)
-        change = -s.V @ s.g
-        size = float(np.sqrt(max(float(change @ s.A @ change), 0.0)))
-        state = sub.step(state, change[: sub.size])
-        if open_centre:
-            centre = centre + change[sub.size :]
-        lin = linearise(sub, state, centre)
-        noise = s.variances(lin, noise, floor)
-        if size < tolerance or (size < 1e-7 and size >= 0.5 * before):
-            break
-        before = size
-    return state, noise, centre
-
-
 def _centre_columns(problem: Problem, lin: Linearised) -> Array:
     """Derivative (n, 3, 3) of the displacement (R_D - 1) c + t by the centre c."""
     return np.where(problem.full[:, None, None], exp_rotation(lin.w) - np.eye(3), 0.0)
@@ -157,35 +123,50 @@ def fit(
     problem: Problem,
     state: State,
     *,
-    centre: Array,
     noise: Noise,
     loss: Loss,
     keep: Flags,
+    centre: Array | None = None,
+    hold_centre: bool = False,
     iterations: int = 60,
     tolerance: float = 1e-6,
 ) -> Fit:
-    """Newton's method with the mean slope of the loss from a good start; the variances are re-estimated at every step.
+    """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
-    Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. ``keep`` (n,):
-    sightings that count; the others get residuals only. ``tolerance``: of the last step, in standard deviations.
+    Variances: Helmert's simplified estimator, each group's weighted squares over its own redundancy. The noise centre is
+    an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
+    displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so the
+    answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``hold_centre``: keep it,
+    and count it only as something else that is uncertain. ``keep`` (n,): sightings that count; the others get residuals
+    only. ``tolerance``: of the last step, in standard deviations.
     """
     sub = problem if keep.all() else problem.pick(keep)
     floor = extent(sub) ** 2 * _TINY
+    centre = np.zeros(3) if centre is None else centre
+    # three more unknowns need some sightings to spare
+    loose = int(sub.full.sum()) >= 5 + len(sub.blocks)
     lin = linearise(sub, state, centre)
-    s = Scaled(sub, lin, noise, loss)
+    s = Scaled(sub, lin, noise, loss, _centre_columns(sub, lin) if loose else None)
     before = np.inf
     for _ in range(iterations):
-        change = -s.newton() @ s.g
-        size = float(np.sqrt(max(float(change @ s.A @ change), 0.0)))
-        state = sub.step(state, change)
+        moving = sub.size if hold_centre else len(s.g)
+        change = -s.newton(moving) @ s.g[:moving]
+        size = float(np.sqrt(max(float(change @ s.A[:moving, :moving] @ change), 0.0)))
+        state = sub.step(state, change[: sub.size])
+        if loose and not hold_centre:
+            centre = centre + change[sub.size :]
         lin = linearise(sub, state, centre)
         new = s.variances(lin, noise, floor)
         settled = abs(new.rotation / noise.rotation - 1.0) + abs(new.translation / noise.translation - 1.0)
         noise = new
-        s = Scaled(sub, lin, noise, loss)
+        exact = noise.translation <= floor and noise.rotation <= _TINY
+        if exact and loose:  # there is no noise to have a centre
+            loose, centre = False, np.zeros(3)
+            lin = linearise(sub, state, centre)
+        s = Scaled(sub, lin, noise, loss, _centre_columns(sub, lin) if loose else None)
         if size < tolerance and settled < tolerance:
             break
-        if size < 0.1 and noise.translation <= floor and noise.rotation <= _TINY:  # exact data
+        if size < 0.1 and exact:
             break
         if size < 1e-7 and settled < 1e-7 and size >= 0.5 * before:  # rounding: nothing left to gain
             break
@@ -200,7 +181,8 @@ class Scaled:
     """One linearisation in units of its noise: normal equations, robust weights, covariance, errors left out."""
 
     def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss, extra: Array | None = None) -> None:
-        if extra is not None:  # columns of further unknowns that only displace
+        self.size, self.full = problem.size, problem.full
+        if extra is not None:  # columns of the noise centre, which only displaces
             Jw = np.concatenate([lin.Jw, np.zeros_like(extra)], axis=2)
             lin = Linearised(lin.w, lin.d, Jw, np.concatenate([lin.Jd, extra], axis=2))
         n = len(problem)
@@ -231,11 +213,12 @@ class Scaled:
         taken_d = self.slope_d / self.inflate * float(np.einsum("ij,ji->", self.V, self.Gd))
         self.free_w, self.free_d = max(self.total_w - taken_w, 0.3), max(self.total_d - taken_d, 0.3)
 
-    def newton(self) -> Array:
-        """Inverse of the exact second derivative of the robust cost (Gauss-Newton in the residuals); that of the mean
-        slope where the exact one is not positive."""
+    def newton(self, moving: int) -> Array:
+        """Inverse of the exact second derivative of the robust cost (Gauss-Newton in the residuals) by the first
+        ``moving`` unknowns; that of the mean slope where the exact one is not positive."""
+        mean = self.V if moving == len(self.V) else inverse_information(self.A[:moving, :moving])
         if self.loss is Loss.SQUARES:
-            return self.V
+            return mean
         N = np.zeros_like(self.A)
         for J, e, q, m, w, inflate in (
             (self.Jw, self.ew, self.qw, self.m_w, self.ww, 1.0),
@@ -248,8 +231,8 @@ class Scaled:
             N -= along.T @ along
         s = 1.0 / np.sqrt(np.maximum(np.diag(self.A), 1e-300))
         if float(np.linalg.eigvalsh(N * s[:, None] * s)[0]) < -RANK:
-            return self.V
-        return inverse_information(N)
+            return mean
+        return inverse_information(N[:moving, :moving])
 
     def _whiten(self, lin: Linearised) -> tuple[Array, Array]:
         assert self.root is not None
@@ -276,25 +259,31 @@ class Scaled:
 
     def cross_covariance(self, other: Scaled) -> Array:
         """Covariance between the unknowns of two fits of the same sightings, each with its own weights."""
-        # both in the units of the first: raw weights differ by the ratio of variances
-        kw, kd = self.noise.rotation / other.noise.rotation, self.noise.translation / other.noise.translation
-        if self.root is not None:
-            kw = kd = 1.0
-        cross_w = float((self.ww * other.ww * np.sqrt(self.qw * other.qw / kw) * kw).sum()) / self.free_w
-        cross_d = float((self.wd * other.wd * np.sqrt(self.qd * other.qd / kd) * kd).sum()) / self.free_d
-        middle = cross_w * self.Gw + cross_d / (self.inflate * other.inflate) * self.Gd
-        return np.asarray(self.V @ middle @ other.V)
+        cross_w = float((self.ww * other.ww * (self.ew * other.ew).sum(axis=1)).sum()) / self.free_w
+        cross_d = float((self.wd * other.wd * (self.ed * other.ed).sum(axis=1)).sum()) / self.free_d
+        k, m = self.Jw.shape[2], other.Jw.shape[2]
+        middle = cross_w * self.Jw.reshape(-1, k).T @ other.Jw.reshape(-1, m)
+        middle += cross_d / (self.inflate * other.inflate) * self.Jd.reshape(-1, k).T @ other.Jd.reshape(-1, m)
+        return np.asarray((self.V @ middle @ other.V)[: self.size, : self.size])
+
+    def information(self) -> Array:
+        """Information of the unknowns alone, unweighted by the loss, the noise centre marginalised out."""
+        N, m = self.Gw + self.Gd, self.size
+        if len(N) == m:
+            return N
+        return np.asarray(N[:m, :m] - N[:m, m:] @ np.linalg.pinv(N[m:, m:], rcond=1e-10, hermitian=True) @ N[m:, :m])
 
     def leave_one_out(self, lin: Linearised) -> tuple[Array, Array]:
         """Residuals (n, 3), (n, 3) of each sighting under the fit without it (exact where linear: PRESS, Allen 1974)."""
         J = np.concatenate([self.Jw, self.Jd], axis=1)
+        m = self.size
         u = np.repeat(np.column_stack([self.ww, self.wd / self.inflate]), 3, axis=1)
         hat = (J @ (self.V @ np.swapaxes(J, 1, 2))) * u[:, None, :]
         e = np.concatenate([self.ew, self.ed], axis=1)
         eased = np.linalg.solve(np.eye(6) * (1.0 + 1e-9) - hat, e[:, :, None])
         change = self.V @ (np.swapaxes(J, 1, 2) @ (u[:, :, None] * eased))
         out = np.concatenate([lin.w, lin.d], axis=1)
-        out = out + (np.concatenate([lin.Jw, lin.Jd], axis=1) @ change)[:, :, 0]
+        out = out + (np.concatenate([lin.Jw, lin.Jd], axis=1) @ change[:, :m])[:, :, 0]
         return out[:, :3], out[:, 3:]
 
 

@@ -24,6 +24,7 @@ from weldcal.calibration.handeye.mountings import MOUNTINGS
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out, opencv_solve
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
 from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse, pose
+from weldcal.calibration.result import write_atomically
 from weldcal.tools.simulation import Progress, no_progress
 
 Array = NDArray[np.float64]
@@ -53,9 +54,13 @@ class DatasetRow:
 
     @property
     def holds(self) -> bool:
-        """At or below the best OpenCV method of both columns, with the tolerance."""
+        """At or below the best OpenCV method of both columns, with the tolerance; never where OpenCV was left out."""
+        return self.meets(self.best_deg, self.best_mm)
+
+    def meets(self, best_deg: float, best_mm: float) -> bool:
+        """Whether the held-out errors are at or below these bars, with the tolerance."""
         share, deg, mm = _TOLERANCE
-        return self.deg <= self.best_deg * (1 + share) + deg and self.mm <= self.best_mm * (1 + share) + mm
+        return self.deg <= best_deg * (1 + share) + deg and self.mm <= best_mm * (1 + share) + mm
 
 
 @dataclass
@@ -86,12 +91,14 @@ class HandEyeBenchmark:
         }
 
 
-def dataset_row(name: str, F: Array, G: Array, truth: Array | None, config: HandEyeConfig | None = None) -> DatasetRow:
-    """Ours and OpenCV's on poses F X G = Y, held out on the same folds."""
-    ours = solve_problem(full_problem(F, G), config=config)
-    theirs = {m: opencv_held_out(m, F, G) for m in METHODS}
-    deg = {m: h.rms_deg for m, h in theirs.items() if np.isfinite(h.rotation_rad).all()}
-    mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()}
+def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: bool = True) -> DatasetRow:
+    """Ours and OpenCV's on poses F X G = Y, held out on the same folds; without ``opencv`` its columns are NaN."""
+    ours = solve_problem(full_problem(F, G))
+    theirs = {m: opencv_held_out(m, F, G) for m in METHODS} if opencv else {}
+    deg = {m: h.rms_deg for m, h in theirs.items() if np.isfinite(h.rotation_rad).all()} or {"-": float("nan")}
+    mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()} or {
+        "-": float("nan")
+    }
     by_deg, by_mm = min(deg, key=lambda m: deg[m]), min(mm, key=lambda m: mm[m])
     row = {}
     if truth is not None:
@@ -229,14 +236,15 @@ def speed(n: int = 200, repeats: int = 7) -> dict[str, float]:
 def run_hand_eye_benchmark(
     data: Path | None, *, quick: bool = False, seed: int = 0, progress: Progress = no_progress
 ) -> HandEyeBenchmark:
-    """All of it; ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials, for a test."""
+    """All of it; ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials and
+    no OpenCV on the sets, for a test."""
     from weldcal.calibration.handeye.files import read_pairs
 
     report = HandEyeBenchmark()
     sets = sorted(data.glob("*/pairs.npz")) if data is not None else []
     for k, path in enumerate(sets):
         pairs = read_pairs(path)
-        report.rows.append(dataset_row(path.parent.name, pairs.F, pairs.G, pairs.X_true))
+        report.rows.append(dataset_row(path.parent.name, pairs.F, pairs.G, pairs.X_true, opencv=not quick))
         progress(path.parent.name, 0.3 * (k + 1) / len(sets))
     tries = [outliers(seed + k) for k in range(3 if quick else 20)]
     ratio = max(r for _, r in tries)
@@ -250,11 +258,11 @@ def run_hand_eye_benchmark(
     good, worst = three_unknowns(starts, seed)
     report.checks["AXB = YCZ"] = (good == starts, f"{good} of {starts} within 2x the bound, worst {worst:.2f}x")
     progress("uncertainty", 0.5)
-    trials = 20 if quick else 500
+    trials = 12 if quick else 500
     for k, name in enumerate(MOUNTINGS):
         share = coverage(name, trials, seed=seed + k)
         # few trials of a quick run only show gross errors
-        low, high = (0.75, 1.0) if quick else (0.93, 0.97)
+        low, high = (0.6, 1.0) if quick else (0.93, 0.97)
         report.checks[f"95 % region, {name}"] = (low <= share <= high, f"{100 * share:.1f} % of {trials}")
         progress(name, 0.5 + 0.1 * (k + 1))
     times = speed(200, 3 if quick else 15)
@@ -263,3 +271,25 @@ def run_hand_eye_benchmark(
         ", ".join(f"{k} {v:.1f} ms" for k, v in times.items()),
     )
     return report
+
+
+def write_table(report: HandEyeBenchmark, folder: Path) -> str:
+    """Write hand_eye.md in ``folder`` and return its text."""
+    lines = [
+        "| set | n | held-out deg | best OpenCV | held-out mm | best OpenCV | flagged | open | holds |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for r in report.rows:
+        lines.append(
+            f"| {r.name} | {r.n} | {r.deg:.4f} | {r.best_deg:.4f} {r.best_deg_by} | {r.mm:.3f} | {r.best_mm:.3f} {r.best_mm_by} | "
+            f"{', '.join(map(str, r.flagged)) or '-'} | {'; '.join(r.unobservable) or '-'} | {'yes' if r.holds else 'NO' if np.isfinite(r.best_deg) else '-'} |"
+        )
+    truths = [r for r in report.rows if r.truth_nees is not None]
+    if truths:
+        lines += ["", "| set | truth deg | truth mm | normalised error squared (6 expected) |", "|---|---|---|---|"]
+        lines += [f"| {r.name} | {r.truth_deg:.4f} | {r.truth_mm:.3f} | {r.truth_nees:.1f} |" for r in truths]
+    lines += ["", "| check | holds | seen |", "|---|---|---|"]
+    lines += [f"| {k} | {'yes' if ok else 'NO'} | {seen} |" for k, (ok, seen) in report.checks.items()]
+    text = "\n".join(lines) + "\n"
+    write_atomically(folder / "hand_eye.md", text)
+    return text
