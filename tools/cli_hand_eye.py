@@ -32,6 +32,12 @@ DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback o
 MotionsOption = Annotated[
     bool, typer.Option("--motions", help="The file holds motions (A X = X B as they stand), not poses.")
 ]
+CornersOption = Annotated[
+    bool,
+    typer.Option(
+        "--corners", help="Use the board's corners in the file: reproject, and look for a shifted principal point."
+    ),
+]
 
 
 @hand_eye.callback()
@@ -59,13 +65,14 @@ def ax_yb(
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
+    corners: CornersOption = False,
     out: OutOption = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
     """AX = YB: the poses of camera and target together, with the next pose to add."""
-    _run("ax-yb", file, mounting, unit, False, out, seed, json, debug)
+    _run("ax-yb", file, mounting, unit, False, out, seed, json, debug, corners)
 
 
 @hand_eye.command("axb-ycz")
@@ -120,6 +127,7 @@ def _run(
     seed: int,
     json: bool,
     debug: bool,
+    corners: bool = False,
 ) -> None:
     from weldcal.tools.cli import fresh_folder
 
@@ -131,7 +139,9 @@ def _run(
             if not json:
                 typer.echo(sentence)
 
-        report = run_hand_eye(equation, file, folder, mounting=mounting, unit=unit, motions=motions, seed=seed, say=say)
+        report = run_hand_eye(
+            equation, file, folder, mounting=mounting, unit=unit, motions=motions, corners=corners, seed=seed, say=say
+        )
     if json:
         console.emit_json(report.summary())
     else:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.handeye.choose import CANDIDATES
+from weldcal.calibration.handeye.corners import refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
 from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
 from weldcal.calibration.handeye.files import PosePairs, read_pairs
@@ -48,6 +49,7 @@ class HandEyeReport:
     next_pose: NextPose | None
     files: tuple[Path, ...]
     seconds: float
+    corners: str = ""
 
     def summary(self) -> dict[str, object]:
         """The JSON object of the command."""
@@ -67,6 +69,7 @@ class HandEyeReport:
             "method": r.method,
             "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
             "next_pose": None if self.next_pose is None else self.next_pose.sentence(),
+            "corners": self.corners or None,
             "seconds": self.seconds,
         }
 
@@ -97,6 +100,8 @@ class HandEyeReport:
         ]
         lines += [f"weighting    {r.method}"]
         lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
+        if self.corners:
+            lines += ["", self.corners]
         if self.comparison:
             lines += ["", "method        held-out deg   held-out mm"]
             for c in self.comparison:
@@ -117,6 +122,7 @@ def run_hand_eye(
     mounting: str | None = None,
     unit: str | None = None,
     motions: bool = False,
+    corners: bool = False,
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
@@ -143,13 +149,23 @@ def run_hand_eye(
         problem = full_problem(pairs.F, pairs.G, pairs.H, free=(True, True, found.name == "co_manipulation"))
         say(check_poses(problem).sentence())
         result = _solved(problem, pairs, config, found)
+    said = ""
+    if corners:
+        if motions or found.name == "co_manipulation":
+            raise InputError("Corners (--corners) go with the poses of one robot.")
+        refined = refine_with_corners(pairs, config)
+        said = refined.sentence
+        if refined.accepted:
+            result = replace(refined.result, labels=found.labels, equation=found.equation)
     if equation == "ax-xb":
         result = _only_camera(result)
-    comparison = () if motions else _compare(problem, result)
+    # with corners applied the measured poses are others, so that a comparison would be of two data
+    plain = said == "" or "does not help" in said
+    comparison = () if motions or not plain else _compare(problem, result)
     advice = None if motions or equation == "ax-xb" else next_pose(problem, result, found, (IDENTITY,) * 3)
     provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
     files = export_hand_eye(result, found, out, provenance)
-    return HandEyeReport(result, found, comparison, advice, files, time.perf_counter() - begin)
+    return HandEyeReport(result, found, comparison, advice, files, time.perf_counter() - begin, said)
 
 
 def _file(path: Path) -> Path:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from weldcal.calibration.handeye.files import read_pairs
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
@@ -67,3 +68,14 @@ def test_the_quick_checks_hold(report: HandEyeBenchmark, tmp_path: Path) -> None
     text = write_table(report, tmp_path)
     assert "handeye_4dof" in text
     assert (tmp_path / "hand_eye.md").read_text() == text
+
+
+def test_corners_find_the_principal_point_that_hides_the_truth(report: HandEyeBenchmark) -> None:
+    rows = {r.name: r for r in report.rows}
+    three_sigma = float(chi2.ppf(0.9973, 6))
+    for name in ("multi_camera_workcell_camera1", "multi_camera_workcell_camera2"):
+        row = rows[name]
+        assert row.truth_nees is not None
+        assert row.truth_nees_corners is not None
+        assert row.truth_nees > three_sigma > row.truth_nees_corners
+        assert "principal point shifted" in row.corners
