@@ -101,8 +101,9 @@ def solve(
             "order, the quaternion order, and which pose is stated from which frame."
         )
     fits: dict[str, Fit] = {}
-    # only full poses hold the rotation of X without their translations
-    tried = [c for c in candidates if bool(problem.full.all()) or c.ratio == 1.0] or list(candidates)
+    # only full poses hold the rotation of X without their translations; three unknowns need what both know
+    separable = bool(problem.full.all()) and not all(problem.free)
+    tried = [c for c in candidates if separable or c.ratio == 1.0] or list(candidates)
     for c in tried:
         near = next((f for f in reversed(fits.values()) if f.loss is c.loss), next(iter(fits.values()), base))
         noise = replace(near.noise, ratio=c.ratio)

@@ -198,11 +198,15 @@ def invariance(seed: int = 0) -> float:
     return max(float(np.abs(Y - X).max()) for Y in answers) / float(np.linalg.norm(X[:3, 3]))
 
 
-def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float]:
+def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]:
     """AXB = YCZ with 30 poses, 0.1 mm and 0.02 degrees: how many random starts end within twice the Cramer-Rao bound in
-    all three unknowns, and the worst ratio of error to bound (rms over rotation and over translation apart)."""
+    all three unknowns, the worst error, and the rms error over all starts, both in units of the bound.
+
+    The error of an unknown is the root of its squared error in units of the bound's covariance, per number. (An error
+    norm beside the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
+    """
     turn, shift = float(np.radians(0.02)), 1e-4
-    good, worst = 0, 0.0
+    ratios = []
     for k in range(starts):
         rng = np.random.default_rng(seed + k)
         problem, truth = simulated("co_manipulation", 30, rng, turn, shift)
@@ -210,15 +214,18 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float]:
         bound = Scaled(problem, linearise(problem, state, np.zeros(3)), Noise(turn**2, shift**2), Loss.SQUARES).V
         guess = [as_transform(p) for p in pose(Rotation.random(3, rng=rng).as_matrix(), rng.normal(size=(3, 3)))]
         result = solve_axb_ycz(problem.F, problem.G, problem.H, _PLAIN, starts=[(guess[0], guess[1], guess[2])])
-        ratios = []
-        for row, name in enumerate("XYZ"):
+        row = []
+        for i, name in enumerate("XYZ"):
             e = pose_difference(result.poses[name], as_transform(truth[name]))
-            for part in (0, 3):
-                s = slice(6 * row + part, 6 * row + part + 3)
-                ratios.append(float(np.linalg.norm(e[part : part + 3]) / np.sqrt(np.trace(bound[s, s]))))
-        good += max(ratios) < 2.0
-        worst = max(worst, *ratios)
-    return good, worst
+            s = slice(6 * i, 6 * i + 6)
+            row.append(float(np.sqrt(e @ np.linalg.solve(bound[s, s], e) / 6.0)))
+        ratios.append(row)
+    table = np.array(ratios)
+    return (
+        int((table.max(axis=1) < 2.0).sum()),
+        float(table.max()),
+        float(np.sqrt((table**2).mean(axis=0)).max()),
+    )
 
 
 def speed(n: int = 200, repeats: int = 7) -> dict[str, float]:
@@ -264,8 +271,9 @@ def run_hand_eye_benchmark(
     relative = invariance(seed)
     report.checks["invariance"] = (relative < 1e-9, f"{relative:.1e} relative")
     starts = 3 if quick else 100
-    good, worst = three_unknowns(starts, seed)
-    report.checks["AXB = YCZ"] = (good == starts, f"{good} of {starts} within 2x the bound, worst {worst:.2f}x")
+    good, worst, rms = three_unknowns(starts, seed)
+    said = f"{good} of {starts} within 2x the bound, worst {worst:.2f}x, rms {rms:.2f}x"
+    report.checks["AXB = YCZ"] = (good == starts, said)
     progress("uncertainty", 0.5)
     trials = 12 if quick else 500
     for k, name in enumerate(MOUNTINGS):
