@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
 from weldcal.calibration.handeye.fit import RANK
@@ -69,19 +70,18 @@ def diversity(problem: Problem) -> Diversity:
 
 def _distinct(stated: list[Array], extent: float) -> int:
     """Number of poses no two of which are the same within 0.1 deg and 0.2 % of the motion."""
-    left = np.ones(len(stated[0]), dtype=bool)
-    count = 0
+    n = len(stated[0])
     limit = SAME_PLACE_SHARE * max(extent, 1e-12)
-    for i in range(len(left)):
-        if not left[i]:
-            continue
+    same = np.ones((n, n), dtype=bool)
+    for X in stated:
+        # chordal distance 2 sqrt(2) sin(angle / 2) of rotation matrices
+        same &= cdist(X[:, :3, :3].reshape(n, 9), X[:, :3, :3].reshape(n, 9)) < np.sqrt(2.0) * SAME_TURN_RAD
+        same &= cdist(X[:, :3, 3], X[:, :3, 3]) < limit
+    left = np.ones(n, dtype=bool)
+    count = 0
+    while left.any():
+        left &= ~same[int(np.argmax(left))]
         count += 1
-        same = np.ones(len(left), dtype=bool)
-        for X in stated:
-            # chordal distance 2 sqrt(2) sin(angle / 2) of rotation matrices
-            same &= np.sqrt(((X[:, :3, :3] - X[i, :3, :3]) ** 2).sum(axis=(1, 2))) < np.sqrt(2.0) * SAME_TURN_RAD
-            same &= np.sqrt(((X[:, :3, 3] - X[i, :3, 3]) ** 2).sum(axis=1)) < limit
-        left &= ~same
     return count
 
 
