@@ -33,6 +33,14 @@ class RepeatedPoses(InputError):
     """The same place was scanned again and again."""
 
 
+class PureTranslation(InputError):
+    """The robot never turned, so that rotations or positions stay open."""
+
+
+class UndeterminedPoses(InputError):
+    """The motion leaves so much open that an answer would be a guess; the message names the directions."""
+
+
 class InconsistentPoses(InputError):
     """No rigid transform explains enough of the poses."""
 

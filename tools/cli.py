@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools import console
+from weldcal.tools import cli_hand_eye, console
 from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_robots import robots
@@ -35,6 +35,8 @@ app.add_typer(tablet, name="tablet")
 benchmarks.command("tablet")(benchmark_tablet)
 benchmarks.command("seam-planning")(seam_planning)
 mount_flange(benchmarks)
+app.add_typer(cli_hand_eye.hand_eye, name="hand-eye")
+benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

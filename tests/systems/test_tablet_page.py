@@ -143,7 +143,8 @@ def test_undo_takes_the_last_touch_back_and_a_reload_keeps_the_rest(browser: Bro
         press(browser, "mouse", *landmarks[k])
     browser.run("document.getElementById('undo').click()")
     assert [row["landmark"] for row in touches(browser)] == ["0", "1"]
-    browser.open(PAGE)
+    browser.run("window.before = true; location.reload()")
+    browser.wait("!window.before && document.readyState === 'complete'")
     assert [row["landmark"] for row in touches(browser)] == ["0", "1"]
 
 

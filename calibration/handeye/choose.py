@@ -1,0 +1,247 @@
+"""From sightings to the one fit to trust: starts, gross outliers, candidates, and the choice by errors left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_of
+from weldcal.calibration.handeye.problem import Problem, State, residuals
+from weldcal.calibration.handeye.se3 import exp_rotation, mean_of
+from weldcal.calibration.handeye.starts import closed_forms, grid
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+_GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers go
+_WORST_SHARE = 0.1  # of the extent: residuals beyond it are no calibration
+_WORST_TURN_RAD = 0.2
+_SUBSETS = 60
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way to weigh the sightings: the loss, and how much less than estimated the translations count."""
+
+    name: str
+    loss: Loss
+    ratio: float = 1.0
+
+
+CANDIDATES = (
+    Candidate("least squares", Loss.SQUARES),
+    Candidate("Student's t", Loss.STUDENT),
+    Candidate("least squares, rotations first", Loss.SQUARES, 4.0),
+    Candidate("Student's t, rotations first", Loss.STUDENT, 4.0),
+)
+_LEVEL = 0.01  # of all paired t tests together (Bonferroni) at which candidates count as different
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen answer, how it was found, and what the candidates reached: name -> (deg, length) rms of errors left out.
+
+    ``covariance`` of the free poses, 6 each in the order X, Y, Z, in the tangent of se3.moved.
+    """
+
+    state: State
+    covariance: Array
+    fit: Fit
+    method: str
+    start: str
+    scores: dict[str, tuple[float, float]]
+
+
+def solve(
+    problem: Problem,
+    known: State,
+    *,
+    seed: int = 0,
+    starts: tuple[State, ...] = (),
+    max_outliers: float = 0.40,
+    candidates: tuple[Candidate, ...] = CANDIDATES,
+) -> Choice:
+    """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
+
+    The candidate is chosen by errors left out of the fit: the one whose worse column (degrees or length, each relative
+    to the best candidate of that column) is best, so that neither is bought with the other. Raises InconsistentPoses
+    where no rigid poses explain enough sightings.
+    """
+    state, name = _start(problem, known, seed, starts)
+    keep = gate(problem, state)
+    base: Fit | None = None
+    tried_sets: set[bytes] = set()
+    for _ in range(10):
+        noise = noise_of(problem, *residuals(problem, state), keep) if base is None else base.noise
+        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
+        state = base.state
+        tried_sets.add(keep.tobytes())
+        new = _within(problem, base)
+        if new.tobytes() in tried_sets or int(new.sum()) < 4:
+            break
+        keep = new
+    assert base is not None
+    need = max(3, int(np.ceil((1.0 - max_outliers) * len(problem) - 1e-9)))
+    if int(keep.sum()) < need and len(problem) > 4:
+        raise InconsistentPoses(
+            f"Only {int(keep.sum())} of {len(problem)} poses agree on one answer; check units, pose order, the quaternion"
+            " order, and which pose is stated from which frame."
+        )
+    seen = bool((problem.full | problem.normal).any())
+    turned = float(np.sqrt(base.noise.rotation)) if seen else 0.0
+    if np.sqrt(base.noise.translation) > _WORST_SHARE * extent(problem) or turned > _WORST_TURN_RAD:
+        raise InconsistentPoses(
+            f"The poses disagree by {np.degrees(turned):.1f} deg and "
+            f"{100.0 * np.sqrt(base.noise.translation) / extent(problem):.0f} % of their own extent; check units, pose "
+            "order, the quaternion order, and which pose is stated from which frame."
+        )
+    fits: dict[str, Fit] = {}
+    # only full poses hold the rotation of X without their translations; three unknowns need what both know
+    separable = bool(problem.full.all()) and not all(problem.free)
+    tried = [c for c in candidates if separable or c.ratio == 1.0] or list(candidates)
+    for c in tried:
+        near = next((f for f in reversed(fits.values()) if f.loss is c.loss), next(iter(fits.values()), base))
+        noise = replace(near.noise, ratio=c.ratio)
+        # the first candidate finds the noise centre for all
+        fits[c.name] = fit(
+            problem, near.state, centre=near.centre, noise=noise, loss=c.loss, keep=keep, hold_centre=bool(fits)
+        )
+    agreed = _alike(fits)
+    best = fits[agreed[0]]
+    state, covariance = best.state, best.scaled.covariance()
+    if len(agreed) > 1:
+        chosen = [fits[k] for k in agreed]
+        parts = [mean_of([f.state[k] for f in chosen]) if problem.free[k] else known[k] for k in range(3)]
+        state = parts[0], parts[0] if problem.tied else parts[1], parts[2]
+        covariance = (
+            sum((f.scaled.cross_covariance(o.scaled) for f in chosen for o in chosen), np.zeros_like(covariance))
+            / len(chosen) ** 2
+        )
+    scores = {k: _rms(s) for k, s in _left_out(fits).items()}
+    return Choice(state, 0.5 * (covariance + covariance.T), best, " + ".join(agreed), name, scores)
+
+
+def gate(problem: Problem, state: State, centre: Array | None = None) -> Flags:
+    """Sightings (n,) whose residuals lie within the gate, the noise taken from the medians."""
+    w, d = residuals(problem, state, centre)
+    everything = np.ones(len(problem), dtype=bool)
+    if len(problem) <= 4:
+        return everything
+    noise = noise_of(problem, w, d, everything)
+    return _inside(problem, w, d, noise.rotation, noise.translation)
+
+
+def _within(problem: Problem, base: Fit) -> Flags:
+    if len(problem) <= 4:
+        return np.ones(len(problem), dtype=bool)
+    return _inside(problem, base.w, base.d, base.noise.rotation, base.noise.translation)
+
+
+def _inside(problem: Problem, w: Array, d: Array, rotation: float, translation: float) -> Flags:
+    own_w, own_d = 0.0, 0.0
+    if problem.covariance is not None:
+        diagonal = np.diagonal(problem.covariance, axis1=1, axis2=2)
+        own_w, own_d = diagonal[:, :3].max(axis=1), diagonal[:, 3:].max(axis=1)
+    square = np.maximum((w**2).sum(axis=1) / (rotation + own_w), (d**2).sum(axis=1) / (translation + own_d))
+    return np.asarray(square < 3.0 * _GATE**2)
+
+
+def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...]) -> tuple[State, str]:
+    rng = np.random.default_rng(seed)
+    best: State | None = None
+    cost, name = np.inf, ""
+    # a closed form that fits well needs no second opinion
+    for found in chain([[("given", s) for s in starts]], ([form] for form in closed_forms(problem, known))):
+        state, new, given = _best(problem, found, 2)
+        if state is not None and new < cost:
+            best, cost, name = state, new, given
+            if _clean(problem, best):
+                return best, name
+    # gross outliers or a closed form that failed: minimal sets, then turns of the cube
+    size = 8 if all(problem.free) else 3 if problem.full.all() else 5
+    subsets: list[tuple[str, State]] = []
+    if len(problem) > size + 1:
+        for _ in range(_SUBSETS):
+            rows = rng.choice(len(problem), size, replace=False)
+            forms = islice(closed_forms(problem.pick(rows), known), 2)
+            subsets += [(f"minimal sets, {n}", s) for n, s in forms]
+    other, other_cost, other_name = _best(problem, subsets + grid(problem, known, rng), 6)
+    if best is None or (other is not None and other_cost < cost * (1.0 - 1e-6)):
+        best, cost, name = other, other_cost, other_name
+    if best is None:
+        raise InconsistentPoses("No rigid poses explain the measurements; check units, pose order and frames.")
+    return best, name
+
+
+def _best(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[State | None, float, str]:
+    """The start with the least cost after a descent from the most promising ones."""
+    if not pool:
+        return None, np.inf, ""
+    length = extent(problem)
+    ranked: list[tuple[float, int, str, State]] = []
+    for name, state in pool:
+        if not all(np.isfinite(X).all() for X in state):
+            continue
+        w, d = residuals(problem, state)
+        s = 4.0 * (w**2).sum(axis=1) + 16.0 * (d**2).sum(axis=1) / length**2
+        ranked.append((float((s / (1.0 + s)).sum()), len(ranked), name, state))
+    ranked.sort(key=lambda r: r[:2])
+    best: tuple[State | None, float, str] = (None, np.inf, "")
+    for _, _, name, state in ranked[:tries]:
+        state, cost = descend(problem, state)
+        if cost < best[1] * (1.0 - 1e-6):
+            best = (state, cost, name)
+        elif cost < best[1] * (1.0 + 1e-4):
+            break  # the same valley from another start
+    return best
+
+
+def _clean(problem: Problem, state: State) -> bool:
+    w, d = residuals(problem, state)
+    noise = noise_of(problem, w, d, np.ones(len(problem), dtype=bool))
+    turned = np.sqrt(noise.rotation) if (problem.full | problem.normal).any() else 0.0
+    few = int((~gate(problem, state)).sum()) <= max(0.02 * len(problem), 1)
+    return few and np.sqrt(noise.translation) < 0.05 * extent(problem) and bool(turned < 0.1)
+
+
+def _left_out(fits: dict[str, Fit]) -> dict[str, Array]:
+    """Squares (n, 2) of the errors left out, rotation and displacement, all at the noise centre of the first fit."""
+    centre = next(iter(fits.values())).centre
+    out = {}
+    for k, f in fits.items():
+        w, d = f.left_w[f.keep], f.left_d[f.keep]
+        d = d + np.where(f.scaled.full[:, None], (exp_rotation(w) - np.eye(3)) @ (centre - f.centre), 0.0)
+        out[k] = np.column_stack([(w**2).sum(axis=1), (d**2).sum(axis=1)])
+    return out
+
+
+def _rms(squares: Array) -> tuple[float, float]:
+    rms = np.sqrt(squares.mean(axis=0))
+    return float(np.degrees(rms[0])), float(rms[1])
+
+
+def _alike(fits: dict[str, Fit]) -> list[str]:
+    """The candidate with the least regret, and those whose errors left out cannot be told apart from the best of either
+    column (paired t test of the squares)."""
+    squares = _left_out(fits)
+    means = {k: s.mean(axis=0) for k, s in squares.items()}
+    least = np.maximum(np.min(list(means.values()), axis=0), 1e-300)
+    order = sorted(fits, key=lambda k: (float(max(means[k] / least)), list(fits).index(k)))
+    column_best = [list(means)[int(np.argmin([m[c] for m in means.values()]))] for c in range(2)]
+    tests = 2.0 * max(len(fits) - 1, 1)
+    limit = float(student.ppf(1.0 - 0.5 * _LEVEL / tests, max(len(squares[order[0]]) - 1, 1)))
+    out = [order[0]]
+    for k in order[1:]:
+        apart = False
+        for c in range(2):
+            difference = squares[k][:, c] - squares[column_best[c]][:, c]
+            error = float(difference.std(ddof=1)) / np.sqrt(len(difference))
+            apart |= bool(float(difference.mean()) > limit * error)
+        if not apart:
+            out.append(k)
+    return out

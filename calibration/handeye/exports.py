@@ -1,0 +1,119 @@
+"""A hand-eye result as files that other programs read, each pose named by its parent and child."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.hand_eye import HandEyeResult
+from weldcal.calibration.handeye.mountings import Mounting, Unknown
+from weldcal.calibration.result import (
+    export_ros2,
+    export_ur_pose,
+    export_urdf,
+    matrix4,
+    software_version,
+    write_atomically,
+)
+
+RESULT_FILE = "hand_eye.yaml"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a result came from: the file's name and its SHA-256."""
+
+    source: str
+    sha256: str
+
+
+def export_drake_directive(X: RigidTransform, parent: str, child: str) -> str:
+    """A Drake model directive that adds the child frame to the parent."""
+    roll, pitch, yaw = np.degrees(X.rotation().ToRollPitchYaw().vector())
+    x, y, z = X.translation()
+    return (
+        f"directives:\n- add_frame:\n    name: {child}\n    X_PF:\n      base_frame: {parent}\n"
+        f"      translation: [{x:.9f}, {y:.9f}, {z:.9f}]\n"
+        f"      rotation: !Rpy {{ deg: [{roll:.9f}, {pitch:.9f}, {yaw:.9f}] }}\n"
+    )
+
+
+def document(result: HandEyeResult, mounting: Mounting, provenance: Provenance) -> dict[str, object]:
+    """All of a result in plain types: what hand_eye.yaml holds."""
+    held = result.held_out
+    return {
+        "schema": 1,
+        "software": software_version(),
+        "configuration": mounting.name,
+        "equation": mounting.equation,
+        "poses": {u.symbol: _pose(result, k, u) for k, u in mounting.unknowns.items() if k in result.poses},
+        "covariance_order": "rotation (rad) then translation (m), on the parent's side about the child's origin",
+        "held_out": {"deg": _number(held.rms_deg), "mm": _number(1e3 * held.rms_translation)},
+        "noise": {
+            "deg": _number(float(np.degrees(result.sigma_rotation_rad))),
+            "mm": _number(1e3 * result.sigma_translation),
+        },
+        "degrees_of_freedom": float(result.degrees_of_freedom),
+        "condition": _number(result.condition),
+        "method": result.method,
+        "start": result.start,
+        "unobservable": list(result.unobservable),
+        "warnings": list(result.warnings),
+        "samples": [
+            {
+                "used": bool(used),
+                "residual_deg": _number(float(np.degrees(w))),
+                "residual_mm": _number(1e3 * float(d)),
+                "held_out_deg": _number(float(np.degrees(hw))),
+                "held_out_mm": _number(1e3 * float(hd)),
+            }
+            for used, w, d, hw, hd in zip(
+                result.inliers,
+                result.rotation_rad,
+                result.translation,
+                held.rotation_rad,
+                held.translation,
+                strict=True,
+            )
+        ],
+        "data": {"file": provenance.source, "sha256": provenance.sha256},
+    }
+
+
+def export_hand_eye(
+    result: HandEyeResult, mounting: Mounting, folder: Path, provenance: Provenance
+) -> tuple[Path, ...]:
+    """Write hand_eye.yaml, hand_eye.json, and for every pose URDF, ROS 2, UR and Drake files; returns the paths."""
+    whole = document(result, mounting, provenance)
+    files = {RESULT_FILE: yaml_dump(whole), "hand_eye.json": json.dumps(whole, indent=2) + "\n"}
+    for letter, X in result.poses.items():
+        u = mounting.unknowns[letter]
+        files[f"{u.symbol}.urdf.xacro"] = export_urdf(X, u.parent, u.child)
+        files[f"{u.symbol}.static_transform.sh"] = export_ros2(X, u.parent, u.child)
+        files[f"{u.symbol}.ur_pose.script"] = export_ur_pose(X)
+        files[f"{u.symbol}.drake.yaml"] = export_drake_directive(X, u.parent, u.child)
+    for name, text in files.items():
+        write_atomically(folder / name, text)
+    return tuple(folder / name for name in files)
+
+
+def _pose(result: HandEyeResult, letter: str, unknown: Unknown) -> dict[str, object]:
+    X = result.poses[letter]
+    return {
+        "meaning": unknown.sentence,
+        "parent": unknown.parent,
+        "child": unknown.child,
+        "matrix": matrix4(X),
+        "xyz": [float(v) for v in X.translation()],
+        "wxyz": [float(v) for v in X.rotation().ToQuaternion().wxyz()],
+        "covariance": [[float(v) for v in row] for row in result.covariance[letter]],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,268 @@
+"""Pose pairs from the files people have: npz, CSV, JSON, and the sample files of easy_handeye2 and MoveIt."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.yaml import yaml_load
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.hand_eye import as_poses
+from weldcal.calibration.handeye.mountings import chain, get_mounting
+from weldcal.calibration.handeye.se3 import exp_rotation, inverse, pose
+from weldcal.models.errors import InputError
+
+Array = NDArray[np.float64]
+
+LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+_FAR_M = 20.0  # no arm and no camera on one reach this far: the numbers are not metres
+
+
+@dataclass(frozen=True)
+class PosePairs:
+    """What a file holds, in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
+    of a second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
+    published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
+    given (NaN: not seen)."""
+
+    source: str
+    robot: Array
+    camera: Array
+    mode: str
+    robot2: Array | None = None
+    link: Array | None = None
+    X_true: Array | None = None
+    img: Array | None = None
+    obj: Array | None = None
+    K: Array | None = None
+    dist: Array | None = None
+
+    @property
+    def F(self) -> Array:
+        """F of F X G = Y H Z."""
+        return chain(get_mounting(self.mode), self.robot, self.link, self.robot2)[0]
+
+    @property
+    def H(self) -> Array:
+        """H of F X G = Y H Z."""
+        return chain(get_mounting(self.mode), self.robot, self.link, self.robot2)[1]
+
+    @property
+    def G(self) -> Array:
+        """G of F X G = Y H Z."""
+        return self.camera
+
+
+def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = None) -> PosePairs:
+    """Read a file of pose pairs; the kind is told by its ending and its contents.
+
+    ``mounting`` says what the file does not (and must not contradict it); ``length`` is the unit of its positions (m, mm,
+    cm; m where not said). Raises DatasetError with one sentence, InputError for poses that are no poses.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "pairs.npz"
+    if not path.is_file():
+        raise DatasetError(f"There is no file '{path}'.")
+    if length is not None and length not in LENGTHS:
+        raise DatasetError(f"There is no unit '{length}'; say {', '.join(LENGTHS)}.")
+    ending = path.suffix.lower()
+    if ending == ".npz":
+        raw = _npz(path)
+    elif ending in (".csv", ".txt"):
+        raw = _csv(path)
+    else:
+        raw = _document(path)
+    return _finished(path, raw, mounting, length)
+
+
+def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str | None) -> PosePairs:
+    said = raw.get("mode") or None
+    if said in ("eye_to_hand", "eye_on_hand"):  # other tools' words
+        said = {"eye_to_hand": "eye_on_base", "eye_on_hand": "eye_in_hand"}[said]
+    if said and mounting and said != mounting:
+        raise DatasetError(f"'{path.name}' says {said} and you say {mounting}; one of them is wrong.")
+    mode = mounting or said or ("co_manipulation" if raw.get("robot2") is not None else None)
+    if mode is None:
+        raise DatasetError(
+            f"'{path.name}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
+        )
+    get_mounting(mode)
+    unit = raw.get("unit") or None
+    if unit and length and unit != length:
+        raise DatasetError(f"'{path.name}' says its lengths are {unit} and you say {length}; one of them is wrong.")
+    scale = LENGTHS.get(unit or length or "m")
+    if scale is None:
+        raise DatasetError(f"'{path.name}' says its lengths are '{unit}'; say {', '.join(LENGTHS)}.")
+    poses: dict[str, Array | None] = {}
+    for key, name in (("robot", "robot"), ("camera", "camera"), ("robot2", "second robot"), ("link", "arm link")):
+        if raw.get(key) is None:
+            poses[key] = None
+            continue
+        X = as_poses(raw[key], name)
+        X[:, :3, 3] *= scale
+        poses[key] = X
+    robot, camera = poses["robot"], poses["camera"]
+    if robot is None or camera is None:
+        raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
+    if len(robot) != len(camera):
+        raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(camera)} camera poses.")
+    for X, name in ((robot, "robot"), (camera, "camera")):
+        far = float(np.median(np.linalg.norm(X[:, :3, 3], axis=1)))
+        if far > _FAR_M:
+            raise DatasetError(
+                f"The {name} positions of '{path.name}' are {far:.0f} m away, as metres; if they are millimetres, add --unit mm."
+            )
+    if raw.get("inverted") and mode == "eye_on_base":  # easy_handeye2 then stores the base in the hand
+        robot = inverse(robot)
+    X_true = raw.get("X_true")
+    return PosePairs(
+        path.name,
+        robot,
+        camera,
+        mode,
+        poses["robot2"],
+        poses["link"],
+        None if X_true is None else np.asarray(X_true, dtype=float),
+        **{k: None if raw.get(k) is None else np.asarray(raw[k], dtype=float) for k in ("img", "obj", "K", "dist")},
+    )
+
+
+def _npz(path: Path) -> dict[str, Any]:
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            raw = {k: z[k] for k in z.files}
+    except (OSError, ValueError) as e:
+        raise DatasetError(f"'{path.name}' is not an npz file of plain arrays.") from e
+    out: dict[str, Any] = {k: raw[k] for k in ("X_true", "img", "obj", "K", "dist") if k in raw}
+    out["robot"], out["camera"] = raw.get("A", raw.get("robot")), raw.get("B", raw.get("camera"))
+    out["robot2"], out["link"] = raw.get("C", raw.get("robot2")), raw.get("L", raw.get("link"))
+    out["mode"] = str(raw.get("mode", raw.get("configuration", "")))
+    out["unit"] = str(raw.get("unit", ""))
+    if out["robot"] is None or out["camera"] is None:
+        raise DatasetError(
+            f"'{path.name}' has no arrays A and B (n, 4, 4): A = pose of the flange in the base, B = of the target in the camera."
+        )
+    return out
+
+
+def _csv(path: Path) -> dict[str, Any]:
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        rows = [r for r in csv.reader(stream) if r and not r[0].lstrip().startswith("#")]
+    if not rows:
+        raise DatasetError(f"'{path.name}' is empty.")
+    names = [c.strip().lower() for c in rows[0]]
+    wanted = "robot_x,robot_y,robot_z,robot_qw,robot_qx,robot_qy,robot_qz,camera_x, ... camera_qz"
+    if not any(n.startswith("robot_") for n in names):
+        raise DatasetError(f"The first line of '{path.name}' must name its columns: {wanted} (or _rx,_ry,_rz).")
+    try:
+        table = np.array(
+            [
+                [float(c) if c.strip() else np.nan for c in (r + [""] * len(names))[: len(names)]]
+                for r in ([c if names[i] != "id" else "0" for i, c in enumerate(r)] for r in rows[1:])
+            ]
+        )
+    except ValueError as e:
+        raise DatasetError(f"'{path.name}' holds something that is not a number: {e}.") from e
+    if len(table) == 0:
+        raise DatasetError(f"'{path.name}' has a header and no samples.")
+    out: dict[str, Any] = {}
+    for who in ("robot", "camera", "robot2", "link"):
+        if f"{who}_x" in names:
+            out[who] = _columns(path, names, table, who)
+    return out
+
+
+def _columns(path: Path, names: list[str], table: Array, who: str) -> Array:
+    def column(*suffixes: str) -> Array | None:
+        keys = [f"{who}_{s}" for s in suffixes]
+        return table[:, [names.index(k) for k in keys]] if all(k in names for k in keys) else None
+
+    p = column("x", "y", "z")
+    q, r = column("qw", "qx", "qy", "qz"), column("rx", "ry", "rz")
+    if p is None or (q is None and r is None):
+        raise DatasetError(
+            f"'{path.name}' lacks {who}_x, _y, _z with {who}_qw, _qx, _qy, _qz or {who}_rx, _ry, _rz (rad)."
+        )
+    if not np.isfinite(p).all() or not np.isfinite(q if q is not None else r if r is not None else p).all():
+        raise DatasetError(f"'{path.name}' has empty or non-finite cells in the {who} columns.")
+    turned = _from_quaternions(path, q) if q is not None else exp_rotation(np.asarray(r))
+    return pose(turned, p)
+
+
+def _from_quaternions(path: Path, q: Array) -> Array:
+    length = np.linalg.norm(q, axis=1)
+    if (np.abs(length - 1.0) > 1e-2).any():
+        raise DatasetError(
+            f"A quaternion of '{path.name}' has length {float(length[np.argmax(np.abs(length - 1))]):.3f}, not 1."
+        )
+    return np.asarray(Rotation.from_quat(q, scalar_first=True).as_matrix())
+
+
+def _document(path: Path) -> dict[str, Any]:
+    text = path.read_text(encoding="utf-8", errors="replace")
+    document: Any
+    try:
+        document = json.loads(text) if path.suffix.lower() == ".json" else yaml_load(data=text)
+    except Exception as e:  # unreadable in any way: the same sentence (pydrake's reader raises no ValueError)
+        raise DatasetError(f"'{path.name}' cannot be read as {'JSON' if path.suffix == '.json' else 'YAML'}.") from e
+    out: dict[str, Any] = {}
+    samples: Any = document
+    if isinstance(document, dict):
+        parameters = document.get("parameters") or {}
+        out["mode"] = document.get("configuration") or document.get("mode") or parameters.get("calibration_type") or ""
+        out["unit"] = document.get("unit") or ""
+        out["X_true"] = document.get("X_true")
+        if "A" in document and "B" in document:
+            return out | {"robot": document["A"], "camera": document["B"], "robot2": document.get("C")}
+        samples = document.get("samples", document.get("poses"))
+    if not isinstance(samples, list) or not samples:
+        raise DatasetError(f"'{path.name}' holds no list of samples.")
+    first = samples[0]
+    if isinstance(first, dict) and "effector_wrt_world" in first:  # MoveIt: 16 numbers, row by row
+        robot, camera = "effector_wrt_world", "object_wrt_sensor"
+    elif isinstance(first, dict) and "robot" in first and "tracking" in first:  # easy_handeye2
+        robot, camera = "robot", "tracking"
+        out["inverted"] = True
+    elif (
+        isinstance(first, dict) and "robot" in first and "optical" in first
+    ):  # easy_handeye2, as it keeps them in memory
+        robot, camera = "robot", "optical"
+        out["inverted"] = True
+    else:
+        robot, camera = "robot", "camera"
+    for key, name in (("robot", robot), ("camera", camera), ("robot2", "robot2"), ("link", "link")):
+        if isinstance(first, dict) and name in first:
+            out[key] = np.array([_one(path, s, name, i) for i, s in enumerate(samples)])
+    return out
+
+
+def _one(path: Path, sample: Any, name: str, index: int) -> Array:
+    """A pose in any of the ways people write one."""
+    try:
+        value = sample[name]
+        if isinstance(value, dict):
+            value = value.get("transform", value)
+        if isinstance(value, dict):
+            p = value.get("translation", value.get("position", value.get("xyz")))
+            q = value.get("rotation", value.get("orientation", value.get("quaternion_wxyz", value.get("wxyz"))))
+            p = [p[k] for k in "xyz"] if isinstance(p, dict) else p
+            # a list without names is wxyz here only where its key says so
+            if isinstance(q, dict):
+                q = [q[k] for k in "wxyz"]
+            elif "quaternion_wxyz" not in value and "wxyz" not in value:
+                raise InputError("the order of its quaternion is not said (name it quaternion_wxyz)")
+            return pose(_from_quaternions(path, np.array([q], dtype=float))[0], np.array(p, dtype=float))
+        return np.array(value, dtype=float).reshape(4, 4)
+    except DatasetError:
+        raise
+    except (KeyError, TypeError, ValueError, InputError) as e:
+        why = f": {e}" if isinstance(e, InputError) else ""
+        raise DatasetError(f"Sample {index} of '{path.name}' has no pose '{name}' that can be read{why}.") from e

@@ -1,0 +1,109 @@
+"""Rigid poses as stacks of 4 x 4 matrices: inverse, logarithm, small changes, means."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.rigid import skew
+
+Array = NDArray[np.float64]
+
+IDENTITY: Array = np.eye(4)
+IDENTITY.setflags(write=False)
+
+
+def inverse(X: Array) -> Array:
+    """Inverse of rigid poses (..., 4, 4)."""
+    out = np.zeros_like(X)
+    Rt = np.swapaxes(X[..., :3, :3], -1, -2)
+    out[..., :3, :3] = Rt
+    out[..., :3, 3] = -(Rt @ X[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def pose(R: Array, p: Array) -> Array:
+    """Poses (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3)."""
+    R, p = np.asarray(R, dtype=float), np.asarray(p, dtype=float)
+    out = np.zeros((*np.broadcast_shapes(R.shape[:-2], p.shape[:-1]), 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = R, p, 1.0
+    return out
+
+
+def log_rotation(R: Array) -> Array:
+    """Rotation vectors (n, 3) rad of rotations (n, 3, 3)."""
+    v = 0.5 * np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.sqrt((v * v).sum(axis=1))
+    cosine = 0.5 * (R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    w = v * np.where(sine > 1e-8, angle / np.maximum(sine, 1e-8), 1.0)[:, None]
+    # near a half turn the antisymmetric part fades: go by the quaternion there
+    turned = cosine < -0.9
+    if turned.any():
+        w[turned] = Rotation.from_matrix(R[turned]).as_rotvec()
+    return np.asarray(w)
+
+
+def exp_rotation(w: Array) -> Array:
+    """Rotations (..., 3, 3) of rotation vectors (..., 3) rad."""
+    return np.asarray(Rotation.from_rotvec(w).as_matrix())
+
+
+def left_jacobian_inverse(w: Array) -> Array:
+    """d log(exp(d) R) / d d at d = 0 (n, 3, 3), for w = log R (n, 3) (Chirikjian 2012, Eq. 10.86)."""
+    angle = np.linalg.norm(w, axis=1)[:, None, None]
+    S = skew(w)
+    a = np.clip(angle, 1e-4, np.pi - 1e-9)
+    c = np.where(angle < 1e-3, 1.0 / 12.0 + angle**2 / 720.0, 1.0 / a**2 - (1.0 + np.cos(a)) / (2.0 * a * np.sin(a)))
+    return np.asarray(np.eye(3) - 0.5 * S + c * (S @ S))
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Rotation(s) (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm (Arun et al. 1987)."""
+    U, _, Vt = np.linalg.svd(M)
+    U = U.copy()
+    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    return np.asarray(U @ Vt)
+
+
+def moved(X: Array, change: Array) -> Array:
+    """X after a change (6,) [rotation; translation] on the parent's side about the child's origin: (exp(a) R, p + b)."""
+    out = X.copy()
+    out[:3, :3] = exp_rotation(change[:3]) @ X[:3, :3]
+    out[:3, 3] += change[3:]
+    return out
+
+
+def difference(X: Array, Y: Array) -> Array:
+    """The change (6,) that moves X to Y in the sense of ``moved``."""
+    return np.concatenate([log_rotation((Y[:3, :3] @ X[:3, :3].T)[None])[0], Y[:3, 3] - X[:3, 3]])
+
+
+def mean_pose(X: Array) -> Array:
+    """Chordal mean of rotations and component-wise median of positions of poses (n, 4, 4)."""
+    return pose(nearest_rotation(X[:, :3, :3].sum(axis=0)), np.median(X[:, :3, 3], axis=0))
+
+
+def random_rotations(n: int, rng: np.random.Generator) -> Array:
+    """Rotations (n, 3, 3), uniform over all of them."""
+    return np.asarray(Rotation.random(n, rng=rng).as_matrix()).reshape(n, 3, 3)
+
+
+def mean_of(poses: list[Array]) -> Array:
+    """The pose M with sum log(M^-1 X_k) = 0 on SE(3): it moves with the poses under any change of frames on either side
+    (Pennec and Arsigny 2013, bi-invariant mean)."""
+    M = poses[0]
+    stack = np.array(poses)
+    for _ in range(50):
+        D = inverse(M) @ stack
+        w = log_rotation(D[:, :3, :3])
+        rho = (left_jacobian_inverse(w) @ D[:, :3, 3:])[:, :, 0].mean(axis=0)
+        omega = w.mean(axis=0)
+        step = pose(exp_rotation(omega), np.linalg.solve(left_jacobian_inverse(omega[None])[0], rho))
+        M = M @ step
+        M = pose(nearest_rotation(M[:3, :3]), M[:3, 3])
+        if float(np.linalg.norm(omega)) < 1e-15:
+            break
+    return M

@@ -1,0 +1,175 @@
+"""Pose files of every kind read alike, and what is wrong with one is said in a sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.errors import DatasetError, InconsistentPoses
+from weldcal.calibration.handeye.files import PosePairs, read_pairs
+from weldcal.calibration.handeye.se3 import inverse
+from weldcal.models.errors import InputError
+from weldcal.tools.hand_eye import run_hand_eye
+
+from .hand_eye_poses import Array, co_manipulation, eye_in_hand
+
+HEADER = ",".join(f"{who}_{c}" for who in ("robot", "camera") for c in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+
+
+@pytest.fixture(scope="module")
+def poses() -> tuple[Array, Array]:
+    F, G, _, _ = eye_in_hand(12, np.random.default_rng(0), np.radians(0.05), 2e-4)
+    return F, G
+
+
+def numbers(X: Array, scale: float = 1.0) -> list[float]:
+    return [*(scale * X[:3, 3]), *Rotation.from_matrix(X[:3, :3]).as_quat(scalar_first=True)]
+
+
+def transform(X: Array) -> dict[str, dict[str, float]]:
+    x, y, z = X[:3, 3]
+    qw, qx, qy, qz = Rotation.from_matrix(X[:3, :3]).as_quat(scalar_first=True)
+    return {"translation": {"x": x, "y": y, "z": z}, "rotation": {"x": qx, "y": qy, "z": qz, "w": qw}}
+
+
+def write(kind: str, folder: Path, F: Array, G: Array) -> Path:
+    path = folder / {"npz": "a.npz", "csv": "a.csv", "rotvec": "b.csv", "json": "a.json"}.get(kind, "a.yaml")
+    if kind == "npz":
+        np.savez(path, A=F, B=G, mode="eye_in_hand")
+    elif kind == "csv":
+        path.write_text(
+            "\n".join(
+                [HEADER, *(",".join(map(repr, map(float, numbers(a) + numbers(b)))) for a, b in zip(F, G, strict=True))]
+            )
+        )
+    elif kind == "rotvec":
+        names = ",".join(f"{w}_{c}" for w in ("robot", "camera") for c in ("x", "y", "z", "rx", "ry", "rz"))
+        rows = [[*a[:3, 3], *Rotation.from_matrix(a[:3, :3]).as_rotvec()] for a in np.concatenate([F, G])]
+        both = [rows[i] + rows[len(F) + i] for i in range(len(F))]
+        path.write_text(
+            "\n".join(
+                [f"id,{names}", *(f"p{i}," + ",".join(f"{v!r}" for v in map(float, r)) for i, r in enumerate(both))]
+            )
+        )
+    elif kind == "json":
+        path.write_text(json.dumps({"A": F.tolist(), "B": G.tolist(), "mode": "eye_in_hand"}))
+    elif kind == "moveit":
+        lines = []
+        for a, b in zip(F, G, strict=True):
+            lines += [f"- effector_wrt_world: {a.ravel().tolist()}", f"  object_wrt_sensor: {b.ravel().tolist()}"]
+        path.write_text("\n".join(lines))
+    else:  # easy_handeye2; JSON is YAML
+        samples = [{"robot": transform(a), "tracking": transform(b)} for a, b in zip(F, G, strict=True)]
+        path.write_text(json.dumps({"parameters": {"calibration_type": ""}, "samples": samples}))
+    return path
+
+
+@pytest.mark.parametrize("kind", ["npz", "csv", "rotvec", "json", "moveit", "easy_handeye2"])
+def test_every_kind_of_file_holds_the_same_poses(kind: str, tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    pairs = read_pairs(write(kind, tmp_path, F, G), mounting="eye_in_hand")
+    np.testing.assert_allclose(pairs.F, F, atol=1e-12)
+    np.testing.assert_allclose(pairs.G, G, atol=1e-12)
+
+
+def test_easy_handeye_stores_the_base_in_the_hand_where_the_eye_is_on_the_base(
+    tmp_path: Path, poses: tuple[Array, Array]
+) -> None:
+    F, G = poses
+    pairs = read_pairs(write("easy_handeye2", tmp_path, F, G), mounting="eye_on_base")
+    np.testing.assert_allclose(pairs.robot, inverse(F), atol=1e-12)
+    np.testing.assert_allclose(pairs.F, F, atol=1e-12)
+
+
+def read_error(text: str, path: Path, **options: str) -> str:
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_pairs(path, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_bad_file_is_named_in_a_sentence(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    csv = tmp_path / "a.csv"
+    assert "must name its columns" in read_error("1,2,3\n4,5,6", csv)
+    assert "is empty" in read_error("", csv)
+    assert "no samples" in read_error(HEADER, csv, mounting="eye_in_hand")
+    row = ",".join(map(str, numbers(F[0]) + numbers(G[0])))
+    assert "add --mounting" in read_error(f"{HEADER}\n{row}", csv)
+    assert "not a number" in read_error(f"{HEADER}\n{row.replace(row.split(',')[0], 'x', 1)}", csv)
+    assert "non-finite cells" in read_error(f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand")
+    assert "cannot be read as JSON" in read_error("{", tmp_path / "a.json")
+    assert "no list of samples" in read_error("a: 1", tmp_path / "a.yaml")
+    assert "Sample 0" in read_error("- effector_wrt_world: [1, 2]\n  object_wrt_sensor: [1]", tmp_path / "a.yaml")
+    with pytest.raises(DatasetError, match="no file"):
+        read_pairs(tmp_path / "none.csv")
+    path = write("npz", tmp_path, F, G)
+    with pytest.raises(DatasetError, match="one of them is wrong"):
+        read_pairs(path, mounting="eye_on_base")
+
+
+def test_millimetres_are_asked_for_not_guessed(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    mm_F, mm_G = F.copy(), G.copy()
+    for X in (mm_F, mm_G):
+        X[:, :3, 3] *= 1e3
+    path = write("json", tmp_path, mm_F, mm_G)
+    with pytest.raises(DatasetError, match="add --unit mm"):
+        read_pairs(path)
+    np.testing.assert_allclose(read_pairs(path, length="mm").G, G, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [
+        ("camera", "poses are inverted"),
+        ("robot", "mounted eye_on_base"),
+        ("unit", "camera's positions are millimetres"),
+    ],
+)
+def test_one_mistake_is_recognised(wrong: str, sentence: str, tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses[0].copy(), poses[1].copy()
+    if wrong == "robot":
+        F = inverse(F)
+    if wrong == "camera":
+        G = inverse(G)
+    if wrong == "unit":  # a target so near that its millimetres could be metres
+        G[:, :3, 3] *= 10.0
+        F[:, :3, 3] *= 0.01  # together a factor of a thousand
+    np.savez(tmp_path / "a.npz", A=F, B=G, mode="eye_in_hand")
+    with pytest.raises(InconsistentPoses, match=sentence):
+        run_hand_eye("ax-yb", tmp_path / "a.npz", tmp_path)
+
+
+def test_the_command_writes_what_other_programs_read(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    report = run_hand_eye("ax-yb", write("npz", tmp_path, *poses), tmp_path / "out")
+    names = {p.name for p in report.files}
+    assert {"hand_eye.yaml", "hand_eye.json", "X_FC.urdf.xacro", "X_FC.drake.yaml", "X_BM.static_transform.sh"} <= names
+    saved = json.loads((tmp_path / "out" / "hand_eye.json").read_text())
+    assert saved["poses"]["X_FC"]["meaning"] == "pose of the camera in the flange frame: X_FC"
+    np.testing.assert_allclose(saved["poses"]["X_FC"]["matrix"], report.result.X.GetAsMatrix4(), atol=1e-15)
+    assert "pose of the camera in the flange frame: X_FC" in report.text()
+    assert {c.method for c in report.comparison} >= {"weldcal", "PARK", "SHAH"}
+    assert report.next_pose is not None
+    assert report.next_pose.sigma_after < report.next_pose.sigma_before
+
+
+def test_two_robots_want_their_own_equation(tmp_path: Path) -> None:
+    A, B, C, *_ = co_manipulation(20, np.random.default_rng(1), np.radians(0.02), 1e-4)
+    path = tmp_path / "two.npz"
+    np.savez(path, A=A, B=B, C=C)
+    with pytest.raises(InputError, match="hand-eye axb-ycz"):
+        run_hand_eye("ax-yb", path, tmp_path)
+    report = run_hand_eye("axb-ycz", path, tmp_path)
+    assert set(report.result.poses) == {"X", "Y", "Z"}
+    assert report.summary()["Y_is"] == "pose of the second robot's base in the first robot's base frame: X_BD"
+
+
+def test_pairs_know_their_equation() -> None:
+    F, G, _, _ = eye_in_hand(3, np.random.default_rng(2))
+    np.testing.assert_allclose(PosePairs("a", F, G, "eye_on_base").F, inverse(F))

@@ -1,0 +1,127 @@
+"""Every mounting finds its camera from poses, from points, and from points with normals; directions are told in words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.hand_eye import HandEyeConfig, as_transform
+from weldcal.calibration.handeye.mountings import MOUNTINGS, Sighting, calibrate_mounting, get_mounting
+from weldcal.calibration.handeye.next_pose import next_pose
+from weldcal.calibration.handeye.problem import full_problem
+from weldcal.calibration.handeye.se3 import IDENTITY, inverse
+from weldcal.models.errors import InputError
+
+from .hand_eye_poses import Array, noise, random_poses
+
+TURN, SHIFT = np.radians(0.05), 2e-4
+QUICK = HandEyeConfig(folds=0)
+
+
+def sightings(name: str, kind: str, n: int = 20) -> tuple[list[Sighting], dict[str, RigidTransform]]:
+    """Samples of a mounting written with its own equation in frames, not with the solver's F and H."""
+    rng = np.random.default_rng(list(MOUNTINGS).index(name))
+    X_BF, X_BL, X_DE = (random_poses(n, rng) for _ in range(3))
+    X, Y, Z = random_poses(3, rng, 1.5)
+    target = {
+        "eye_in_hand": lambda: inverse(X_BF @ X) @ Y,
+        "eye_on_base": lambda: inverse(X) @ X_BF @ Y,
+        "eye_on_arm_target_on_flange": lambda: inverse(X_BL @ X) @ X_BF @ Y,
+        "eye_on_arm_target_on_base": lambda: inverse(X_BL @ X) @ Y,
+        "co_manipulation": lambda: inverse(X_BF @ X) @ Y @ X_DE @ Z,
+    }[name]()
+    X_CM = target @ noise(n, rng, TURN, SHIFT)
+    samples = [
+        Sighting(
+            as_transform(X_BF[i]),
+            X_CM[i, :3, 3],
+            n_CM=X_CM[i, :3, 2] if kind == "normals" else None,
+            R_CM=RotationMatrix(as_transform(X_CM[i]).rotation()) if kind == "poses" else None,
+            X_BL=as_transform(X_BL[i]) if "arm" in name else None,
+            X_DE=as_transform(X_DE[i]) if name == "co_manipulation" else None,
+        )
+        for i in range(n)
+    ]
+    truth = {k: as_transform(p) for k, p in zip("XYZ", (X, Y, Z), strict=True) if k in MOUNTINGS[name].unknowns}
+    return samples, truth
+
+
+@pytest.mark.parametrize("name", list(MOUNTINGS))
+def test_full_poses_find_all_unknowns(name: str) -> None:
+    samples, truth = sightings(name, "poses")
+    result = calibrate_mounting(name, samples, config=QUICK)
+    assert set(result.poses) == set(truth)
+    for letter, X in truth.items():
+        assert result.normalised_error(letter, X) < result.region(0.999)
+
+
+@pytest.mark.parametrize("name", list(MOUNTINGS))
+@pytest.mark.parametrize("kind", ["points", "normals"])
+def test_a_flange_or_mounting_circle_as_target_finds_the_camera(name: str, kind: str) -> None:
+    # the paper's way: the feature's place on the robot is known, only its centre (and normal) is seen
+    samples, truth = sightings(name, kind)
+    last = max(truth)
+    known = {last: truth[last]}
+    result = calibrate_mounting(name, samples, known=known, config=QUICK)
+    assert set(result.poses) == set(truth) - {last}
+    assert result.normalised_error("X", truth["X"]) < result.region(0.999)
+
+
+def test_poses_points_and_normals_go_together() -> None:
+    samples, truth = sightings("eye_in_hand", "poses")
+    points, _ = sightings("eye_in_hand", "points")
+    normals, _ = sightings("eye_in_hand", "normals")
+    mixed = samples[:8] + points[8:14] + normals[14:]
+    result = calibrate_mounting("eye_in_hand", mixed, config=QUICK)
+    assert result.normalised_error("X", truth["X"]) < result.region(0.999)
+    assert np.isnan(result.rotation_rad[8:14]).all()
+    assert np.isfinite(result.rotation_rad[:8]).all()
+
+
+def test_mountings_say_their_directions() -> None:
+    assert get_mounting("eye_on_base").labels["X"] == "pose of the camera in the base frame: X_BC"
+    for m in MOUNTINGS.values():
+        assert all(u.symbol in m.equation and u.symbol in m.sketch for u in m.unknowns.values())
+    with pytest.raises(InputError, match="choose one of eye_in_hand"):
+        get_mounting("eye_in_foot")
+    samples, truth = sightings("eye_on_arm_target_on_base", "poses", 6)
+    with pytest.raises(InputError, match="pose of the link"):
+        calibrate_mounting("eye_on_arm_target_on_base", [Sighting(s.X_BF, s.p_CM) for s in samples])
+    with pytest.raises(InputError, match="has no unknown 'Z'"):
+        calibrate_mounting("eye_in_hand", samples, known={"Z": truth["X"]})
+
+
+def test_the_next_pose_keeps_its_promise() -> None:
+    rng = np.random.default_rng(3)
+    F = random_poses(6, rng, 0.2)
+    X, Y = random_poses(2, rng, 1.5)
+
+    def seen(F: Array) -> Array:
+        return inverse(F @ X) @ Y @ noise(len(F), rng, TURN, SHIFT)
+
+    problem = full_problem(F, seen(F))
+    mounting = get_mounting("eye_in_hand")
+    samples = [
+        Sighting(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation()) for a, b in zip(F, problem.G, strict=True)
+    ]
+    result = calibrate_mounting("eye_in_hand", samples, config=QUICK)
+    advice = next_pose(problem, result, mounting, (IDENTITY,) * 3)
+    assert advice is not None
+    assert advice.X_BF is not None
+    assert advice.sigma_after < advice.sigma_before
+    # taken, it shows the target where it was promised
+    there = inverse(np.asarray(advice.X_BF.GetAsMatrix4()) @ X) @ Y
+    assert np.linalg.norm(there[:3, 3] - advice.X_CM.translation()) < 0.02
+    # and a calibration with it is surer than with a repeated pose
+    more = np.concatenate([F, [advice.X_BF.GetAsMatrix4()]])
+    again = np.concatenate([F, F[:1]])
+    sigmas = []
+    for poses in (more, again):
+        G = inverse(poses @ X) @ Y @ noise(len(poses), np.random.default_rng(4), TURN, SHIFT)
+        both = [
+            Sighting(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation()) for a, b in zip(poses, G, strict=True)
+        ]
+        found = calibrate_mounting("eye_in_hand", both, config=QUICK)
+        sigmas.append(np.trace(found.covariance["X"][3:, 3:]) / found.sigma_translation**2)
+    assert sigmas[0] < sigmas[1]

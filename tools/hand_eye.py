@@ -1,0 +1,243 @@
+"""weldcal hand-eye: a file of pose pairs in, the unknown poses out, with a comparison of all methods and exports."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
+from weldcal.calibration.handeye.choose import CANDIDATES
+from weldcal.calibration.handeye.corners import refine_with_corners
+from weldcal.calibration.handeye.determinacy import check_poses
+from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
+from weldcal.calibration.handeye.files import PosePairs, read_pairs
+from weldcal.calibration.handeye.mountings import Mounting, get_mounting
+from weldcal.calibration.handeye.next_pose import NextPose, next_pose
+from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
+from weldcal.calibration.handeye.problem import Problem, full_problem
+from weldcal.calibration.handeye.se3 import IDENTITY, inverse
+from weldcal.models.errors import InputError, WeldcalError
+
+Array = NDArray[np.float64]
+
+EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
+
+
+@dataclass(frozen=True)
+class MethodRow:
+    """One line of the comparison: a method and its held-out errors; NaN where it gave no answer on some fold."""
+
+    method: str
+    deg: float
+    mm: float
+
+
+@dataclass(frozen=True)
+class HandEyeReport:
+    """A finished calibration: the result, how it compares, which pose to add, where the files are."""
+
+    result: HandEyeResult
+    mounting: Mounting
+    comparison: tuple[MethodRow, ...]
+    next_pose: NextPose | None
+    files: tuple[Path, ...]
+    seconds: float
+    corners: str = ""
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of the command."""
+        r = self.result
+        out: dict[str, object] = {"state": "done", "configuration": self.mounting.name}
+        for k, X in r.poses.items():
+            out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": r.covariance[k]}
+        return out | {
+            "held_out_deg": r.held_out.rms_deg,
+            "held_out_mm": 1e3 * r.held_out.rms_translation,
+            "residual_deg": np.degrees(r.rotation_rad),
+            "residual_mm": 1e3 * r.translation,
+            "inliers": r.inliers,
+            "unobservable": list(r.unobservable),
+            "warnings": list(r.warnings),
+            "condition": r.condition,
+            "method": r.method,
+            "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
+            "next_pose": None if self.next_pose is None else self.next_pose.sentence(),
+            "corners": self.corners or None,
+            "seconds": self.seconds,
+        }
+
+    def text(self) -> str:
+        """What a person reads: directions, sketch, numbers with their uncertainty, comparison, advice."""
+        r, m = self.result, self.mounting
+        lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
+        lines += [f"poses        {r.diversity.sentence()}"]
+        for k, X in r.poses.items():
+            u = m.unknowns[k]
+            sigma = np.sqrt(np.diag(r.covariance[k]))
+            p, rpy = 1e3 * X.translation(), np.degrees(X.rotation().ToRollPitchYaw().vector())
+            lines += [
+                "",
+                u.sentence,
+                "  position     "
+                + "  ".join(f"{v:+.3f}" for v in p)
+                + "  mm   +- "
+                + _sigmas(1e3 * sigma[3:], 1e3 * r.extent),
+                "  roll pitch yaw "
+                + "  ".join(f"{v:+.4f}" for v in rpy)
+                + "  deg  +- "
+                + _sigmas(np.degrees(sigma[:3]), 57.3),
+            ]
+        lines += [
+            "",
+            f"held out     {r.held_out.rms_deg:.4f} deg   {1e3 * r.held_out.rms_translation:.3f} mm (rms, 5 folds)",
+        ]
+        lines += [f"weighting    {r.method}"]
+        lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
+        if self.corners:
+            lines += ["", self.corners]
+        if self.comparison:
+            lines += ["", "method        held-out deg   held-out mm"]
+            for c in self.comparison:
+                failed = not (np.isfinite(c.deg) and np.isfinite(c.mm))
+                lines += [
+                    f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
+                ]
+        if self.next_pose is not None:
+            lines += ["", f"next pose    {self.next_pose.sentence()}"]
+        return "\n".join(lines)
+
+
+def run_hand_eye(
+    equation: str,
+    file: Path,
+    out: Path,
+    *,
+    mounting: str | None = None,
+    unit: str | None = None,
+    motions: bool = False,
+    corners: bool = False,
+    seed: int = 0,
+    say: Callable[[str], None] = lambda _: None,
+) -> HandEyeReport:
+    """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved.
+
+    Raises InputError and WeldcalError with one sentence; where the poses contradict each other, the sentence names the
+    one mistake (unit, inverse, mounting) whose correction makes them agree, if there is one.
+    """
+    begin = time.perf_counter()
+    if equation not in EQUATIONS:
+        raise InputError(f"There is no equation '{equation}'; choose one of {', '.join(EQUATIONS)}.")
+    pairs = read_pairs(file, mounting=mounting, length=unit)
+    found = get_mounting(pairs.mode)
+    if (equation == "axb-ycz") != (found.name == "co_manipulation"):
+        right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
+        raise InputError(f"'{file.name}' is {found.name}: solve it with 'weldcal hand-eye {right}'.")
+    config = HandEyeConfig(seed=seed)
+    if motions:
+        if equation != "ax-xb":
+            raise InputError("Motions (--motions) belong to ax-xb.")
+        result = solve_ax_xb(pairs.robot, pairs.camera, config)
+        problem = full_problem(pairs.robot, inverse(pairs.camera), free=(True, False, False), tied=True)
+    else:
+        problem = full_problem(pairs.F, pairs.G, pairs.H, free=(True, True, found.name == "co_manipulation"))
+        say(check_poses(problem).sentence())
+        result = _solved(problem, pairs, config, found)
+    said = ""
+    if corners:
+        if motions or found.name == "co_manipulation":
+            raise InputError("Corners (--corners) go with the poses of one robot.")
+        refined = refine_with_corners(pairs, config)
+        said = refined.sentence
+        if refined.accepted:
+            result = replace(refined.result, labels=found.labels, equation=found.equation)
+    if equation == "ax-xb":
+        result = _only_camera(result)
+    # with corners applied the measured poses are others, so that a comparison would be of two data
+    plain = said == "" or "does not help" in said
+    comparison = () if motions or not plain else _compare(problem, result)
+    advice = None if motions or equation == "ax-xb" else next_pose(problem, result, found, (IDENTITY,) * 3)
+    provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
+    files = export_hand_eye(result, found, out, provenance)
+    return HandEyeReport(result, found, comparison, advice, files, time.perf_counter() - begin, said)
+
+
+def _file(path: Path) -> Path:
+    return path / "pairs.npz" if path.is_dir() else path
+
+
+def _only_camera(result: HandEyeResult) -> HandEyeResult:
+    return replace(
+        result,
+        poses={"X": result.poses["X"]},
+        covariance={"X": result.covariance["X"]},
+        joint_covariance=result.covariance["X"],
+    )
+
+
+def _solved(problem: Problem, pairs: PosePairs, config: HandEyeConfig, mounting: Mounting) -> HandEyeResult:
+    try:
+        return solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
+    except InconsistentPoses as e:
+        mistake = likely_mistake(pairs, config)
+        if mistake is None:
+            raise
+        raise InconsistentPoses(mistake) from e
+
+
+def likely_mistake(pairs: PosePairs, config: HandEyeConfig) -> str | None:
+    """The one correction of the input, of those people need most, under which the poses agree; None where none does."""
+    if pairs.mode not in ("eye_in_hand", "eye_on_base"):
+        return None
+    quick = replace(config, folds=0, candidates=CANDIDATES[:1])
+
+    def scaled(X: Array, s: float) -> Array:
+        out = X.copy()
+        out[:, :3, 3] *= s
+        return out
+
+    # with both inverted the equation holds as well, X and Y exchanged: no data can tell
+    other = "eye_on_base" if pairs.mode == "eye_in_hand" else "eye_in_hand"
+    trials = (
+        (pairs.F, scaled(pairs.G, 1e-3), "the camera's positions are millimetres while the robot's are metres"),
+        (scaled(pairs.F, 1e-3), pairs.G, "the robot's positions are millimetres while the camera's are metres"),
+        (
+            inverse(pairs.F),
+            pairs.G,
+            f"the camera is mounted {other}, or either the robot or the camera poses are inverted",
+        ),
+    )
+    for F, G, sentence in trials:
+        try:
+            result = solve_problem(full_problem(F, G), config=quick)
+        except WeldcalError:
+            continue
+        if result.sigma_translation < 0.05 * result.extent and result.sigma_rotation_rad < 0.05:
+            return (
+                f"These poses contradict each other as given, but agree if {sentence}: correct the file and run again."
+            )
+    return None
+
+
+def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
+    rows = [MethodRow("weldcal", ours.held_out.rms_deg, 1e3 * ours.held_out.rms_translation)]
+    if problem.free == (True, True, False):
+        for m in METHODS:
+            held = opencv_held_out(m, problem.F, problem.G)
+            whole = bool(np.isfinite(held.translation).all())
+            rows.append(
+                MethodRow(
+                    m, held.rms_deg if whole else float("nan"), 1e3 * held.rms_translation if whole else float("nan")
+                )
+            )
+    return tuple(rows)
+
+
+def _sigmas(values: Array, certain: float) -> str:
+    return "  ".join("open" if v > certain else f"{v:.3f}" for v in values)
