@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 
 # Joint 1 turns the base and joint 6 the flange: their offsets are part of other unknowns.
@@ -32,6 +33,23 @@ class DhArm:
         if dh.shape != (6, 4) or not np.isfinite(dh).all():
             raise InputError(f"An arm's table has six finite rows [a, alpha, d, theta], not the shape {dh.shape}.")
         return DhArm(dh)
+
+    @staticmethod
+    def of(arm: ArmModel) -> DhArm:
+        """A UR arm's table, by the nominal lengths of its model."""
+        d, right = arm.dh, 0.5 * np.pi
+        return DhArm(
+            np.array(
+                [
+                    [0.0, right, d.d1, 0.0],
+                    [d.a2, 0.0, 0.0, 0.0],
+                    [d.a3, 0.0, 0.0, 0.0],
+                    [0.0, right, d.d4, 0.0],
+                    [0.0, -right, d.d5, 0.0],
+                    [0.0, 0.0, d.d6, 0.0],
+                ]
+            )
+        )
 
     def frames(self, q: Floats) -> Floats:
         """Homogeneous poses (n, 7, 4, 4) of the base and of the frames after each joint, for joints (n, 6) rad."""

@@ -7,7 +7,6 @@ rank of its matrix does not show them in noise; here these motions are named and
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -96,15 +95,20 @@ def _rotation(poses: FlangePoses, p_S: Floats, groups: list[np.ndarray]) -> Floa
     for g in groups:
         R_BF = poses.rotation[g[0]]
         u_s, u_t = p_S[g[1:]] - p_S[g[0]], poses.translation[g[1:]] - poses.translation[g[0]]
-        for i, j in combinations(range(len(u_s)), 2):
-            B1 = np.kron(np.cross(u_s[i], u_s[j]), R_BF)
-            B2, B3 = np.kron(u_s[i], R_BF), np.kron(u_s[j], R_BF)
-            # Eq. 17 is the transposed cross product matrix: a x b = [b]x^T a
-            rows.append(B1 + skew(u_t[j]).T @ B2 - skew(u_t[i]).T @ B3)
-            right.append(-np.cross(u_t[i], u_t[j]))
+        i, j = np.triu_indices(len(u_s), 1)
+        B1, B2, B3 = (_kron(v, R_BF) for v in (np.cross(u_s[i], u_s[j]), u_s[i], u_s[j]))
+        # Eq. 17 is the transposed cross product matrix: a x b = [b]x^T a
+        A = B1 - skew(u_t[j]) @ B2 + skew(u_t[i]) @ B3
+        rows.append(A.reshape(-1, 9))
+        right.append(-np.cross(u_t[i], u_t[j]).ravel())
     r = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
     U, _, Vt = np.linalg.svd(r.reshape(3, 3, order="F"))
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt)
+
+
+def _kron(v: Floats, R: Floats) -> Floats:
+    """Kronecker products v^T (x) R (m, 3, 9) for vectors (m, 3)."""
+    return np.asarray(np.einsum("mk,ab->makb", v, R).reshape(len(v), 3, 9))
 
 
 def _direction(poses: FlangePoses, p_S: Floats, groups: list[np.ndarray], R: Floats) -> Floats:

@@ -111,3 +111,11 @@ def turned(R: Floats, w: Floats) -> Floats:
     s = np.where(small, 1.0, np.sin(safe) / safe)
     c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     return np.asarray(R @ (np.eye(3) + s * K + c * (K @ K)))
+
+
+def left_jacobian(w: Floats) -> Floats:
+    """J (3, 3) with exp(w + d) = exp(J d) exp(w) for a small d."""
+    angle, K = float(np.linalg.norm(w)), skew(w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * K)
+    return np.asarray(np.eye(3) + (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * K @ K)

@@ -20,6 +20,7 @@ RADIUS_TOLERANCE_M = 0.2e-3
 PLANAR = 0.05  # second over first singular value of the translations
 ONE_AXIS = 0.02
 MINIMUM_TOUCHES = 4
+CLEARLY = 0.7  # of the spread that is left when a side is mirrored
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +98,40 @@ def sphere_linear(
     A = (poses.rotation[first] - poses.rotation).reshape(-1, 3)
     t = np.linalg.lstsq(A, (seen - seen[first]).ravel(), rcond=None)[0]
     return SphereLinear(np.asarray(R), t)
+
+
+def wrong_sides(
+    rotation: ArrayLike, translation: ArrayLike, centers: ArrayLike, translated: ArrayLike
+) -> tuple[int, ...]:
+    """Scans whose centre is on the other side of the scan plane than was said: with it mirrored, all centres agree far better.
+
+    One after the other, the most telling first, as long as each helps by itself: one wrong side is found, several may not be,
+    and all of them wrong cannot be told. Arguments as for `sphere_linear`.
+    """
+    P = np.array(centers, float)
+    found: list[int] = []
+    spread = _spread(rotation, translation, P, translated)
+    while len(found) < len(P) // 4:
+        trials = []
+        for k in range(len(P)):
+            P[k, 1] *= -1.0
+            trials.append(_spread(rotation, translation, P, translated))
+            P[k, 1] *= -1.0
+        k = int(np.argmin(trials))
+        if k in found or not trials[k] < CLEARLY * spread:
+            break
+        found.append(k)
+        P[k, 1] *= -1.0
+        spread = trials[k]
+    return tuple(sorted(found))
+
+
+def _spread(rotation: ArrayLike, translation: ArrayLike, centers: Floats, translated: ArrayLike) -> float:
+    """Rms distance m of the centres in B from their mean, by the linear method itself."""
+    e = sphere_linear(rotation, translation, centers, translated)
+    at = np.einsum("nij,nj->ni", np.asarray(rotation, float), centers @ e.rotation.T + e.translation)
+    at = at + np.asarray(translation, float)
+    return float(np.sqrt(np.mean(np.sum((at - at.mean(axis=0)) ** 2, axis=1))))
 
 
 def fit_touch_sphere(
