@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.cli_profiler import profiler
 from weldcal.tools.studies.cli_reproduce import reproduce
 
 app = typer.Typer(
@@ -23,6 +24,7 @@ app = typer.Typer(
 benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
+app.add_typer(profiler, name="profiler")
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

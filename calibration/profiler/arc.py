@@ -40,7 +40,7 @@ def find_arc(
 ) -> tuple[NDArray[np.bool_], Floats, float]:
     """Which samples of a profile (n, 2) [x, z] m lie on the sphere, the circle [x, z, r] m through them, and its rms in m.
 
-    A circle of a larger radius than the sphere's cannot be a cut of it, and the sensor sees the near side only. Random
+    A circle of a larger radius than the sphere's cannot be a cut of it, and the sensor sees one side of it only. Random
     triples of neighbouring samples (seeded), then the longest run of samples that agree.
 
     Raises:
@@ -91,10 +91,13 @@ def _through(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def _run(q: Floats, circle: Floats, tolerance_m: float) -> NDArray[np.intp]:
-    """The longest stretch of samples on the near side of a circle, bridging short gaps."""
+    """The longest stretch of samples on one side of a circle (z may grow to or from the sensor), bridging short gaps."""
     off = q - circle[:2]
-    good = np.flatnonzero((np.abs(np.linalg.norm(off, axis=1) - circle[2]) < tolerance_m) & (off[:, 1] < 0.0))
-    if good.size == 0:
-        return good
-    pieces = np.split(good, np.flatnonzero(np.diff(good) > GAP_SAMPLES) + 1)
-    return max(pieces, key=len)
+    near = np.abs(np.linalg.norm(off, axis=1) - circle[2]) < tolerance_m
+    longest = np.empty(0, dtype=np.intp)
+    for side in (off[:, 1] < 0.0, off[:, 1] > 0.0):
+        good = np.flatnonzero(near & side)
+        if good.size > longest.size:
+            pieces = np.split(good, np.flatnonzero(np.diff(good) > GAP_SAMPLES) + 1)
+            longest = max([longest, *pieces], key=len)
+    return longest

@@ -195,6 +195,8 @@ def test_an_arc_is_found_between_table_and_spikes_or_not_at_all() -> None:
     mask, circle, rms = find_arc(p, RADIUS_M)
     assert circle == pytest.approx([0.004, 0.1, 0.018], abs=0.05 * MM)
     assert rms < 0.07 * MM
+    upside_down, _, _ = find_arc(p * [1.0, -1.0], RADIUS_M)  # a sensor whose z grows towards it
+    assert (upside_down == mask).all()
     assert not mask[np.abs(x - 0.004) > 0.0165].any()
     with pytest.raises(ArcNotFound):
         find_arc(np.column_stack([x, np.full(400, 0.1)]), RADIUS_M)
