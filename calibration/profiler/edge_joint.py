@@ -1,0 +1,192 @@
+"""X_FS from one straight edge seen in any poses: one least-squares problem, no grid, no initial guess.
+
+Every measured profile point is compared with where the edge crosses the scan plane, in units of its own sigma (sensor and
+robot), with a Cauchy loss; the covariance is that of the Cramer-Rao bound where the stated sigmas are right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from weldcal.calibration.profiler.edge_model import (
+    EdgeState,
+    left_covariance,
+    left_information,
+    measurement_covariance,
+    predicted,
+    whitened,
+)
+from weldcal.calibration.profiler.edge_start import edge_starts
+from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, checked_points
+from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
+from weldcal.models.errors import InputError
+
+MINIMUM_POSES = 6
+STARTING_POSES = 60  # spread over all of them, are enough to find where to start
+CAUCHY = 1.5  # in sigmas of one coordinate
+OUTLIER = 4.5  # in sigmas of a point: one of 25 000 good points lies beyond
+SINGULAR = 1e-4  # least over largest singular value of the Jacobian with columns of unit length
+INCONSISTENT_CHI2 = 9.0
+CONSISTENT_SHARE = 0.7
+ITERATIONS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeEstimate(ProfilerEstimate):
+    """X_FS and the edge itself: a point of it (3,) m and its unit direction (3,), in B."""
+
+    point: Floats
+    direction: Floats
+
+
+def edge_joint(
+    rotation: ArrayLike,
+    translation: ArrayLike,
+    points: ArrayLike,
+    *,
+    sigma_robot_m: float,
+    sigma_xz_m: ArrayLike,
+    init: EdgeState | None = None,
+) -> EdgeEstimate:
+    """The pose of a profiler on the flange, from points of one straight edge.
+
+    Args:
+        rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF m; points: (n, 2) profile points [x, z] m of the edge.
+        sigma_robot_m: of the flange's position, per axis; sigma_xz_m: (2,) of the profile point.
+        init: where to start; without it the 24 orientations of a cube are tried.
+
+    Raises:
+        InputError: shapes, numbers that are not finite, no rotation.
+        TooFewTranslations: fewer than six poses.
+        DegenerateMotion: these motions leave a direction open, which is named.
+        InconsistentData: the points are not on one edge.
+
+    Source: straight-edge paper, Eq. 1 and its closing wish for a single phase; docs/profiler.md.
+    """
+    poses = FlangePoses.checked(rotation, translation)
+    p = checked_points(points, len(poses))
+    sigmas = np.asarray(sigma_xz_m, float)
+    if sigmas.shape != (2,) or not (sigmas > 0.0).all() or not sigma_robot_m >= 0.0:
+        raise InputError(
+            "The sigmas of a profile point [x, z] must be two positive numbers, and the robot's not negative."
+        )
+    if len(poses) < MINIMUM_POSES:
+        raise TooFewTranslations(
+            f"{len(poses)} poses of the edge are too few: take at least {MINIMUM_POSES}, all different."
+        )
+    some = np.unique(np.linspace(0, len(poses) - 1, STARTING_POSES).round().astype(int))
+    starts = [init] if init is not None else edge_starts(poses[some], p[some])
+    fits = [_fitted(start, poses, p, sigma_robot_m, sigmas) for start in starts]
+    state, _ = min(fits, key=lambda fit: fit[1])
+    return _estimate(state, poses, p, sigma_robot_m, sigmas)
+
+
+def _system(
+    state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: float, sigmas: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Residuals (n, 2) m, and both residuals and Jacobian (n, 2, 10) in sigmas."""
+    predicted_p, J, by_robot = predicted(state, poses)
+    covariance = measurement_covariance(by_robot, sigma_robot_m, sigmas)
+    r, Jw = whitened(covariance, p - predicted_p, J)
+    return p - predicted_p, r, Jw
+
+
+def _fitted(
+    state: EdgeState,
+    poses: FlangePoses,
+    p: Floats,
+    sigma_robot_m: float,
+    sigmas: Floats,
+    inliers: NDArray[np.bool_] | None = None,
+) -> tuple[EdgeState, float]:
+    """Levenberg-Marquardt with a Cauchy loss on each coordinate, of all poses or of the inliers; the state and its cost."""
+    damping = 1e-3
+    _, r, J = _system(state, poses, p, sigma_robot_m, sigmas)
+    cost = _cost(r, inliers)
+    for _ in range(ITERATIONS):
+        w = 1.0 / (1.0 + (r / CAUCHY) ** 2)
+        if inliers is not None:
+            w = w * inliers[:, None]
+        Jw = (w[:, :, None] * J).reshape(-1, 10).T
+        H, g = Jw @ J.reshape(-1, 10), Jw @ r.ravel()
+        scale = np.sqrt(np.diag(H)) + 1e-300
+        step = np.linalg.lstsq(H / np.outer(scale, scale) + damping * np.eye(10), g / scale, rcond=None)[0] / scale
+        new = state.moved(step)
+        _, r_new, J_new = _system(new, poses, p, sigma_robot_m, sigmas)
+        cost_new = _cost(r_new, inliers)
+        if not cost_new < cost:
+            damping *= 8.0
+            if damping > 1e8:
+                break
+            continue
+        done = cost - cost_new < 1e-13 * cost
+        state, r, J, cost, damping = new, r_new, J_new, cost_new, max(0.1 * damping, 1e-12)
+        if done:
+            break
+    return state, cost
+
+
+def _square(r: Floats) -> Floats:
+    return np.asarray(np.einsum("na,na->n", r, r))
+
+
+def _cost(r: Floats, inliers: NDArray[np.bool_] | None) -> float:
+    return float(np.sum(np.log1p((r if inliers is None else r[inliers]) ** 2 / CAUCHY**2)))
+
+
+def _estimate(state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: float, sigmas: Floats) -> EdgeEstimate:
+    """From the robust optimum: outliers named, the fit without them, its covariance, and whether it may be believed."""
+    residual, r, J = _system(state, poses, p, sigma_robot_m, sigmas)
+    inliers = _square(r) < OUTLIER**2
+    for _ in range(10):
+        if inliers.sum() < MINIMUM_POSES:
+            break
+        state, _ = _fitted(state, poses, p, sigma_robot_m, sigmas, inliers)
+        residual, r, J = _system(state, poses, p, sigma_robot_m, sigmas)
+        before, inliers = inliers, _square(r) < OUTLIER**2
+        if (before == inliers).all():
+            break
+    kept = max(int(inliers.sum()), 1)
+    chi2_all = float(np.median(_square(r)) / (2.0 * np.log(2.0)))  # the median of chi-square with 2 degrees is 2 ln 2
+    if kept < MINIMUM_POSES or (kept < CONSISTENT_SHARE * len(poses) and chi2_all > 1.0):
+        text = f"Only {kept} of {len(poses)} points lie on one edge: scan one edge only, and state the sigmas of robot and scanner."
+        raise InconsistentData(text)
+    Ji = J[inliers].reshape(-1, 10)
+    scale = np.linalg.norm(Ji, axis=0)
+    singular = np.linalg.svd(Ji / np.where(scale > 0.0, scale, 1.0), compute_uv=False)
+    H = Ji.T @ Ji
+    condition = float(singular[-1] / singular[0])
+    if condition < SINGULAR or not (scale > 0.0).all():
+        of_pose = H[:6, :6] - H[:6, 6:] @ np.linalg.pinv(H[6:, 6:]) @ H[6:, :6]
+        raise DegenerateMotion(
+            f"These motions leave the {worst_direction(left_information(state.rotation, of_pose))} open: "
+            "turn the flange about two different axes, in three orientations or more."
+        )
+    freedom = 2 * kept - 10
+    return EdgeEstimate(
+        rotation=state.rotation,
+        translation=state.translation,
+        covariance=left_covariance(state.rotation, np.asarray(np.linalg.inv(H))),
+        residuals=residual,
+        inliers=inliers,
+        rms_m=float(np.sqrt(np.mean(residual[inliers] ** 2))),
+        reduced_chi2=float(_square(r[inliers]).sum() / freedom) if freedom > 0 else float("nan"),
+        condition=condition,
+        point=state.point,
+        direction=state.direction,
+    )
+
+
+def edge_crb(
+    state: EdgeState, rotation: ArrayLike, translation: ArrayLike, *, sigma_robot_m: float, sigma_xz_m: ArrayLike
+) -> Floats:
+    """Cramer-Rao bound (6, 6) of [rotation in F; translation] for these poses and sigmas: no unbiased method does better."""
+    poses = FlangePoses.checked(rotation, translation)
+    p, _, _ = predicted(state, poses)
+    _, _, J = _system(state, poses, p, sigma_robot_m, np.asarray(sigma_xz_m, float))
+    flat = J.reshape(-1, 10)
+    return left_covariance(state.rotation, np.asarray(np.linalg.pinv(flat.T @ flat)))

@@ -1,0 +1,121 @@
+"""The robot's side of a profiler's calibration: flange poses as arrays, checked once, and what their motion lacks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from weldcal.models.errors import InputError
+
+Floats = NDArray[np.float64]
+
+ORTHONORMAL = 1e-6
+SAME_ROTATION_RAD = 1e-4  # orientations of a group differ by less: a robot holds one to a hundredth of this
+
+
+@dataclass(frozen=True, eq=False)
+class FlangePoses:
+    """Flange poses X_BF as arrays: R_BF (n, 3, 3), p_BF (n, 3) m."""
+
+    rotation: Floats
+    translation: Floats
+
+    def __len__(self) -> int:
+        return len(self.translation)
+
+    def __getitem__(self, chosen: NDArray[np.intp] | NDArray[np.bool_] | slice) -> FlangePoses:
+        return FlangePoses(self.rotation[chosen], self.translation[chosen])
+
+    @staticmethod
+    def checked(rotation: ArrayLike, translation: ArrayLike) -> FlangePoses:
+        """Arrays that are poses.
+
+        Args:
+            rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF in m.
+
+        Raises:
+            InputError: wrong shapes, not finite, or a rotation that is not orthonormal to 1e-6.
+        """
+        R, p = np.asarray(rotation, float), np.asarray(translation, float)
+        if R.ndim != 3 or R.shape[1:] != (3, 3) or p.shape != (len(R), 3):
+            raise InputError(
+                f"Flange poses need rotations (n, 3, 3) and translations (n, 3), not {R.shape} and {p.shape}."
+            )
+        if not (np.isfinite(R).all() and np.isfinite(p).all()):
+            raise InputError("A flange pose holds a number that is not finite: leave that sample out.")
+        off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).reshape(len(R), -1).max(axis=1, initial=0.0)
+        bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(R) < 0.0))
+        if bad.size:
+            raise InputError(f"The rotation of pose {bad[0]} is not a rotation matrix: check its axes and its numbers.")
+        return FlangePoses(R, p)
+
+
+def checked_points(points: ArrayLike, count: int) -> Floats:
+    """One profile point [x, z] (n, 2) m for each pose.
+
+    Raises:
+        InputError: another shape, or not finite.
+    """
+    p = np.asarray(points, float)
+    if p.shape != (count, 2):
+        raise InputError(f"{count} poses need {count} profile points [x, z], not an array of shape {p.shape}.")
+    if not np.isfinite(p).all():
+        raise InputError("A profile point is not finite: leave that sample out.")
+    return p
+
+
+def rotation_groups(poses: FlangePoses) -> NDArray[np.intp]:
+    """A number (n,) for each pose: poses of one orientation have the same, in the order in which they come."""
+    R = poses.rotation
+    group = np.full(len(R), -1, dtype=np.intp)
+    found = 0
+    for k in range(len(R)):
+        if group[k] >= 0:
+            continue
+        cosine = 0.5 * (np.einsum("nij,ij->n", R, R[k]) - 1.0)
+        group[(np.arccos(np.clip(cosine, -1.0, 1.0)) < SAME_ROTATION_RAD) & (group < 0)] = found
+        found += 1
+    return group
+
+
+def rotation_axes_spread(rotation: Floats) -> float:
+    """Second singular value over the first of the axes of all turns from the first orientation: 0 where all share one axis."""
+    turns = np.array([_axis_times_sine(rotation[0].T @ R) for R in rotation[1:]])
+    if len(turns) < 2:
+        return 0.0
+    s = np.linalg.svd(turns, compute_uv=False)
+    return float(s[1] / s[0]) if s[0] > 0.0 else 0.0
+
+
+def _axis_times_sine(R: Floats) -> Floats:
+    return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+
+
+def skew(v: Floats) -> Floats:
+    """Cross product matrices (..., 3, 3) of vectors (..., 3)."""
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def turned(R: Floats, w: Floats) -> Floats:
+    """R exp(w) for stacks of rotations (..., 3, 3) and rotation vectors (..., 3) in their own frame."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    K = skew(w)
+    small = angle < 1e-8
+    safe = np.where(small, 1.0, angle)
+    s = np.where(small, 1.0, np.sin(safe) / safe)
+    c = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    return np.asarray(R @ (np.eye(3) + s * K + c * (K @ K)))
+
+
+def left_jacobian(w: Floats) -> Floats:
+    """J (3, 3) with exp(w + d) = exp(J d) exp(w) for a small d."""
+    angle, K = float(np.linalg.norm(w)), skew(w)
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + 0.5 * K)
+    return np.asarray(np.eye(3) + (1 - np.cos(angle)) / angle**2 * K + (angle - np.sin(angle)) / angle**3 * K @ K)

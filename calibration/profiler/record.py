@@ -1,0 +1,158 @@
+"""A profiler's calibration as a file, profiler.yaml: pose, covariance, sensor and arm corrections, from which data; and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump, yaml_load
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.result import ProfilerEstimate
+from weldcal.calibration.profiler.sphere_joint import SphereEstimate
+from weldcal.calibration.profiler.sphere_model import corrected
+from weldcal.calibration.result import matrix4, software_version, write_atomically
+from weldcal.models.errors import InputError
+
+RECORD_FILE = "profiler.yaml"
+JSON_FILE = "X_FS.json"
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilerRecord:
+    """All that is needed to bring a profile point into the base frame, and how well it is known.
+
+    Attributes:
+        rotation (3, 3), translation (3,) m: X_FS; covariance (6, 6) [rotation in F; translation] or None (paper's methods).
+        affine (3,), origin (2,) m: the sensor's correction; tip (3,) m in F or None.
+        arm: its table where joints were corrected, with offsets (4,) rad of joints 2 to 5 and sag (2,) rad/m.
+        figures: what the command reports of the fit; data_sha256: of the file it came from.
+    """
+
+    method: str
+    rotation: Floats
+    translation: Floats
+    covariance: Floats | None = None
+    affine: Floats = field(default_factory=lambda: np.zeros(3))
+    origin: Floats = field(default_factory=lambda: np.zeros(2))
+    tip: Floats | None = None
+    arm: DhArm | None = None
+    offsets: Floats = field(default_factory=lambda: np.zeros(len(OFFSET_JOINTS)))
+    sag: Floats = field(default_factory=lambda: np.zeros(len(SAG_JOINTS)))
+    figures: dict[str, Any] = field(default_factory=dict)
+    data_sha256: str = ""
+
+    @staticmethod
+    def of(
+        method: str, e: ProfilerEstimate, figures: dict[str, Any], data_sha256: str, arm: DhArm | None = None
+    ) -> ProfilerRecord:
+        """Of an edge's or a sphere's estimate; arm only where its joints were corrected."""
+        if not isinstance(e, SphereEstimate):
+            return ProfilerRecord(
+                method, e.rotation, e.translation, e.covariance, figures=figures, data_sha256=data_sha256
+            )
+        return ProfilerRecord(
+            method, e.rotation, e.translation, e.covariance, e.affine, e.origin, e.tip, arm, e.offsets, e.sag, figures, data_sha256
+        )  # fmt: skip
+
+    def points_F(self, points: Floats) -> Floats:
+        """Profile points (n, 2) m in F (n, 3)."""
+        return np.asarray(
+            corrected(np.asarray(points, float), self.affine, self.origin) @ self.rotation.T + self.translation
+        )
+
+    def flange(self, poses: FlangePoses, q: Floats | None) -> FlangePoses:
+        """Flange poses as the corrected arm has them; as given where the calibration corrects no joints.
+
+        Raises:
+            InputError: the calibration corrects joints, and there are none.
+        """
+        if self.arm is None:
+            return poses
+        if q is None:
+            raise InputError(
+                "This calibration corrects the arm's joints: give the joints q with the scans, or calibrate without --model affine+joints."
+            )
+        return self.arm.poses(q, self.offsets, self.sag, self.arm.loads(q))
+
+
+def save_record(record: ProfilerRecord, folder: Path) -> tuple[Path, Path]:
+    """Write profiler.yaml and X_FS.json into a folder; their paths."""
+    X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(record.rotation), record.translation)
+    q = X.rotation().ToQuaternion()
+    pose = {
+        "matrix": matrix4(X),
+        "xyz": [float(v) for v in record.translation],
+        "wxyz": [float(v) for v in (q.w(), q.x(), q.y(), q.z())],
+    }
+    covariance = None
+    if record.covariance is not None:
+        covariance = {
+            "order": "rotation vector (rad) in the flange frame, then translation (m)",
+            "matrix": record.covariance.tolist(),
+        }
+    document = {
+        "schema": 1,
+        "software": software_version(),
+        "method": record.method,
+        "units": "m, rad",
+        "X_FS": pose,
+        "covariance": covariance,
+        "sensor": {"x_scale_z_scale_shear": record.affine.tolist(), "origin": record.origin.tolist()},
+        "tip_F": None if record.tip is None else record.tip.tolist(),
+        "arm": None
+        if record.arm is None
+        else {"dh": record.arm.rows.tolist(), "offsets": record.offsets.tolist(), "sag": record.sag.tolist()},
+        "figures": record.figures,
+        "data_sha256": record.data_sha256,
+    }
+    paths = folder / RECORD_FILE, folder / JSON_FILE
+    write_atomically(paths[0], yaml_dump(document))
+    exported = {"parent": "flange", "child": "profiler", "X_FS": pose, "covariance": covariance}
+    write_atomically(paths[1], json.dumps(exported, indent=2) + "\n")
+    return paths
+
+
+def load_record(path: Path) -> ProfilerRecord:
+    """Read a profiler.yaml, or the folder that holds it.
+
+    Raises:
+        InputError: it is not there, or no profiler's calibration.
+    """
+    path = path / RECORD_FILE if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(
+            f"There is no calibration at '{path}': give a folder written by 'weldcal profiler edge' or 'sphere'."
+        )
+    try:
+        d = yaml_load(filename=str(path))
+        M = np.array(d["X_FS"]["matrix"], float)
+        covariance = None if d["covariance"] is None else np.array(d["covariance"]["matrix"], float)
+        affine, origin = np.array(d["sensor"]["x_scale_z_scale_shear"], float), np.array(d["sensor"]["origin"], float)
+        tip = None if d["tip_F"] is None else np.array(d["tip_F"], float)
+        arm, offsets, sag = None, np.zeros(len(OFFSET_JOINTS)), np.zeros(len(SAG_JOINTS))
+        if d["arm"] is not None:
+            arm = DhArm.checked(d["arm"]["dh"])
+            offsets, sag = np.array(d["arm"]["offsets"], float), np.array(d["arm"]["sag"], float)
+        good = (
+            d["schema"] == 1
+            and M.shape == (4, 4)
+            and np.isfinite(M).all()
+            and affine.shape == (3,)
+            and origin.shape == (2,)
+        )
+        method, figures, digest = str(d["method"]), dict(d["figures"] or {}), str(d["data_sha256"])
+    except Exception as e:  # unreadable in any way: the same sentence
+        raise InputError(
+            f"'{path.name}' is no profiler's calibration: run 'weldcal profiler edge' or 'sphere' again."
+        ) from e
+    if not good or not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
+        raise InputError(f"'{path.name}' was changed by hand: run 'weldcal profiler edge' or 'sphere' again.")
+    return ProfilerRecord(
+        method, M[:3, :3], M[:3, 3], covariance, affine, origin, tip, arm, offsets, sag, figures, digest
+    )

@@ -1,0 +1,57 @@
+"""What every calibration of a profiler returns: X_FS with its covariance, its residuals, and what it cannot know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.profiler.motion import Floats, skew
+
+LEVER_M = 0.1  # a turn is weighed against a shift at this distance from the flange
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilerEstimate:
+    """Pose of the scan plane's frame S in the flange F: a profile point [x, z] is p_S = (x, 0, z).
+
+    Attributes:
+        rotation: R_FS (3, 3); translation: p_FS (3,) m.
+        covariance: (6, 6) of [left rotation vector rad (in F); translation m]: R_FS = exp(w) R_estimate.
+        residuals: (n, 2) m, measured profile point less the predicted one.
+        inliers: (n,) bool; rms_m: of the inliers' residuals; reduced_chi2: of the whitened ones, 1 where the stated
+            sigmas are right.
+        condition: least over largest singular value of the Jacobian with columns of unit length.
+    """
+
+    rotation: Floats
+    translation: Floats
+    covariance: Floats
+    residuals: Floats
+    inliers: NDArray[np.bool_]
+    rms_m: float
+    reduced_chi2: float
+    condition: float
+
+    @property
+    def X_FS(self) -> RigidTransform:
+        """The same as a transform."""
+        return RigidTransform(RotationMatrix(self.rotation), self.translation)
+
+    def mapped_covariance(self, x_m: float, z_m: float) -> Floats:
+        """Covariance (3, 3) m^2 in F of where a profile point (x, z) lies, by the calibration's own uncertainty alone."""
+        J = np.hstack([-skew(self.rotation @ np.array([x_m, 0.0, z_m])), np.eye(3)])
+        return np.asarray(J @ self.covariance @ J.T)
+
+
+def worst_direction(normal_matrix: Floats) -> str:
+    """In words, what a motion leaves open: the part of [rotation; translation] (6, 6, in F) with the least information."""
+    unit = np.diag([1.0 / LEVER_M] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(unit @ normal_matrix @ unit)
+    v = vectors[:, int(np.argmin(values))]
+    turn, shift = float(np.linalg.norm(v[:3])), float(np.linalg.norm(v[3:]))
+    kind, part = ("rotation about", v[:3] / turn) if turn > shift else ("translation along", v[3:] / shift)
+    part = part * np.sign(part[int(np.argmax(np.abs(part)))])
+    return f"{kind} ({part[0]:.2f}, {part[1]:.2f}, {part[2]:.2f}) of the flange"

@@ -1,0 +1,180 @@
+"""X_FS from a sphere in any poses, by its raw profile points and touches of it: one problem, no circles, no sides, no roots.
+
+Every profile point lies on the sphere, and so does the tip at every touch. The sensor's scale and shear in its plane and,
+where the joint angles are given, the arm's offsets and sag may be estimated with it, each held by a prior.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS
+from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
+from weldcal.calibration.profiler.motion import Floats
+from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
+from weldcal.calibration.profiler.sphere_model import Layout, Problem, SphereData, SphereSigmas, corrected
+from weldcal.calibration.profiler.sphere_start import sphere_starts
+from weldcal.models.errors import InputError
+
+Model = Literal["rigid", "affine", "affine+joints"]
+MINIMUM_POSES = 5
+SINGULAR = 1e-5
+WRONG_POSE = 5.0  # sigmas by which one pose's mean residual may be off before it is named
+
+
+@dataclass(frozen=True, eq=False)
+class SphereEstimate(ProfilerEstimate):
+    """X_FS and what was estimated with it; its residuals (n,) m are distances to the sphere.
+
+    Attributes:
+        center: (3,) m in B; tip: (3,) m in F or None; affine: (3,) [x scale, z scale, shear] about `origin` (2,) m.
+        offsets: (4,) rad of joints 2 to 5; sag: (2,) rad/m; zero where the model has them not.
+        wrong_poses: scans whose points lie off the sphere together.
+    """
+
+    center: Floats = field(default_factory=lambda: np.zeros(3))
+    tip: Floats | None = None
+    affine: Floats = field(default_factory=lambda: np.zeros(3))
+    origin: Floats = field(default_factory=lambda: np.zeros(2))
+    offsets: Floats = field(default_factory=lambda: np.zeros(len(OFFSET_JOINTS)))
+    sag: Floats = field(default_factory=lambda: np.zeros(len(SAG_JOINTS)))
+    wrong_poses: tuple[int, ...] = ()
+
+    def points_F(self, profile: ArrayLike) -> Floats:
+        """Profile points (n, 2) m, corrected by the sensor's model, in F (n, 3)."""
+        return np.asarray(
+            corrected(np.asarray(profile, float), self.affine, self.origin) @ self.rotation.T + self.translation
+        )
+
+
+def sphere_joint(
+    data: SphereData, model: Model = "affine", sigmas: SphereSigmas | None = None, init: SphereEstimate | None = None
+) -> SphereEstimate:
+    """The pose of a profiler on the flange from profiles of a sphere, and touches of it where there are any.
+
+    Without `init` the 24 orientations of a cube are tried.
+
+    Raises:
+        InputError: measurements that do not belong together, or joints asked for and not given.
+        TooFewTranslations: fewer than five scans. DegenerateMotion: the motion leaves a direction open, which is named.
+        InconsistentData: no sphere of this radius explains the profiles.
+    """
+    s = sigmas or SphereSigmas()
+    _check(data, model)
+    layout = Layout(tip=data.touches is not None, affine=model != "rigid", joints=model == "affine+joints")
+    problem = Problem(data, layout, s)
+    rigid = Problem(data, Layout(tip=layout.tip, affine=False, joints=False), s)
+    best = None
+    given = [] if init is None else [(init.rotation, init.translation, init.center)]
+    starts = given or sphere_starts(data.poses, problem.profiles, data.radius_m)
+    for R, t, c in starts:
+        found = rigid.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)]))
+        if best is None or found[1].cost < best[1].cost:
+            best = found
+    assert best is not None
+    R, result = best
+    x = np.zeros(layout.size)
+    x[: 9 + 3 * layout.tip] = result.x
+    if layout.size > len(result.x):
+        _, result = problem.solved(R, np.zeros(3), x)
+    return _estimate(problem, R, result.x)
+
+
+def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None = None) -> Floats:
+    """Rms distance (n,) m of each scan's points to the sphere, by the calibration that did not see it."""
+    errors = []
+    whole = sphere_joint(data, model, sigmas)
+    for k in range(len(data.poses)):
+        estimate = sphere_joint(data.without(k), model, sigmas, init=whole)
+        poses, p = data.poses, data.profiles[k]
+        if data.arm is not None and data.q is not None:
+            loads = data.arm.loads(data.q)
+            poses = data.arm.poses(data.q, estimate.offsets, estimate.sag, loads)
+        at = estimate.points_F(p[np.isfinite(p).all(axis=1)]) @ poses.rotation[k].T + poses.translation[k]
+        distance = np.linalg.norm(at - estimate.center, axis=1) - data.radius_m
+        errors.append(np.sqrt(np.mean(distance**2)))
+    return np.array(errors)
+
+
+def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> tuple[Model, dict[Model, float]]:
+    """The model with the least leave-one-scan-out error (rms m of each is returned); the simpler one where they are equal."""
+    names: list[Model] = ["rigid", "affine"]
+    if data.arm is not None:
+        names.append("affine+joints")
+    errors = {name: float(np.sqrt(np.mean(leave_one_out_m(data, name, sigmas) ** 2))) for name in names}
+    best = min(errors.values())
+    return next(name for name in names if errors[name] <= 1.02 * best), errors
+
+
+def _check(data: SphereData, model: Model) -> None:
+    n = len(data.poses)
+    if len(data.profiles) != n:
+        raise InputError(f"{n} poses need {n} profiles, not {len(data.profiles)}.")
+    if n < MINIMUM_POSES:
+        raise TooFewTranslations(
+            f"{n} scans of the sphere are too few: take {MINIMUM_POSES} or more, in different orientations."
+        )
+    if (data.touches is None) != (data.tip is None):
+        raise InputError("Touches need the tip's place in the flange frame, and the tip needs touches.")
+    no_joints = data.arm is None or data.q is None or (data.touches is not None and data.touch_q is None)
+    if model == "affine+joints" and no_joints:
+        raise InputError("The model with joints needs the arm's table and its joints at every scan and touch.")
+    for k, p in enumerate(data.profiles):
+        if p.ndim != 2 or p.shape[1] != 2 or np.isfinite(p).all(axis=1).sum() < 5:
+            raise InputError(f"Profile {k} has fewer than five points of the sphere: leave that scan out.")
+
+
+def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
+    """The result with its covariance, and whether it may be believed."""
+    # linearised about itself: a large rotation vector's own covariance is not that of a turn in F
+    R = np.asarray(Rotation.from_rotvec(x[:3]).as_matrix() @ R0)
+    problem.linearise_about(R)
+    x = np.concatenate([np.zeros(3), x[3:]])
+    pose, c, tip, affine, offsets, sag = problem.layout.unpack(x)
+    problem.share_robot_error(x)
+    J, r = problem.derivatives(x), problem.residual(x)
+    unit = np.linalg.norm(J, axis=0)
+    singular = np.linalg.svd(J / np.where(unit > 0, unit, 1.0), compute_uv=False)
+    H = J.T @ J
+    condition = float(singular[-1] / singular[0])
+    if condition < SINGULAR:
+        of_pose = H[:6, :6] - H[:6, 6:] @ np.linalg.pinv(H[6:, 6:]) @ H[6:, :6]
+        raise DegenerateMotion(
+            f"These scans leave the {worst_direction(of_pose)} open: turn the flange about two different axes between them."
+        )
+    m = len(problem.p)
+    distance = np.linalg.norm(problem.off(x)[0], axis=1) - problem.data.radius_m
+    freedom = max(len(r) - len(x), 1)
+    chi2 = float(np.median(np.abs(r[:m])) / 0.6745) ** 2
+    felt = r[m : m + (0 if problem.data.touches is None else len(problem.data.touches))]
+    if max(chi2, float(np.median(np.abs(felt)) / 0.6745) ** 2 if felt.size else 0.0) > 100.0:
+        raise InconsistentData(
+            f"Profiles lie {1e3 * float(np.median(np.abs(distance))):.2f} mm and touches "
+            f"{1e3 * problem.sigmas.touch_m * float(np.median(np.abs(felt)) if felt.size else 0.0):.2f} mm off any sphere of "
+            f"{1e3 * problem.data.radius_m:.2f} mm: check the radius, the poses and that only the sphere is in the profiles."
+        )
+    per_pose = np.array([np.mean(distance[problem.of == k]) for k in range(len(problem.count))])
+    spread = max(1.4826 * float(np.median(np.abs(per_pose))), 0.2 * problem.sigmas.robot_m)
+    wrong = tuple(int(k) for k in np.flatnonzero(np.abs(per_pose) > WRONG_POSE * spread))
+    return SphereEstimate(
+        rotation=R,
+        translation=np.asarray(pose[3:]),
+        covariance=np.asarray(np.linalg.inv(H)[:6, :6]),
+        residuals=np.asarray(distance),
+        inliers=np.abs(r[:m]) < 5.0,
+        rms_m=float(np.sqrt(np.mean(distance**2))),
+        reduced_chi2=float(r @ r / freedom),
+        condition=condition,
+        center=np.asarray(c),
+        tip=None if problem.data.tip is None else problem.data.tip + tip,
+        affine=np.asarray(affine),
+        origin=problem.origin,
+        offsets=np.asarray(offsets),
+        sag=np.asarray(sag),
+        wrong_poses=wrong,
+    )

@@ -1,0 +1,256 @@
+"""The sphere problem itself: its measurements, its unknowns, and the whitened residuals with their derivatives.
+
+Every profile point lies on the sphere, and so does the tip at every touch. The error of the robot's position, which all
+points of a scan share, is taken out by whitening with it rather than by unknowns of its own; docs/profiler.md derives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, left_jacobian
+
+POINTS_PER_POSE = 120
+STEP_RAD = 1e-6
+ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
+
+
+@dataclass(frozen=True)
+class SphereSigmas:
+    """What is known before: of the sensor's points, the robot's position at a scan and at a touch (m), and the priors."""
+
+    sensor_m: float = 0.05e-3
+    robot_m: float = 0.03e-3  # per axis: a repeatability of 0.05 mm by ISO 9283 is a radius
+    touch_m: float = 0.05e-3
+    affine: float = 0.03
+    joint_rad: float = np.radians(0.05)
+    sag_rad_m: float = np.radians(0.1)
+    tip_m: float = 10e-3
+
+
+@dataclass(frozen=True, eq=False)
+class SphereData:
+    """One calibration's measurements.
+
+    Attributes:
+        poses: flange at each scan; profiles: (m, 2) [x, z] m of the sphere in each; radius_m: of the sphere.
+        touches: flange at each touch, tip: (3,) m in F as far as it is known; both or none.
+        arm, q, touch_q: the arm's table and its joints (n, 6) rad at scans and touches, for the model with joints.
+    """
+
+    poses: FlangePoses
+    profiles: Sequence[Floats]
+    radius_m: float
+    touches: FlangePoses | None = None
+    tip: Floats | None = None
+    arm: DhArm | None = None
+    q: Floats | None = None
+    touch_q: Floats | None = None
+
+    def without(self, k: int) -> SphereData:
+        """The same but for scan k."""
+        keep = np.arange(len(self.poses)) != k
+        q = None if self.q is None else self.q[keep]
+        profiles = [p for j, p in enumerate(self.profiles) if j != k]
+        return SphereData(self.poses[keep], profiles, self.radius_m, self.touches, self.tip, self.arm, q, self.touch_q)
+
+
+def corrected(p: Floats, affine: Floats, origin: Floats) -> Floats:
+    """Profile points (n, 2) as (n, 3) in S, through [x scale, z scale, shear] about an origin."""
+    a, b, h = affine
+    u = p - origin
+    x = u[:, 0] * (1.0 + a) + u[:, 1] * h + origin[0]
+    z = u[:, 0] * h + u[:, 1] * (1.0 + b) + origin[1]
+    return np.column_stack([x, np.zeros(len(p)), z])
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each unknown stands in the vector: pose, centre, tip, affine, joints."""
+
+    tip: bool
+    affine: bool
+    joints: bool
+
+    def unpack(self, x: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+        """(w and t (6,), centre (3,), tip change (3,), affine (3,), offsets (4,), sag (2,))."""
+        k, parts = 9, []
+        for size, used in (
+            (3, self.tip),
+            (3, self.affine),
+            (len(OFFSET_JOINTS), self.joints),
+            (len(SAG_JOINTS), self.joints),
+        ):
+            parts.append(x[k : k + size] if used else np.zeros(size))
+            k += size if used else 0
+        return x[:6], x[6:9], parts[0], parts[1], parts[2], parts[3]
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return 9 + 3 * self.tip + 3 * self.affine + (len(OFFSET_JOINTS) + len(SAG_JOINTS)) * self.joints
+
+    def sigmas(self, s: SphereSigmas) -> Floats:
+        """Of the priors; infinite where there is none."""
+        known: list[float] = [np.inf] * 9
+        known += [s.tip_m] * 3 * self.tip + [s.affine] * 3 * self.affine
+        known += ([s.joint_rad] * len(OFFSET_JOINTS) + [s.sag_rad_m] * len(SAG_JOINTS)) * self.joints
+        return np.array(known)
+
+
+class Problem:
+    """The whitened residuals of one model on one set of measurements."""
+
+    def __init__(self, data: SphereData, layout: Layout, sigmas: SphereSigmas) -> None:
+        self.data, self.layout, self.sigmas = data, layout, sigmas
+        self.profiles = [_thinned(p[np.isfinite(p).all(axis=1)]) for p in data.profiles]
+        self.count = np.array([len(p) for p in self.profiles])
+        self.of = np.repeat(np.arange(len(self.profiles)), self.count)
+        self.p = np.vstack(self.profiles)
+        self.origin = self.p.mean(axis=0)
+        self._R0, self._t0 = np.eye(3), np.zeros(3)
+        self._whiten: list[tuple[Floats, Floats]] | None = None
+        self._slant = np.ones(len(self.p))
+        arm, q, touch_q = data.arm, data.q, data.touch_q
+        self._loads = arm.loads(q) if arm is not None and q is not None else None
+        self._touch_loads = arm.loads(touch_q) if arm is not None and touch_q is not None else None
+
+    def solved(self, R: Floats, t: Floats, x: Floats) -> tuple[Floats, OptimizeResult]:
+        """Least squares from a start, twice: the second time with the robot's own error of each scan taken out."""
+        self._R0 = R
+        x = np.array(x)
+        x[3:6] += t
+        prior = 1.0 / self.layout.sigmas(self.sigmas)
+        scale = np.concatenate(
+            [[0.1] * 3, [0.01] * 6, np.where(prior[9:] > 0, 1.0 / np.where(prior[9:] > 0, prior[9:], 1), 1)]
+        )
+        self._whiten = None
+        found = least_squares(self.residual, x, jac=self.derivatives, x_scale=scale, **ROBUST)
+        self.share_robot_error(found.x)
+        found = least_squares(self.residual, found.x, jac=self.derivatives, x_scale=scale, **ROBUST)
+        return R, found
+
+    def linearise_about(self, rotation: Floats) -> None:
+        """R_FS (3, 3) to which the first three unknowns are a turn in F."""
+        self._R0 = rotation
+
+    def share_robot_error(self, x: Floats) -> None:
+        """Whiten from now on with the robot's error at each scan, linearised at x."""
+        self._whiten = self._robot_error(x)
+
+    def _poses(self, offsets: Floats, sag: Floats) -> tuple[FlangePoses, FlangePoses | None]:
+        data = self.data
+        if not self.layout.joints:
+            return data.poses, data.touches
+        assert data.arm is not None
+        assert data.q is not None
+        assert self._loads is not None
+        touches = None
+        if data.touch_q is not None and self._touch_loads is not None:
+            touches = data.arm.poses(data.touch_q, offsets, sag, self._touch_loads)
+        return data.arm.poses(data.q, offsets, sag, self._loads), touches
+
+    def off(self, x: Floats) -> tuple[Floats, Floats, FlangePoses]:
+        """Vectors (m, 3) from the centre to all profile points, and to the tip at all touches (k, 3)."""
+        pose, c, tip, affine, offsets, sag = self.layout.unpack(x)
+        poses, touches = self._poses(offsets, sag)
+        R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
+        p_F = corrected(self.p, affine, self.origin) @ R.T + pose[3:]
+        at = np.einsum("nij,nj->ni", poses.rotation[self.of], p_F) + poses.translation[self.of] - c
+        felt = np.empty((0, 3))
+        if touches is not None and self.data.tip is not None:
+            felt = touches.rotation @ (self.data.tip + tip) + touches.translation - c
+        return at, felt, poses
+
+    def residual(self, x: Floats) -> Floats:
+        at, felt, _ = self.off(x)
+        R = self.data.radius_m
+        r = (np.linalg.norm(at, axis=1) - R) / self.sigmas.sensor_m
+        r = self._whitened(r[:, None])[:, 0]
+        touch = (np.linalg.norm(felt, axis=1) - R) / self.sigmas.touch_m
+        prior = x / self.layout.sigmas(self.sigmas)
+        return np.concatenate([r, touch, prior[9:]])
+
+    def _whitened(self, columns: Floats) -> Floats:
+        """Rows (m, k) of the profiles' points, in sigmas of independent errors once these are known."""
+        if self._whiten is None:
+            return columns
+        out, start = columns / self._slant[:, None], 0
+        for (U, less), n in zip(self._whiten, self.count, strict=True):
+            part = out[start : start + n]
+            out[start : start + n] = part - U @ (less[:, None] * (U.T @ part))
+            start += n
+        return np.asarray(out)
+
+    def derivatives(self, x: Floats) -> Floats:
+        """Jacobian of `residual`; that of the joints by differences of poses."""
+        pose, _, tip, affine, offsets, sag = self.layout.unpack(x)
+        poses, touches = self._poses(offsets, sag)
+        at, felt, _ = self.off(x)
+        R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
+        turned = corrected(self.p, affine, self.origin) @ R.T
+        n_B = at / np.linalg.norm(at, axis=1, keepdims=True)
+        n_F = np.einsum("nij,ni->nj", poses.rotation[self.of], n_B)
+        m_B = felt / np.linalg.norm(felt, axis=1, keepdims=True)
+        m = len(felt)
+        scan = [np.cross(turned, n_F) @ left_jacobian(pose[:3]), n_F, -n_B]
+        touch = [np.zeros((m, 6)), -m_B]
+        if self.layout.tip:
+            scan.append(np.zeros((len(at), 3)))
+            assert touches is not None
+            touch.append(np.einsum("nij,ni->nj", touches.rotation, m_B))
+        if self.layout.affine:
+            n_S, u = n_F @ R, self.p - self.origin
+            scan.append(
+                np.column_stack([n_S[:, 0] * u[:, 0], n_S[:, 2] * u[:, 1], n_S[:, 0] * u[:, 1] + n_S[:, 2] * u[:, 0]])
+            )
+            touch.append(np.zeros((m, 3)))
+        if self.layout.joints:
+            p_F = turned + pose[3:]
+            both = np.concatenate([offsets, sag])
+            for k, h in enumerate([STEP_RAD] * len(OFFSET_JOINTS) + [STEP_RAD] * len(SAG_JOINTS)):
+                moved = both + h * np.eye(len(both))[k]
+                near, near_touch = self._poses(moved[: len(OFFSET_JOINTS)], moved[len(OFFSET_JOINTS) :])
+                dR, dp = (near.rotation - poses.rotation) / h, (near.translation - poses.translation) / h
+                by = np.einsum("nij,nj->ni", dR[self.of], p_F) + dp[self.of]
+                scan.append(np.einsum("ni,ni->n", n_B, by)[:, None])
+                if near_touch is None or touches is None or self.data.tip is None:
+                    continue
+                by = (
+                    (near_touch.rotation - touches.rotation) @ (self.data.tip + tip)
+                    + near_touch.translation
+                    - touches.translation
+                )
+                touch.append(np.einsum("ni,ni->n", m_B, by / h)[:, None])
+        top = self._whitened(np.hstack(scan) / self.sigmas.sensor_m)
+        bottom = np.hstack(touch) / self.sigmas.touch_m if m else np.empty((0, self.layout.size))
+        prior = np.diag(1.0 / self.layout.sigmas(self.sigmas))[9:]
+        return np.vstack([top, bottom, prior])
+
+    def _robot_error(self, x: Floats) -> list[tuple[Floats, Floats]]:
+        """Per scan (U, less) that whiten residuals which share the robot's error: C^-1/2 r = r - U less U^T r."""
+        at, _, poses = self.off(x)
+        normals = at / np.linalg.norm(at, axis=1, keepdims=True)
+        # noise lies in the scan plane, and the sphere's normal does not: only its part in the plane carries noise
+        y_F = Rotation.from_rotvec(x[:3]).as_matrix() @ self._R0[:, 1]
+        y_B = np.einsum("nij,j->ni", poses.rotation, y_F)[self.of]
+        self._slant = np.sqrt(np.maximum(1.0 - np.einsum("ni,ni->n", normals, y_B) ** 2, 0.01))
+        normals = normals / self._slant[:, None]
+        ratio, out, start = (self.sigmas.robot_m / self.sigmas.sensor_m) ** 2, [], 0
+        for n in self.count:
+            U, s, _ = np.linalg.svd(normals[start : start + n], full_matrices=False)
+            out.append((U, 1.0 - 1.0 / np.sqrt(1.0 + ratio * s**2)))
+            start += n
+        return out
+
+
+def _thinned(p: Floats) -> Floats:
+    step = max(1, int(np.ceil(len(p) / POINTS_PER_POSE)))
+    return np.asarray(p[::step])

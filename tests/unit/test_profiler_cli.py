@@ -1,0 +1,175 @@
+"""weldcal profiler at a prompt: files in, calibrations out, one sentence for each mistake."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from weldcal.calibration.profiler.edge_model import EdgeState, predicted
+from weldcal.calibration.profiler.motion import FlangePoses
+from weldcal.calibration.profiler.plan import sample_edge_poses
+from weldcal.calibration.profiler.record import load_record
+from weldcal.models.errors import InputError
+from weldcal.tools.cli import app
+from weldcal.tools.studies.profiler_worlds import CLEAN, SphereWorld, sphere_trial
+
+STATE = EdgeState(
+    Rotation.from_euler("xyz", [170.0, -9.0, 52.0], degrees=True).as_matrix(),
+    np.array([0.055, 0.021, 0.130]),
+    np.array([0.9, -0.2, 0.25]),
+    np.array([0.8, 0.58, 0.15]) / np.linalg.norm([0.8, 0.58, 0.15]),
+)
+
+
+def called(*words: object) -> tuple[int, str]:
+    """Exit code and all that was printed, its lines made one."""
+    result = CliRunner().invoke(app, ["profiler", *(str(w) for w in words)])
+    return result.exit_code, " ".join(result.output.split())
+
+
+def found(*words: object) -> dict[str, Any]:
+    result = CliRunner().invoke(app, ["profiler", *(str(w) for w in words), "--json"])
+    assert result.exit_code == 0, result.output
+    answer: dict[str, Any] = json.loads(result.stdout.strip().splitlines()[-1])
+    return answer
+
+
+@cache
+def edge() -> tuple[FlangePoses, np.ndarray]:
+    poses = sample_edge_poses(STATE, 24, 3)
+    p = predicted(STATE, poses)[0]
+    return poses, p + 5e-5 * np.random.default_rng(4).standard_normal(p.shape)
+
+
+def edge_csv(path: Path, unit: str = "mm") -> Path:
+    poses, p = edge()
+    k = 1e3 if unit == "mm" else 1.0
+    turns = Rotation.from_matrix(poses.rotation).as_rotvec()
+    rows = np.column_stack([k * poses.translation, turns, k * p])
+    path.write_text(
+        ",".join([*(f"{a}_{unit}" for a in "xyz"), "rx_rad", "ry_rad", "rz_rad", f"px_{unit}", f"pz_{unit}"]) + "\n"
+        + "\n".join(",".join(repr(float(v)) for v in row) for row in rows) + "\n"
+    )  # fmt: skip
+    return path
+
+
+def test_an_edge_from_csv_and_from_npz_in_any_unit_is_the_same_calibration(tmp_path: Path) -> None:
+    poses, p = edge()
+    np.savez(tmp_path / "m.npz", rotation=poses.rotation, translation=poses.translation, points=p, unit="m")
+    np.savez(tmp_path / "mm.npz", rotation=poses.rotation, translation=1e3 * poses.translation, points=1e3 * p)
+    sources: list[tuple[object, ...]] = [
+        (edge_csv(tmp_path / "mm.csv"),),
+        (edge_csv(tmp_path / "m.csv", "m"),),
+        (tmp_path / "m.npz",),
+        (tmp_path / "mm.npz", "--unit", "mm"),
+    ]
+    answers = []
+    for k, words in enumerate(sources):
+        answer = found("edge", *words, "--out", tmp_path / f"out{k}", "--plan", 2 if k == 0 else 0)
+        answers.append(load_record(tmp_path / f"out{k}"))
+        assert answer["inliers"] == 24
+    sigma = np.sqrt(np.diag(answers[0].covariance))  # type: ignore[arg-type]
+    assert (np.abs(answers[0].translation - STATE.translation) < 4 * sigma[3:]).all()
+    for other in answers[1:]:
+        np.testing.assert_allclose(other.rotation, answers[0].rotation, atol=1e-8)
+        np.testing.assert_allclose(other.translation, answers[0].translation, atol=1e-8)
+    assert len(answers[0].figures["next_poses"]["poses"]) == 2
+    assert json.loads((tmp_path / "out0/X_FS.json").read_text())["child"] == "profiler"
+
+
+def test_a_sphere_with_touches_by_both_methods_and_what_was_written_is_read_back(tmp_path: Path) -> None:
+    world = SphereWorld.made(5, CLEAN)
+    trial = sphere_trial(world, 500, touches=20, views=0)
+    d = trial.data
+    assert d.touches is not None
+    touch_T = np.tile(np.eye(4), (20, 1, 1))
+    touch_T[:, :3, :3], touch_T[:, :3, 3] = d.touches.rotation, d.touches.translation
+    content: dict[str, Any] = {
+        "unit": "m", "rotation": d.poses.rotation, "translation": d.poses.translation, "profiles": np.array(d.profiles),
+        "radius": d.radius_m, "touch_T": touch_T, "tip": d.tip, "sign": trial.sign,
+    }  # fmt: skip
+    np.savez(tmp_path / "s.npz", **content)
+    joint = found("sphere", tmp_path / "s.npz", "--model", "rigid", "--sigma-robot", 0.04, "--out", tmp_path / "joint")
+    assert joint["reduced_chi2"] == pytest.approx(1.0, abs=0.15)
+    record = load_record(tmp_path / "joint")
+    assert np.linalg.norm(record.translation - world.translation) < 1e-3
+    paper = found("compensate", tmp_path / "s.npz", "--out", tmp_path / "paper")
+    assert paper["centre_after_mm"] < paper["centre_before_mm"]
+    content["sign"] = trial.sign * np.where(np.arange(20) == 14, -1.0, 1.0)
+    np.savez(tmp_path / "w.npz", **content)
+    code, text = called("compensate", tmp_path / "w.npz", "--out", tmp_path / "wrong")
+    assert code == 0
+    assert "likely wrong in scans [14]" in text
+
+
+def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
+    found("edge", edge_csv(tmp_path / "e.csv"), "--out", tmp_path / "cal")
+    x = np.linspace(-0.02, 0.02, 300)
+    p = np.column_stack([x, 0.08 + np.clip(0.01 - 2.0 * np.abs(x), 0.0, None)])
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 0.5
+    np.savez(tmp_path / "g.npz", T=T, profiles=np.array([p, p]), unit="m")
+    assert (
+        found("seam", tmp_path / "g.npz", "--calibration", tmp_path / "cal", "--out", tmp_path / "seam")["found"] == 2
+    )
+    table = np.genfromtxt(tmp_path / "seam/seam.csv", delimiter=",", names=True)
+    root = load_record(tmp_path / "cal").points_F(np.array([[0.0, 0.09]]))[0]
+    at = np.array([table[f"root_{a}_mm"] for a in "xyz"]).T
+    np.testing.assert_allclose(at, 1e3 * (root + np.array([[0, 0, 0], [0.5, 0, 0]])), atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("edge", "none.npz"), "There is no file"),
+        (("edge", "t.txt"), "neither .npz nor .csv"),
+        (("edge", "broken.npz", "--unit", "mm"), "cannot be read as NPZ"),
+        (("edge", "p.npz"), "does not say its unit"),
+        (("edge", "p.npz", "--unit", "inch"), "m or mm, not 'inch'"),
+        (("edge", "p.npz", "--unit", "m"), "give --unit mm"),
+        (("edge", "e.csv", "--method", "best"), "joint or paper"),
+        (("edge", "e.csv", "--feature", "bar"), "no profiles"),
+        (("edge", "e.csv", "--sigma-x", "0"), "must be positive"),
+        (("edge", "bad.csv"), "header needs x_mm"),
+        (("edge", "word.csv"), "no number"),
+        (("sphere", "e.csv"), "no 'profiles' of the sphere"),
+        (("sphere", "e.csv", "--tip", "1,2"), "three numbers in mm"),
+        (("seam", "e.csv", "--calibration", "nowhere"), "There is no calibration"),
+    ],
+)
+def test_a_mistake_is_named_in_one_sentence_and_nothing_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    poses, p = edge()
+    np.savez("p.npz", rotation=poses.rotation, translation=1e3 * poses.translation, points=1e3 * p)
+    Path("t.txt").write_text("x")
+    Path("broken.npz").write_text("x")
+    Path("bad.csv").write_text("a,b\n1,2\n")
+    Path("word.csv").write_text("x_mm,y_mm\n1,two\n")
+    edge_csv(Path("e.csv"))
+    code, text = called(*words, "--out", "out")
+    assert code == 1
+    assert sentence in text
+    assert text.count("weldcal:") == 1
+    assert not Path("out").exists()
+
+
+def test_a_record_changed_by_hand_is_refused(tmp_path: Path) -> None:
+    found("edge", edge_csv(tmp_path / "e.csv"), "--out", tmp_path / "cal")
+    path = tmp_path / "cal/profiler.yaml"
+    text = path.read_text()
+    first = text.index("- [") + 3
+    path.write_text(text[:first] + "9." + text[first + 2 :])
+    with pytest.raises(InputError, match="changed by hand"):
+        load_record(path)
+    path.write_text("schema: 1\n")
+    with pytest.raises(InputError, match="no profiler's calibration"):
+        load_record(path)

@@ -1,0 +1,309 @@
+"""The work behind `weldcal profiler`: a file read, calibrated or mapped, the result written; each returns what it found."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from weldcal.calibration.profiler.arc import find_arc, fit_circle
+from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.edge_features import Kind, extract_edge
+from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge_linear import edge_linear
+from weldcal.calibration.profiler.edge_model import EdgeState
+from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
+from weldcal.calibration.profiler.plan import (
+    Field,
+    plan_edge_poses,
+    plan_sphere_poses,
+    sample_edge_poses,
+    sample_sphere_poses,
+)
+from weldcal.calibration.profiler.record import ProfilerRecord, load_record, save_record
+from weldcal.calibration.profiler.result import ProfilerEstimate
+from weldcal.calibration.profiler.sphere_joint import Model, choose_model, sphere_joint
+from weldcal.calibration.profiler.sphere_linear import (
+    compensate,
+    fit_touch_sphere,
+    sphere_center,
+    sphere_linear,
+    wrong_sides,
+)
+from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import InputError
+from weldcal.tools.profiler_files import ProfilerFile
+from weldcal.tools.report.render import write_atomic
+
+CANDIDATES = 300
+ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
+MODELS = ("auto", "rigid", "affine", "affine+joints")
+FEATURES = ("bar", "step", "apex")
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """What is known of sensor and robot, m."""
+
+    robot_m: float = 0.03e-3
+    x_m: float = 0.05e-3
+    z_m: float = 0.06e-3
+
+    def __post_init__(self) -> None:
+        if not (self.robot_m >= 0.0 and self.x_m > 0.0 and self.z_m > 0.0):
+            raise InputError("The sigmas of x and z must be positive, and the robot's not negative.")
+
+
+def calibrate_edge(
+    file: ProfilerFile, sigmas: Sigmas, *, method: str = "joint", feature: str = "", side: str = "left", plan: int = 0
+) -> tuple[ProfilerRecord, dict[str, Any]]:
+    """X_FS from one straight edge: points, or raw profiles with the kind of edge that they show."""
+    if method not in ("joint", "paper"):
+        raise InputError(f"The method is joint or paper, not '{method}'.")
+    if side not in ("left", "right"):
+        raise InputError(f"The side is left or right, not '{side}'.")
+    poses = cast(FlangePoses, file.poses())
+    points, lost = _edge_points(file, feature, side)
+    keep = np.asarray(np.isfinite(points).all(axis=1), bool)
+    if points.shape != (len(poses), 2):
+        raise InputError(
+            f"{len(poses)} poses need {len(poses)} profile points [x, z], not an array of shape {points.shape}."
+        )
+    poses, points = poses[keep], points[keep]
+    found: dict[str, Any] = {"scans": len(keep), "without_feature": lost}
+    if method == "paper":
+        group = file.arrays["group"][keep] if "group" in file.arrays else rotation_groups(poses)
+        linear = edge_linear(poses.rotation, poses.translation, points, group)
+        found |= {"mean_distance_mm": 1e3 * float(linear.distances_m.mean())}
+        return ProfilerRecord(
+            "edge, linear", linear.rotation, linear.translation, figures=found, data_sha256=file.digest
+        ), found
+    xz = np.array([sigmas.x_m, sigmas.z_m])
+    e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz)
+    found |= _figures(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
+    if plan:
+        state = EdgeState(e.rotation, e.translation, e.point, e.direction)
+        z = points[e.inliers, 1]
+        field = Field(
+            max(0.005, float(np.abs(points[e.inliers, 0]).max())), float(z.min()) - 1e-9, float(z.max()) + 2e-3
+        )
+        candidates = sample_edge_poses(state, CANDIDATES, 0, field)
+        chosen = plan_edge_poses(
+            state, poses[e.inliers], candidates, plan, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz, field=field
+        )
+        found["next_poses"] = _next(candidates, chosen.chosen, chosen.rms_m)
+    return ProfilerRecord.of("edge, joint", e, found, file.digest), found
+
+
+def _edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
+    """Points (n, 2) m, not finite where a profile shows no edge; which those are."""
+    if not feature:
+        return file.needed(
+            "points", "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)"
+        ), []
+    if feature not in FEATURES:
+        raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
+    if file.profiles is None:
+        raise InputError("The file has no profiles to look for an edge in: leave --feature away.")
+    points, lost = np.full((len(file.profiles), 2), np.nan), []
+    for k, p in enumerate(file.profiles):
+        try:
+            points[k], _ = extract_edge(p, cast(Kind, feature), "left" if side == "left" else "right")
+        except FeatureNotFound:
+            lost.append(k)
+    return points, lost
+
+
+def sphere_data(
+    file: ProfilerFile,
+    *,
+    radius_m: float | None,
+    arm: str = "",
+    tip_m: Floats | None = None,
+    touches: ProfilerFile | None = None,
+) -> SphereData:
+    """A file's measurements of a sphere: its arcs found among other points, touches and joints where there are any."""
+    if file.profiles is None:
+        raise InputError("The file has no 'profiles' of the sphere: give (n, m, 2), or 'xz' with the lengths 'n'.")
+    radius = radius_m if radius_m is not None else float(file.needed("radius", "the sphere's (or give --radius in mm)"))
+    if not 1e-3 <= radius <= 1.0:
+        raise InputError(f"A sphere of {1e3 * radius:.3g} mm radius is none to calibrate with: give --radius in mm.")
+    felt = touches.poses() if touches is not None else file.poses("touch_")
+    tip = tip_m if tip_m is not None else file.arrays.get("tip")
+    if felt is not None and tip is None:
+        raise InputError("There are touches but no tip: give its place in the flange frame as --tip x,y,z in mm.")
+    table = DhArm.of(load_arm(arm)) if arm else file.arm()
+    poses = cast(FlangePoses, file.poses())
+    if len(file.profiles) != len(poses):
+        raise InputError(f"{len(poses)} poses need {len(poses)} profiles, not {len(file.profiles)}.")
+    profiles = [_arc(p, radius) for p in file.profiles]
+    return SphereData(
+        poses, profiles, radius, felt, tip if felt is not None else None, table, file.arrays.get("q"), file.arrays.get("touch_q")
+    )  # fmt: skip
+
+
+def _arc(profile: Floats, radius_m: float) -> Floats:
+    """The sphere's points of a profile: all of them where they are one arc, else those that are found to be."""
+    p = profile[np.isfinite(profile).all(axis=1)]
+    if len(p) >= 5:
+        circle, rms = fit_circle(p)
+        if rms < ALL_ARC_M and circle[2] < 1.05 * radius_m and len(np.unique(p[:, 1] < circle[1])) == 1:
+            return p
+    return np.asarray(profile[find_arc(profile, radius_m)[0]])
+
+
+def calibrate_sphere(
+    data: SphereData, digest: str, sigmas: Sigmas, *, model: str = "auto", plan: int = 0
+) -> tuple[ProfilerRecord, dict[str, Any]]:
+    """X_FS from a sphere in any poses, by the model that foretells scans left out best (or the one named)."""
+    if model not in MODELS:
+        raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
+    s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
+    found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
+    chosen = cast(Model, model)
+    if model == "auto":
+        full = data.arm is not None and data.q is not None and (data.touches is None or data.touch_q is not None)
+        chosen, errors = choose_model(data if full else _without_arm(data), s)
+        found["left_out_rms_mm"] = {name: 1e3 * v for name, v in errors.items()}
+    e = sphere_joint(data, chosen, s)
+    found |= {"model": chosen} | _figures(e)
+    found["wrong_scans"] = list(e.wrong_poses)
+    if plan:
+        seen = np.vstack(data.profiles)
+        near, far = (float(v) for v in np.percentile(seen[:, 1], [1.0, 99.0]))
+        field = Field(float(np.percentile(np.abs(seen[:, 0]), 99.0)), near, max(far, near + 5e-3))
+        candidates = sample_sphere_poses(e.rotation, e.translation, e.center, data.radius_m, CANDIDATES, 0, field)
+        best = plan_sphere_poses(
+            e.rotation, e.translation, e.center, data.radius_m, data.poses, candidates, plan, sigmas=s, field=field
+        )
+        found["next_poses"] = _next(candidates, best.chosen, best.rms_m)
+    arm = data.arm if chosen == "affine+joints" else None
+    return ProfilerRecord.of(f"sphere, {chosen}", e, found, digest, arm), found
+
+
+def _without_arm(data: SphereData) -> SphereData:
+    return SphereData(data.poses, data.profiles, data.radius_m, data.touches, data.tip)
+
+
+def calibrate_compensate(
+    file: ProfilerFile, data: SphereData, *, solve_tip: bool = False
+) -> tuple[ProfilerRecord, dict[str, Any]]:
+    """The sphere paper's own way: centres with the sides that the file says, two linear steps, compensation by touches."""
+    sign = file.needed(
+        "sign", "on which side (+1 or -1, along y) of the scan plane each scan has the centre; 'sphere' needs none"
+    )
+    if data.touches is None or data.tip is None:
+        raise InputError(
+            "The compensation needs touches: give 'touch_T' and 'tip' in the file, or --touches and --tip."
+        )
+    if sign.shape != (len(data.poses),):
+        raise InputError(f"{len(data.poses)} scans need as many signs, not {sign.shape}.")
+    if "translated" in file.arrays:
+        translated = file.arrays["translated"] > 0.5
+    else:
+        group = rotation_groups(data.poses)
+        translated = np.asarray(group == np.bincount(group).argmax(), bool)
+    centers = np.array(
+        [sphere_center(fit_circle(p)[0], data.radius_m, s) for p, s in zip(data.profiles, sign, strict=True)]
+    )
+    R, t = data.poses.rotation, data.poses.translation
+    linear = sphere_linear(R, t, centers, translated)
+    felt = fit_touch_sphere(
+        data.touches.rotation, data.touches.translation, data.tip, data.radius_m, solve_tip=solve_tip
+    )
+    best = compensate(linear, R, t, centers, felt.center)
+
+    def off(rotation: Floats, translation: Floats) -> float:
+        at = np.einsum("nij,nj->ni", R, centers @ rotation.T + translation) + t
+        return 1e3 * float(np.linalg.norm(at - felt.center, axis=1).mean())
+
+    found = {
+        "scans": len(R),
+        "touches": len(data.touches),
+        "touch_rms_mm": 1e3 * felt.rms_m,
+        "centre_before_mm": off(linear.rotation, linear.translation),
+        "centre_after_mm": off(best.rotation, best.translation),
+        "wrong_sides": list(wrong_sides(R, t, centers, translated)),
+    }
+    record = ProfilerRecord(
+        "sphere, linear and compensated",
+        best.rotation,
+        best.translation,
+        tip=felt.tip,
+        figures=found,
+        data_sha256=file.digest,
+    )
+    return record, found
+
+
+def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, Any]:
+    """A V-groove's three features of every profile in the base frame, written as seam.csv; what was found."""
+    record = load_record(calibration)
+    if file.profiles is None:
+        raise InputError("The file has no 'profiles' of the groove: give (n, m, 2), or 'xz' with the lengths 'n'.")
+    poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
+    if len(poses) != len(file.profiles):
+        raise InputError(f"{len(poses)} poses need {len(poses)} profiles, not {len(file.profiles)}.")
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"])
+    lost, rms = [], []
+    for k, p in enumerate(file.profiles):
+        try:
+            f = groove_features(p)
+        except FeatureNotFound:
+            lost.append(k)
+            continue
+        at = record.points_F(f.points) @ poses.rotation[k].T + poses.translation[k]
+        table.writerow([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
+        rms.append(f.rms_m)
+    if not rms:
+        raise FeatureNotFound(
+            "No profile of the file shows a V-groove with plate on both sides: check the file and its unit."
+        )
+    write_atomic(folder / "seam.csv", text.getvalue())
+    return {
+        "scans": len(poses),
+        "found": len(rms),
+        "without_groove": lost,
+        "rms_mm": 1e3 * float(np.median(rms)),
+        "method": record.method,
+    }
+
+
+def _figures(e: ProfilerEstimate) -> dict[str, Any]:
+    turn, shift = np.trace(e.covariance[:3, :3]), np.trace(e.covariance[3:, 3:])
+    figures: dict[str, Any] = {
+        "sigma_rotation_deg": float(np.degrees(np.sqrt(turn))),
+        "sigma_translation_mm": 1e3 * float(np.sqrt(shift)),
+        "rms_mm": 1e3 * e.rms_m,
+        "reduced_chi2": e.reduced_chi2,
+        "condition": e.condition,
+    }
+    if isinstance(e, EdgeEstimate):
+        figures["inliers"] = int(e.inliers.sum())
+    return figures
+
+
+def _next(candidates: FlangePoses, chosen: tuple[int, ...], rms_m: Floats) -> dict[str, Any]:
+    from scipy.spatial.transform import Rotation
+
+    return {
+        "poses": [
+            [float(v) for v in (*candidates.translation[k], *Rotation.from_matrix(candidates.rotation[k]).as_rotvec())]
+            for k in chosen
+        ],
+        "rms_before_and_after_each_mm": [1e3 * float(v) for v in rms_m],
+    }
+
+
+def write_calibration(record: ProfilerRecord, folder: Path) -> None:
+    """profiler.yaml and X_FS.json."""
+    save_record(record, folder)

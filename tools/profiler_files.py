@@ -1,0 +1,204 @@
+"""Measurements of a profiler from NPZ or CSV, in SI and under one set of names; docs/profiler.md has the layouts."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.models.errors import InputError
+
+UNITS = {"m": 1.0, "mm": 1e-3}
+FAR_M = 20.0  # no robot's flange is this far from its base
+
+# other names of the same things: of files with one axis more, for trials or worlds
+ALIASES = {
+    "scan_T": "T", "T_base_flange": "T", "Rb": "rotation", "Tb": "translation", "ps": "points", "prof": "profiles",
+    "scan_prof": "profiles", "scan_sign": "sign", "scan_q": "q", "tip_nominal": "tip",
+}  # fmt: skip
+DIMENSIONS = {
+    "T": 3, "rotation": 3, "translation": 2, "points": 2, "profiles": 3, "sign": 1, "translated": 1, "group": 1, "q": 2,
+    "touch_T": 3, "touch_q": 2, "tip": 1, "dh": 2, "scan_kind": 1, "dh_nominal": 2,
+}  # fmt: skip
+LENGTHS = ("translation", "points", "profiles", "tip", "radius")
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilerFile:
+    """What a file holds, in m and rad; `digest` is its SHA-256."""
+
+    arrays: dict[str, Floats]
+    profiles: tuple[Floats, ...] | None
+    digest: str
+
+    def poses(self, of: str = "") -> FlangePoses | None:
+        """Flange poses of the scans, or of="touch_"; None where there are none."""
+        T = self.arrays.get(f"{of}T")
+        if T is not None:
+            if T.shape[1:] != (4, 4):
+                raise InputError(f"{of}T holds poses (n, 4, 4), not {T.shape}.")
+            return FlangePoses.checked(T[:, :3, :3], T[:, :3, 3])
+        R, t = self.arrays.get(f"{of}rotation"), self.arrays.get(f"{of}translation")
+        return None if R is None or t is None else FlangePoses.checked(R, t)
+
+    def needed(self, name: str, why: str) -> Floats:
+        """An array that the command cannot do without.
+
+        Raises:
+            InputError: it is not there.
+        """
+        if name not in self.arrays:
+            have = ", ".join(sorted(self.arrays)) or "nothing known"
+            raise InputError(f"The file has no '{name}', {why}; it has {have}.")
+        return self.arrays[name]
+
+    def arm(self) -> DhArm | None:
+        """The arm's table, where the file has one."""
+        return DhArm.checked(self.arrays["dh"]) if "dh" in self.arrays else None
+
+
+def read_profiler_file(
+    path: Path, *, unit: str | None = None, dataset: str = "", trial: int | None = None
+) -> ProfilerFile:
+    """Read an NPZ or a CSV.
+
+    Args:
+        unit: m or mm, of all lengths, where the file does not say; a CSV says it in its header.
+        dataset: of an NPZ with several sets, the one whose names begin so; trial: which of its trials or worlds.
+
+    Raises:
+        InputError: not there, not readable, a unit missing or not believable, no such set or trial.
+    """
+    if not path.is_file():
+        raise InputError(f"There is no file '{path}': check its name.")
+    if unit is not None and unit not in UNITS:
+        raise InputError(f"The unit is m or mm, not '{unit}'.")
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    if path.suffix.lower() == ".csv":
+        arrays, profiles = _from_csv(path)
+    elif path.suffix.lower() == ".npz":
+        arrays, profiles = _from_npz(path, unit, dataset, trial)
+    else:
+        raise InputError(f"'{path.name}' is neither .npz nor .csv: give one of these.")
+    file = ProfilerFile(arrays, profiles, digest)
+    X = file.poses()
+    if X is None:
+        raise InputError("The file has no flange poses: give 'T', or 'rotation' and 'translation'.")
+    if len(X) and float(np.abs(X.translation).max()) > FAR_M:
+        raise InputError(
+            f"The flange would be {np.abs(X.translation).max():.0f} m from the base: give --unit mm if the lengths are in mm."
+        )
+    return file
+
+
+def _from_npz(
+    path: Path, unit: str | None, dataset: str, trial: int | None
+) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
+    try:
+        with np.load(path, allow_pickle=False) as z:
+            raw = {name: z[name] for name in z.files}
+    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as e:
+        raise InputError(f"'{path.name}' cannot be read as NPZ: write it with numpy.savez.") from e
+    said = str(raw.pop("unit")) if "unit" in raw else unit
+    if said is None:
+        raise InputError("The file does not say its unit of length: add --unit mm or --unit m, or an entry 'unit'.")
+    if said not in UNITS:
+        raise InputError(f"The file's unit is '{said}': it may be m or mm.")
+    if unit is not None and unit != said:
+        raise InputError(f"The file says that its unit is {said}: leave --unit {unit} away.")
+    scale = UNITS[said]
+    sets = sorted({name[: -len("_Rb")] for name in raw if name.endswith("_Rb")})
+    if sets and dataset not in sets:
+        raise InputError(f"The file has several sets: choose one with --set {' | '.join(sets)}.")
+    if dataset and not sets:
+        raise InputError(f"The file has no sets: leave --set {dataset} away.")
+    if dataset:
+        raw = {
+            name.removeprefix(f"{dataset}_"): v
+            for name, v in raw.items()
+            if name.startswith(f"{dataset}_") or name == "radius"
+        }
+    arrays: dict[str, Floats] = {}
+    for name, value in raw.items():
+        if value.dtype.kind not in "fiub":
+            continue
+        key = ALIASES.get(name, name)
+        value = np.asarray(value, float)
+        if key in DIMENSIONS and value.ndim == DIMENSIONS[key] + 1:
+            value = _of_trial(value, trial)
+        arrays[key] = value * scale if key.removeprefix("touch_") in LENGTHS else value
+    for name in ("T", "touch_T"):
+        if name in arrays and arrays[name].ndim == 3 and arrays[name].shape[1:] == (4, 4):
+            arrays[name][:, :3, 3] *= scale
+    if "scan_kind" in arrays:
+        arrays["translated"] = (arrays.pop("scan_kind") == 0).astype(float)
+    if "dh_nominal" in arrays:  # lengths in the file's unit, angles in degrees
+        arrays["dh"] = arrays.pop("dh_nominal") * [scale, np.radians(1.0), scale, np.radians(1.0)]
+    elif "dh" in arrays:
+        arrays["dh"] = arrays["dh"] * [scale, 1.0, scale, 1.0]
+    profiles = None
+    if "n" in arrays and "xz" in raw:
+        n = arrays["n"].astype(int)
+        if n.sum() != len(raw["xz"]):
+            raise InputError(f"The profiles' lengths 'n' add up to {n.sum()}, and 'xz' has {len(raw['xz'])} points.")
+        profiles = tuple(np.split(np.asarray(raw["xz"], float) * scale, np.cumsum(n)[:-1]))
+    elif "profiles" in arrays:
+        profiles = tuple(arrays["profiles"])
+    return arrays, profiles
+
+
+def _of_trial(value: Floats, trial: int | None) -> Floats:
+    if trial is None:
+        if len(value) == 1:
+            return np.asarray(value[0])
+        raise InputError(f"The file has {len(value)} trials: choose one with --trial 0 to {len(value) - 1}.")
+    if not 0 <= trial < len(value):
+        raise InputError(f"There is no trial {trial}: the file has 0 to {len(value) - 1}.")
+    return np.asarray(value[trial])
+
+
+def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
+    """One row for each profile point: the flange's x, y, z and rotation vector, then the point; scans by a column `scan`."""
+    try:
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        table = np.array([[float(v) for v in row] for row in rows[1:] if row], float)
+    except (ValueError, UnicodeDecodeError) as e:
+        raise InputError(
+            f"'{path.name}' has a cell that is no number, or is no text: one header line, then numbers."
+        ) from e
+    header = [name.strip() for name in rows[0]] if rows else []
+    if table.ndim != 2 or table.shape[1] != len(header):
+        raise InputError(f"'{path.name}' needs a header and rows of as many numbers as it has names.")
+    unit = next((u for u in UNITS if f"x_{u}" in header), None)
+    wanted = [] if unit is None else [f"{v}_{unit}" for v in "xyz"] + ["rx_rad", "ry_rad", "rz_rad"]
+    if unit is None or not set(wanted) <= set(header):
+        raise InputError(
+            "The CSV's header needs x_mm, y_mm, z_mm (or _m) and rx_rad, ry_rad, rz_rad, the flange's rotation vector."
+        )
+    pose = table[:, [header.index(name) for name in wanted]]
+    seen = [f"px_{unit}", f"pz_{unit}"]
+    points: NDArray[np.float64] | None = None
+    if set(seen) <= set(header):
+        points = table[:, [header.index(name) for name in seen]] * UNITS[unit]
+    first = np.arange(len(table))
+    profiles = None
+    if "scan" in header:
+        scan = table[:, header.index("scan")]
+        _, first, of = np.unique(scan, return_index=True, return_inverse=True)
+        if points is not None:
+            profiles = tuple(points[of == k] for k in range(len(first)))
+    arrays = {
+        "rotation": Rotation.from_rotvec(pose[first, 3:]).as_matrix(),
+        "translation": pose[first, :3] * UNITS[unit],
+    }
+    if points is not None and len(first) == len(points):
+        arrays["points"] = points[first]
+    return arrays, profiles

@@ -1,0 +1,224 @@
+"""Worlds in which a profiler is calibrated by a sphere: an arm that is not its drawing, a sensor that is not flat, a bent torch.
+
+Everything random follows from the seed. The arm is a UR10e; the sag has the form that the calibration's model also has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, DhArm
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.sphere_model import SphereData
+from weldcal.models.arms.kinematics import load_arm
+
+HOME = np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0])  # the tool points downwards
+RADIUS_M = 0.020
+SAMPLES = 120
+REACH_RAD = np.radians(70.0)  # of the arc that is seen, from its top
+
+
+@dataclass(frozen=True)
+class WorldErrors:
+    """One sigma of each cause (m, rad): lengths and angles of the arm, sag per metre of lever, sensor, tip, repeatability."""
+
+    length_m: float = 0.125e-3
+    angle_rad: float = np.radians(0.0125)
+    sag_rad_m: float = np.radians(0.02)
+    affine: float = 0.008
+    tip_m: float = 3.5e-3
+    repeatability_m: float = 0.04e-3
+    noise_m: float = 0.05e-3
+
+
+CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, sag_rad_m=0.0, affine=0.0, tip_m=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SphereTests:
+    """Points that the sensor saw and the tip then touched: joints (n, 6) at both, the profile points (n, 2) m, which of three."""
+
+    q_view: Floats
+    seen: Floats
+    q_touch: Floats
+    point: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class SphereWorld:
+    """One robot with one profiler and one torch: `nominal` is what is believed, the rest is how it is."""
+
+    nominal: DhArm
+    real: DhArm
+    sag: Floats
+    rotation: Floats
+    translation: Floats
+    tip: Floats
+    tip_believed: Floats
+    sensor: Floats
+    offset: Floats
+    errors: WorldErrors
+    center: Floats
+
+    @staticmethod
+    def made(seed: int, errors: WorldErrors | None = None) -> SphereWorld:
+        """The world of a seed."""
+        e = errors or WorldErrors()
+        rng = np.random.default_rng([seed, 71])
+        arm = DhArm.of(load_arm("ur10e"))
+        wrong = rng.standard_normal((6, 4)) * [e.length_m, e.angle_rad, e.length_m, e.angle_rad]
+        R = Rotation.from_euler("ZYX", rng.uniform(-1, 1, 3) * [60.0, 15.0, 15.0], degrees=True).as_matrix()
+        t = np.array([0.035, -0.068, -0.02]) + rng.uniform(-0.02, 0.02, 3)
+        tip = np.array([-0.012, 0.004, 0.19])
+        sensor = np.eye(2) + e.affine * rng.uniform(-1.5, 1.5, (2, 2))
+        return SphereWorld(
+            nominal=arm,
+            real=DhArm(arm.rows + wrong),
+            sag=e.sag_rad_m * np.abs(rng.standard_normal(2)),
+            rotation=R,
+            translation=t,
+            tip=tip,
+            tip_believed=tip + e.tip_m * rng.standard_normal(3),
+            sensor=sensor,
+            offset=e.affine * np.array([0.06, -0.1]),
+            errors=e,
+            center=np.array([-0.75, 0.12, 0.18]),
+        )
+
+    def poses(self, q: Floats) -> FlangePoses:
+        """Where the flange really is."""
+        return self.real.poses(q, np.zeros(len(OFFSET_JOINTS)), self.sag, self.real.loads(q))
+
+    def believed(self, q: Floats) -> FlangePoses:
+        """Where the controller says that it is."""
+        return self.nominal.poses(q, np.zeros(len(OFFSET_JOINTS)), np.zeros(2), self.nominal.loads(q))
+
+    def repeated(self, q: Floats, rng: np.random.Generator) -> FlangePoses:
+        """Where the flange is this time."""
+        X = self.poses(q)
+        return FlangePoses(X.rotation, X.translation + self.errors.repeatability_m * rng.standard_normal((len(q), 3)))
+
+    def measured(self, p: Floats, rng: np.random.Generator) -> Floats:
+        """Profile points (..., 2) as the sensor reports them."""
+        about = np.array([0.0, 0.2])
+        bent = (p - about) @ self.sensor.T + about + self.offset
+        return np.asarray(bent + self.errors.noise_m * rng.standard_normal(p.shape))
+
+    def joints(self, R_BF: Floats, p_BF: Floats) -> Floats:
+        """Joints (n, 6) that the controller finds for flange poses, by Newton's method from HOME."""
+        q = np.tile(HOME, (len(p_BF), 1))
+        for _ in range(60):
+            X = self.nominal.frames(q)
+            dp = p_BF - X[:, 6, :3, 3]
+            turn = Rotation.from_matrix(R_BF @ np.swapaxes(X[:, 6, :3, :3], 1, 2)).as_rotvec()
+            axes = np.swapaxes(X[:, :6, :3, 2], 1, 2)
+            arms = np.cross(X[:, :6, :3, 2], X[:, 6:7, :3, 3] - X[:, :6, :3, 3])
+            J = np.concatenate([np.swapaxes(arms, 1, 2), axes], axis=1)
+            step = np.linalg.solve(J, np.concatenate([dp, turn], axis=1)[:, :, None])[:, :, 0]
+            largest = np.abs(step).max(axis=1, keepdims=True)
+            q = q + step * np.minimum(1.0, 0.3 / np.maximum(largest, 1e-12))
+            if largest.max() < 1e-12:
+                break
+        return np.asarray(q)
+
+    def viewing(self, R_BS: Floats, p_S: Floats, target: Floats) -> tuple[Floats, Floats]:
+        """Flange poses from which targets (n, 3) lie at p_S (n, 3) of the scanner, which has the orientations R_BS."""
+        R = R_BS @ self.rotation.T
+        return R, target - np.einsum("nij,nj->ni", R, p_S @ self.rotation.T + self.translation)
+
+    def in_scanner(self, X: FlangePoses, points: Floats) -> Floats:
+        """Points (n, 3) of B in the scanner's frame, for real poses of the flange."""
+        p_F = np.einsum("nji,nj->ni", X.rotation, points - X.translation)
+        return np.asarray((p_F - self.translation) @ self.rotation)
+
+    def touching(self, targets: Floats, R_BF: Floats) -> Floats:
+        """Joints (n, 6) at which the real tip is on each target: the robot is jogged until it is."""
+        p = targets - np.einsum("nij,j->ni", R_BF, self.tip)
+        q = self.joints(R_BF, p)
+        for _ in range(4):
+            X = self.poses(q)
+            p = p + targets - (X.rotation @ self.tip + X.translation)
+            q = self.joints(R_BF, p)
+        return q
+
+
+def looking_down(rng: np.random.Generator, n: int, tilt_deg: float, yaw_deg: float) -> Floats:
+    """Orientations (n, 3, 3) of a scanner that looks down, tilted and turned at random."""
+    down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    turn = rng.uniform(-1.0, 1.0, (n, 3)) * [yaw_deg, tilt_deg, tilt_deg]
+    return np.asarray(down @ Rotation.from_euler("ZYX", turn, degrees=True).as_matrix())
+
+
+def arcs(world: SphereWorld, q: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Profiles (n, 120, 2) m of the sphere at these joints, and on which side (n,) of the scan plane its centre is."""
+    c = world.in_scanner(world.repeated(q, rng), np.tile(world.center, (len(q), 1)))
+    r = np.sqrt(RADIUS_M**2 - c[:, 1] ** 2)
+    a = np.linspace(-REACH_RAD, REACH_RAD, SAMPLES)
+    p = np.stack([c[:, :1] + r[:, None] * np.sin(a), c[:, 2:] - r[:, None] * np.cos(a)], axis=2)
+    return world.measured(p, rng), np.sign(c[:, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class SphereTrial:
+    """All that one calibration by a sphere and touches is given, and what it is tested with."""
+
+    data: SphereData
+    sign: Floats
+    translated: NDArray[np.bool_]
+    tests: SphereTests | None
+
+
+def sphere_trial(
+    world: SphereWorld, seed: int, *, translations: int = 10, free: int = 10, touches: int = 60, views: int = 10
+) -> SphereTrial:
+    """Ten translations, ten free poses (tilt 12, turn 10 deg), sixty touches and three points seen and touched in ten views."""
+    rng = np.random.default_rng([seed, 72])
+    n = translations + free
+    R_BS = np.concatenate(
+        [np.repeat(looking_down(rng, 1, 8.0, 8.0), translations, 0), looking_down(rng, free, 12.0, 10.0)]
+    )
+    p_S = np.column_stack(
+        [
+            rng.uniform(-0.014, 0.014, n),
+            np.concatenate([rng.uniform(0.005, 0.016, translations), rng.uniform(0.006, 0.014, free) * rng.choice([-1, 1], free)]),
+            rng.uniform(0.196, 0.228, n),
+        ]
+    )  # fmt: skip
+    q = world.joints(*world.viewing(R_BS, p_S, np.tile(world.center, (n, 1))))
+    profiles, sign = arcs(world, q, rng)
+    out = rng.standard_normal((touches, 3))
+    out[:, 2] = np.abs(out[:, 2])
+    felt = world.center + RADIUS_M * out / np.linalg.norm(out, axis=1, keepdims=True)
+    felt += world.errors.repeatability_m * rng.standard_normal(felt.shape)
+    touch_q = world.touching(felt, looking_down(rng, touches, 15.0, 15.0))
+    data = SphereData(
+        world.believed(q), list(profiles), RADIUS_M, world.believed(touch_q), world.tip_believed, world.nominal, q, touch_q
+    )  # fmt: skip
+    tests = None
+    if views:
+        points = world.center + np.repeat(
+            [[0.04, -0.06, 0.01], [-0.05, 0.02, -0.015], [0.01, 0.07, 0.025]], views, axis=0
+        )
+        m = len(points)
+        at = np.column_stack([rng.uniform(-0.015, 0.015, m), np.zeros(m), rng.uniform(0.19, 0.225, m)])
+        tests = seen_and_touched(world, points, at, looking_down(rng, m, 12.0, 10.0), rng)
+    return SphereTrial(data, sign, np.arange(n) < translations, tests)
+
+
+def seen_and_touched(
+    world: SphereWorld, points: Floats, p_S: Floats, R_BS: Floats, rng: np.random.Generator
+) -> SphereTests:
+    """Points (n, 3) brought into the real scan plane at about p_S, measured, and touched with the real tip."""
+    R, p = world.viewing(R_BS, p_S, points)
+    for _ in range(4):
+        X = world.poses(world.joints(R, p))
+        across = X.rotation @ world.rotation[:, 1]
+        p = p + world.in_scanner(X, points)[:, 1:2] * across
+    q = world.joints(R, p)
+    seen = world.measured(world.in_scanner(world.repeated(q, rng), points)[:, [0, 2]], rng)
+    touch = world.touching(points, looking_down(rng, len(points), 0.0, 0.0))
+    return SphereTests(q, seen, touch, np.repeat(np.arange(3), len(points) // 3))
