@@ -263,6 +263,7 @@ def _face(
     count = int(np.count_nonzero(ring & w.face))
     on_ring = int(np.count_nonzero(ring & w.known))
     core = rho2 < (0.7 * standard.bore_radius_m) ** 2
+    said = core & (w.known | np.isfinite(w.z))
     rim = w.face & (rho2 < (outer.radius + 2.0 * pitch + 0.0005) ** 2)
     rim &= rho2 > (outer.radius - 2.0 * pitch - 0.0005) ** 2
     at = np.flatnonzero(rim)
@@ -275,8 +276,9 @@ def _face(
         pitch=pitch,
         coverage=float(np.count_nonzero(np.bincount(sector, minlength=72))) / 72.0,
         count=count,
-        # a bore that is hidden is no bore seen; a ring of which less than half is seen is no ring
-        core_share=1.0 - float(np.count_nonzero(core & w.known & ~w.face)) / max(int(np.count_nonzero(core)), 1),
+        # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's floor);
+        # a ring of which less than half is seen is no ring
+        core_share=1.0 - float(np.count_nonzero(core & w.known & ~w.face)) / max(int(np.count_nonzero(said)), 1),
         ring_share=count / max(on_ring, int(_RING_SEEN * np.count_nonzero(ring)), 1),
     )
     face = judge(measured, standard, config, refusal)
