@@ -176,6 +176,10 @@ def calibrate_sphere(
     found |= {"model": chosen} | _figures(e)
     found["wrong_scans"] = list(e.wrong_poses)
     if plan:
+        if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
+            raise InputError(
+                "Planning needs z growing away from the sensor: turn the sign of z, and of x to keep the frame right-handed, in the file."
+            )
         seen = np.vstack(data.profiles)
         near, far = (float(v) for v in np.percentile(seen[:, 1], [1.0, 99.0]))
         field = Field(float(np.percentile(np.abs(seen[:, 0]), 99.0)), near, max(far, near + 5e-3))
