@@ -14,7 +14,7 @@ from weldcal.calibration.profiler.edge_joint import edge_joint
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.profiler_edge import TARGETS, EdgeRow, all_sets, ball_points
+from weldcal.tools.studies.profiler_edge import TARGETS, TITLES, EdgeRow, all_sets, ball_points
 from weldcal.tools.studies.profiler_sets import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 from weldcal.tools.studies.profiler_sphere import (
     METHODS,
@@ -66,8 +66,8 @@ class ProfilerStudy:
         lines: list[tuple[str, str, float, float]] = []
         for r in self.edge:
             if r.met is not None:
-                lines.append((f"edge {r.name}, rotation", "deg", r.rotation_deg, TARGETS[r.name][0]))
-                lines.append((f"edge {r.name}, translation", "mm", r.translation_mm, TARGETS[r.name][1]))
+                lines.append((f"edge, {TITLES[r.name]}, rotation", "deg", r.rotation_deg, TARGETS[r.name][0]))
+                lines.append((f"edge, {TITLES[r.name]}, translation", "mm", r.translation_mm, TARGETS[r.name][1]))
         for method, limit in TARGET_POINTS.items():
             lines.append(
                 (f"sphere, {method}", "mm", float(np.mean([r.points_mm.mean() for r in self.of(method)])), limit)

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.profiler.edge_joint import edge_crb, edge_joint
 from weldcal.calibration.profiler.edge_linear import edge_linear
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.tools.studies.profiler_sets import SETS, TRANSLATIONS, EdgeTrial
+from weldcal.tools.studies.profiler_sets import TRANSLATIONS, EdgeTrial
 
 COUNTS = (10, 15, 20, 25)
 METHODS = ("paper", "joint")
@@ -23,6 +23,10 @@ TARGETS = {
     "xy_nominal": (0.116, 0.14),
     "tilt_nominal": (0.107, 0.132),
 }
+TITLES = {
+    "xy_paper": "level arcs, noise as in the paper", "tilt_paper": "tilted arcs, noise as in the paper",
+    "xy_nominal": "level arcs, nominal noise", "tilt_nominal": "tilted arcs, nominal noise",
+}  # fmt: skip
 # Tables 1, 2 and 3 as printed: bar, scale, blade for 10, 15, 20, 25 rotations
 PRINTED_ALPHA = {10: (2.19, 3.10, 1.85), 15: (1.16, 0.74, 0.81), 20: (-1.03, 0.86, 0.84), 25: (-1.12, 0.73, 0.94)}
 PRINTED_ALPHA_STD = {10: (2.55, 4.46, 2.38), 15: (2.56, 2.32, 2.08), 20: (2.67, 1.95, 1.74), 25: (2.39, 1.86, 1.66)}
@@ -152,6 +156,3 @@ def all_sets(
 
         rows += edge_rows(name, trials_of(name), part)
     return rows
-
-
-__all__ = ["COUNTS", "SETS", "TARGETS", "EdgeRow", "all_sets", "ball_points", "edge_rows"]

@@ -82,7 +82,7 @@ def true_error(rows: list[EdgeRow], names: tuple[str, ...], titles: dict[str, st
 
 def ball(points: np.ndarray) -> bytes:
     """A ball's profiles (n, m, 3) m brought together, a colour for each orientation of the flange (Fig. 8)."""
-    picture = Figure(figsize=(4.4, 4.0), layout="constrained")
+    picture = Figure(figsize=(7.2, 4.0), layout="constrained")
     axes = picture.add_subplot(projection="3d")
     middle = points.reshape(-1, 3).mean(axis=0)
     for k, p in enumerate(points):
@@ -117,7 +117,7 @@ def boss(result: WorldResult) -> bytes:
     assert result.boss is not None
     b, p = result.boss, result.cloud
     middle = b.corners_top.mean(axis=0)
-    picture = Figure(figsize=(4.8, 4.2), layout="constrained")
+    picture = Figure(figsize=(7.2, 4.4), layout="constrained")
     axes = picture.add_subplot(projection="3d")
     for label in range(6):
         q = 1e3 * (p[b.labels == label] - middle)

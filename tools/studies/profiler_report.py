@@ -15,10 +15,6 @@ from weldcal.tools.studies import profiler_sphere as sphere
 if TYPE_CHECKING:
     from weldcal.tools.studies.profiler_command import ProfilerStudy
 
-TITLES = {
-    "xy_paper": "level arcs, noise as in the paper", "tilt_paper": "tilted arcs, noise as in the paper",
-    "xy_nominal": "level arcs, nominal noise", "tilt_nominal": "tilted arcs, nominal noise",
-}  # fmt: skip
 Lines = list[tuple[str, ...]]
 
 
@@ -35,18 +31,20 @@ def _range(values: tuple[float, ...]) -> str:
 
 
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
-    """Tables 1 to 3 of the edge paper: printed over its three objects, then paper and joint method on every set."""
-    alpha: Lines = []
-    d: Lines = []
-    radius: Lines = []
-    for n in edge.COUNTS:
-        rows = {(r.name, r.method): r for r in study.edge if r.rotations == n}
-        both = [(name, m) for name in study.names for m in edge.METHODS]
-        alpha.append((str(n), f"{_range(edge.PRINTED_ALPHA[n])} ± {_range(edge.PRINTED_ALPHA_STD[n])}",
-                      *(f"{fixed(rows[k].alpha_mean_deg, 2)} ± {fixed(rows[k].alpha_std_deg, 2)}" for k in both)))  # fmt: skip
-        d.append((str(n), f"{_range(edge.PRINTED_D[n])} ± {_range(edge.PRINTED_D_STD[n])}",
-                  *(f"{fixed(rows[k].d_mean_mm, 3)} ± {fixed(rows[k].d_std_mm, 3)}" for k in both)))  # fmt: skip
-        radius.append((str(n), _range(edge.PRINTED_RADIUS[n]), *(fixed(rows[k].radius_mm, 3) for k in both)))
+    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations: as printed over its three objects, then every set and method."""
+    n = edge.COUNTS
+    alpha: Lines = [
+        ("printed", "", *(f"{_range(edge.PRINTED_ALPHA[k])} ± {_range(edge.PRINTED_ALPHA_STD[k])}" for k in n))
+    ]
+    d: Lines = [("printed", "", *(f"{_range(edge.PRINTED_D[k])} ± {_range(edge.PRINTED_D_STD[k])}" for k in n))]
+    radius: Lines = [("printed", "", *(_range(edge.PRINTED_RADIUS[k]) for k in n))]
+    for name in study.names:
+        for method in edge.METHODS:
+            r = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
+            head = (edge.TITLES[name] if method == edge.METHODS[0] else "", method)
+            alpha.append((*head, *(f"{fixed(r[k].alpha_mean_deg, 2)} ± {fixed(r[k].alpha_std_deg, 2)}" for k in n)))
+            d.append((*head, *(f"{fixed(r[k].d_mean_mm, 3)} ± {fixed(r[k].d_std_mm, 3)}" for k in n)))
+            radius.append((*head, *(fixed(r[k].radius_mm, 3) for k in n)))
     return alpha, d, radius
 
 
@@ -59,7 +57,7 @@ def error_lines(study: ProfilerStudy) -> Lines:
                 next(r for r in study.edge if (r.name, r.rotations, r.method) == (name, n, m)) for m in edge.METHODS
             )
             lines.append(
-                (TITLES[name] if n == edge.COUNTS[0] else "", str(n), f"{fixed(p.rotation_deg, 3)} / {fixed(p.translation_mm, 3)}",
+                (edge.TITLES[name] if n == edge.COUNTS[0] else "", str(n), f"{fixed(p.rotation_deg, 3)} / {fixed(p.translation_mm, 3)}",
                  f"{fixed(j.rotation_deg, 3)} / {fixed(j.translation_mm, 3)}", f"{fixed(j.crb_deg, 3)} / {fixed(j.crb_mm, 3)}")
             )  # fmt: skip
     return lines
@@ -105,7 +103,6 @@ def profiler_report(study: ProfilerStudy) -> str:
         source="the fixed files" if fixed_files else f"worlds made from seed {study.options.seed}",
         lines=lines,
         missed=sum(line[3] != "met" for line in lines),
-        columns=[f"{m}: {TITLES[n]}" for n in study.names for m in edge.METHODS],
         alpha=alpha, d=d, radius=radius, errors=error_lines(study), points=points, seam=seam, boss=boss,
         fig_alpha=plots.against_rotations(rows, study.names, "alpha", "deg", _short()),
         fig_d=plots.against_rotations(rows, study.names, "d", "mm", _short()),
@@ -119,4 +116,4 @@ def profiler_report(study: ProfilerStudy) -> str:
 
 
 def _short() -> dict[str, str]:
-    return {name: title.replace("noise as in the paper", "paper noise") for name, title in TITLES.items()}
+    return {name: title.replace("noise as in the paper", "paper noise") for name, title in edge.TITLES.items()}
