@@ -11,7 +11,7 @@ from weldcal.tools.studies.profiler_edge import COUNTS, EdgeRow
 from weldcal.tools.studies.profiler_sphere import METHODS, WorldResult
 
 PAPER = PLANNED
-_COLOURS = {METHODS[0]: "#999999", METHODS[1]: PAPER, METHODS[2]: "#6aa5c9", METHODS[3]: OURS}
+_COLOURS = {METHODS[0]: "black", METHODS[1]: PAPER, METHODS[2]: "#6aa5c9", METHODS[3]: OURS}
 
 
 def _tidy(axes: Axes, x: str, y: str) -> None:
@@ -118,8 +118,8 @@ def boss(result: WorldResult) -> bytes:
     b, p = result.boss, result.cloud
     middle = b.corners_top.mean(axis=0)
     picture = Figure(figsize=(7.2, 4.4), layout="constrained")
-    axes = picture.add_subplot(projection="3d")
-    for label in range(6):
+    axes = picture.add_subplot(projection="3d", computed_zorder=False)
+    for label in (0, 2, 3, 4, 5, 1):
         q = 1e3 * (p[b.labels == label] - middle)
         near = np.abs(q[:, :2]).max(axis=1) < 60.0
         axes.scatter(*q[near][:: 8 if label == 0 else 4].T, s=0.8, color=f"C{label}", depthshade=False, rasterized=True)

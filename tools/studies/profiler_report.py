@@ -26,18 +26,19 @@ def target_lines(study: ProfilerStudy) -> Lines:
     ]
 
 
-def _range(values: tuple[float, ...]) -> str:
-    return f"{fixed(min(values), 2)} to {fixed(max(values), 2)}"
-
-
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
-    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations: as printed over its three objects, then every set and method."""
+    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations: as printed for its three objects, then every set and method."""
     n = edge.COUNTS
-    alpha: Lines = [
-        ("printed", "", *(f"{_range(edge.PRINTED_ALPHA[k])} ± {_range(edge.PRINTED_ALPHA_STD[k])}" for k in n))
-    ]
-    d: Lines = [("printed", "", *(f"{_range(edge.PRINTED_D[k])} ± {_range(edge.PRINTED_D_STD[k])}" for k in n))]
-    radius: Lines = [("printed", "", *(_range(edge.PRINTED_RADIUS[k]) for k in n))]
+    alpha: Lines = []
+    d: Lines = []
+    radius: Lines = []
+    for j, thing in enumerate(("bar", "scale", "blade")):
+        head = ("printed" if j == 0 else "", thing)
+        alpha.append(
+            (*head, *(f"{fixed(edge.PRINTED_ALPHA[k][j], 2)} ± {fixed(edge.PRINTED_ALPHA_STD[k][j], 2)}" for k in n))
+        )
+        d.append((*head, *(f"{fixed(edge.PRINTED_D[k][j], 2)} ± {fixed(edge.PRINTED_D_STD[k][j], 2)}" for k in n)))
+        radius.append((*head, *(fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)))
     for name in study.names:
         for method in edge.METHODS:
             r = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
