@@ -35,6 +35,9 @@ ArmOption = Annotated[str, typer.Option("--arm", metavar="NAME", help="Arm whose
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
 ]
+SeedOption = Annotated[
+    int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
 DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")]
 
@@ -60,6 +63,7 @@ def edge(
     sigma_z: ZSigma = 0.06,
     plan: PlanOption = 0,
     out: OutOption = None,
+    seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -70,8 +74,8 @@ def edge(
 
         sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_x, 1e-3 * sigma_z)
         data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
-        record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan)
-        folder = _folder(out, file)
+        record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=seed)
+        folder = _folder(out, file, seed)
         write_calibration(record, folder)
     _report("profiler edge", found, folder, json)
 
@@ -90,6 +94,7 @@ def sphere(
     sigma_z: ZSigma = 0.05,
     plan: PlanOption = 0,
     out: OutOption = None,
+    seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -98,9 +103,9 @@ def sphere(
         from weldcal.tools.profiler import Sigmas, calibrate_sphere, write_calibration
 
         sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
-        data, measured = _sphere(file, unit, trial, radius, arm, touches, tip)
-        record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan)
-        folder = _folder(out, file)
+        data, measured = _sphere(file, unit, trial, radius, arm, touches, tip, seed)
+        record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=seed)
+        folder = _folder(out, file, seed)
         write_calibration(record, folder)
     _report("profiler sphere", found, folder, json)
 
@@ -117,6 +122,7 @@ def compensate(
         bool, typer.Option("--solve-tip", help="The tip from the same touches (not in the paper).")
     ] = False,
     out: OutOption = None,
+    seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -124,9 +130,9 @@ def compensate(
     with console.boundary(json_wanted=json, debug=debug):
         from weldcal.tools.profiler import calibrate_compensate, write_calibration
 
-        data, measured = _sphere(file, unit, trial, radius, "", touches, tip)
+        data, measured = _sphere(file, unit, trial, radius, "", touches, tip, seed)
         record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
-        folder = _folder(out, file)
+        folder = _folder(out, file, seed)
         write_calibration(record, folder)
     if found["wrong_sides"]:
         console.emit_warning(
@@ -144,6 +150,7 @@ def seam(
     unit: UnitOption = None,
     trial: TrialOption = None,
     out: OutOption = None,
+    seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
@@ -152,13 +159,20 @@ def seam(
         from weldcal.tools.profiler import map_seam
         from weldcal.tools.profiler_files import read_profiler_file
 
-        folder = _folder(out, file)
+        folder = _folder(out, file, seed)
         found = map_seam(read_profiler_file(file, unit=unit, trial=trial), calibration, folder)
     _report("profiler seam", found, folder, json)
 
 
 def _sphere(
-    file: Path, unit: str | None, trial: int | None, radius: float | None, arm: str, touches: Path | None, tip: str
+    file: Path,
+    unit: str | None,
+    trial: int | None,
+    radius: float | None,
+    arm: str,
+    touches: Path | None,
+    tip: str,
+    seed: int,
 ) -> tuple[Any, Any]:
     import numpy as np
 
@@ -175,13 +189,13 @@ def _sphere(
     data = read_profiler_file(file, unit=unit, trial=trial)
     felt = None if touches is None else read_profiler_file(touches, unit=unit)
     radius_m = None if radius is None else 1e-3 * radius
-    return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt)
+    return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, seed=seed)
 
 
-def _folder(out: Path | None, file: Path) -> Path:
+def _folder(out: Path | None, file: Path, seed: int) -> Path:
     from weldcal.tools.cli import fresh_folder
 
-    return out or fresh_folder("profiler", file.stem, 0)
+    return out or fresh_folder("profiler", file.stem, seed)
 
 
 def _report(command: str, found: Mapping[str, object], folder: Path, json: bool) -> None:

@@ -62,7 +62,14 @@ class Sigmas:
 
 
 def calibrate_edge(
-    file: ProfilerFile, sigmas: Sigmas, *, method: str = "joint", feature: str = "", side: str = "left", plan: int = 0
+    file: ProfilerFile,
+    sigmas: Sigmas,
+    *,
+    method: str = "joint",
+    feature: str = "",
+    side: str = "left",
+    plan: int = 0,
+    seed: int = 0,
 ) -> tuple[ProfilerRecord, dict[str, Any]]:
     """X_FS from one straight edge: points, or raw profiles with the kind of edge that they show."""
     if method not in ("joint", "paper"):
@@ -94,7 +101,7 @@ def calibrate_edge(
         field = Field(
             max(0.005, float(np.abs(points[e.inliers, 0]).max())), float(z.min()) - 1e-9, float(z.max()) + 2e-3
         )
-        candidates = sample_edge_poses(state, CANDIDATES, 0, field)
+        candidates = sample_edge_poses(state, CANDIDATES, seed, field)
         chosen = plan_edge_poses(
             state, poses[e.inliers], candidates, plan, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz, field=field
         )
@@ -128,6 +135,7 @@ def sphere_data(
     arm: str = "",
     tip_m: Floats | None = None,
     touches: ProfilerFile | None = None,
+    seed: int = 0,
 ) -> SphereData:
     """A file's measurements of a sphere: its arcs found among other points, touches and joints where there are any."""
     if file.profiles is None:
@@ -143,24 +151,24 @@ def sphere_data(
     poses = cast(FlangePoses, file.poses())
     if len(file.profiles) != len(poses):
         raise InputError(f"{len(poses)} poses need {len(poses)} profiles, not {len(file.profiles)}.")
-    profiles = [_arc(p, radius) for p in file.profiles]
+    profiles = [_arc(p, radius, seed) for p in file.profiles]
     return SphereData(
         poses, profiles, radius, felt, tip if felt is not None else None, table, file.arrays.get("q"), file.arrays.get("touch_q")
     )  # fmt: skip
 
 
-def _arc(profile: Floats, radius_m: float) -> Floats:
+def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
     """The sphere's points of a profile: all of them where they are one arc, else those that are found to be."""
     p = profile[np.isfinite(profile).all(axis=1)]
     if len(p) >= 5:
         circle, rms = fit_circle(p)
         if rms < ALL_ARC_M and circle[2] < 1.05 * radius_m and len(np.unique(p[:, 1] < circle[1])) == 1:
             return p
-    return np.asarray(profile[find_arc(profile, radius_m)[0]])
+    return np.asarray(profile[find_arc(profile, radius_m, seed=seed)[0]])
 
 
 def calibrate_sphere(
-    data: SphereData, digest: str, sigmas: Sigmas, *, model: str = "auto", plan: int = 0
+    data: SphereData, digest: str, sigmas: Sigmas, *, model: str = "auto", plan: int = 0, seed: int = 0
 ) -> tuple[ProfilerRecord, dict[str, Any]]:
     """X_FS from a sphere in any poses, by the model that foretells scans left out best (or the one named)."""
     if model not in MODELS:
@@ -176,10 +184,14 @@ def calibrate_sphere(
     found |= {"model": chosen} | _figures(e)
     found["wrong_scans"] = list(e.wrong_poses)
     if plan:
+        if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
+            raise InputError(
+                "Planning needs z growing away from the sensor: turn the sign of z, and of x to keep the frame right-handed, in the file."
+            )
         seen = np.vstack(data.profiles)
         near, far = (float(v) for v in np.percentile(seen[:, 1], [1.0, 99.0]))
         field = Field(float(np.percentile(np.abs(seen[:, 0]), 99.0)), near, max(far, near + 5e-3))
-        candidates = sample_sphere_poses(e.rotation, e.translation, e.center, data.radius_m, CANDIDATES, 0, field)
+        candidates = sample_sphere_poses(e.rotation, e.translation, e.center, data.radius_m, CANDIDATES, seed, field)
         best = plan_sphere_poses(
             e.rotation, e.translation, e.center, data.radius_m, data.poses, candidates, plan, sigmas=s, field=field
         )

@@ -61,3 +61,41 @@ def weld(
     if not study.met:
         console.emit_warning("Some targets were missed; the table says which.")
         raise typer.Exit(1)
+
+
+@reproduce.command("profiler")
+def profiler(
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="FOLDER", help="The fixed files; without them, worlds made from the seed."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Two sets of edges and two or three worlds.")] = False,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
+    ] = None,
+    seed: Annotated[
+        int, typer.Option("--seed", metavar="N", min=0, help="The first seed; everything random follows from it.")
+    ] = 0,
+    json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
+) -> None:
+    """A laser profiler on the flange: both papers' tables with ours beside them, pictures, one report."""
+    from weldcal.tools.cli import fresh_folder
+
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce profiler") as progress:
+        from weldcal.tools.studies.profiler_command import ProfilerStudyOptions, run_profiler_study
+
+        folder = out or fresh_folder("reproduce", "profiler", seed)
+        study = run_profiler_study(ProfilerStudyOptions(folder, data, seed, quick), progress)
+    if json:
+        console.emit_json(study.summary())
+    else:
+        rows = {
+            what: f"{v:.3f} {unit}, target {limit:g}: {verdict}" for what, unit, v, limit, verdict in study.targets()
+        }
+        console.emit_summary("reproduce profiler: done", {**rows, "written to": str(folder)})
+    if not study.met:
+        console.emit_warning(
+            "Some targets were missed; the table says which. They were set on the fixed files (--data)."
+        )
+        raise typer.Exit(1)

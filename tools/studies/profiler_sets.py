@@ -1,0 +1,138 @@
+"""What the profiler's study calibrates from: grids of edge poses and a sphere per trial, from the fixed files or from seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.profiler.edge_model import EdgeState, predicted
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.models.errors import InputError
+
+MM = 1e-3
+ROTATIONS, TRANSLATIONS = 25, 10
+BALL_M = 0.020
+
+
+@dataclass(frozen=True)
+class EdgeNoise:
+    """One sigma of the robot per axis and of a profile point in x and z, and the step z is rounded to (m)."""
+
+    robot_m: float
+    x_m: float
+    z_m: float
+    step_m: float = 0.1 * MM
+
+    @property
+    def xz_m(self) -> Floats:
+        """(2,), with what rounding adds."""
+        return np.array([self.x_m, np.hypot(self.z_m, self.step_m / np.sqrt(12.0))])
+
+
+NOISE = {"nominal": EdgeNoise(0.03 * MM, 0.046 * MM, 0.05 * MM), "paper": EdgeNoise(0.06 * MM, 0.16 * MM, 0.16 * MM)}
+SETS = ("xy_paper", "tilt_paper", "xy_nominal", "tilt_nominal")
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeTrial:
+    """25 rotations of 10 translations each, the truth, and the profiles of a ball (60, m, 2) that the result is tried on."""
+
+    poses: FlangePoses
+    points: Floats
+    truth: EdgeState
+    noise: EdgeNoise
+    ball_poses: FlangePoses | None = None
+    ball: Floats | None = None
+
+
+def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
+    """Of the fixed files; the ball of five trials goes round.
+
+    Raises:
+        InputError: the files are not there.
+    """
+    files = folder / "edge_features.npz", folder / "edge_sphere.npz"
+    for path in files:
+        if not path.is_file():
+            raise InputError(f"There is no {path.name} in '{folder}': leave --data away to make trials from seeds.")
+    level = name.split("_")[1]
+    with np.load(files[0]) as d, np.load(files[1]) as b:
+        truth = EdgeState(d["truth_Rs"], d["truth_Ts"] * MM, d["truth_p0"] * MM, d["truth_e"])
+        R, t, p = d[f"grid_{name}_Rb"], d[f"grid_{name}_Tb"] * MM, d[f"grid_{name}_ps"] * MM
+        ball_R, ball_t, ball = b[f"{level}_Rb"], b[f"{level}_Tb"] * MM, b[f"{level}_prof"].astype(float) * MM
+    for k in range(len(R)):
+        j = k % len(ball)
+        yield EdgeTrial(FlangePoses(R[k], t[k]), p[k], truth, NOISE[level], FlangePoses(ball_R[j], ball_t[j]), ball[j])
+
+
+def made_edge_trials(name: str, count: int, seed: int) -> Iterator[EdgeTrial]:
+    """Made from seeds: another scanner pose, another edge and other poses in every trial."""
+    arc, level = name.split("_")
+    for k in range(count):
+        yield _made(arc, NOISE[level], np.random.default_rng([seed, k, SETS.index(name)]))
+
+
+def _made(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
+    slope = rng.uniform(-0.2, 0.2)
+    e = np.array([np.cos(a := rng.uniform(0, np.pi)), np.sin(a), slope])
+    truth = EdgeState(
+        Rotation.from_euler(
+            "ZYX", rng.uniform(-1, 1, 3) * [90.0, 20.0, 20.0] + [0.0, 0.0, 180.0], degrees=True
+        ).as_matrix(),
+        np.array([0.06, -0.03, 0.14]) + rng.uniform(-0.02, 0.02, 3),
+        np.array([1.0, 0.2, 0.3]) + rng.uniform(-0.1, 0.1, 3),
+        e / np.linalg.norm(e),
+    )
+    down = np.array([0.0, 0.0, -1.0])
+    x = np.cross(truth.direction, down)
+    x /= np.linalg.norm(x)
+    above = np.column_stack([x, np.cross(down, x), down])
+    R: list[Floats] = []
+    t: list[Floats] = []
+    while len(R) < ROTATIONS:
+        turn = Rotation.from_euler("ZYX", rng.uniform(-1, 1, 3) * [45.0, 25.0, 25.0], degrees=True).as_matrix()
+        R_BF = above @ turn @ truth.rotation.T
+        middle = np.array([rng.uniform(-0.004, 0.004), 0.0, rng.uniform(0.072, 0.080)])
+        at = truth.point + rng.uniform(-0.008, 0.008) * truth.direction
+        angle = rng.uniform(0, 2 * np.pi) + np.radians(np.linspace(-120.0, 120.0, TRANSLATIONS))
+        circle = 0.014 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(TRANSLATIONS)])
+        circle -= circle[TRANSLATIONS // 2]
+        if arc == "tilt":
+            circle = circle @ Rotation.from_euler("xy", rng.uniform(-30.0, 30.0, 2), degrees=True).as_matrix().T
+        p_BF = at - R_BF @ (truth.rotation @ middle + truth.translation) + circle
+        X = FlangePoses(np.repeat(R_BF[None], TRANSLATIONS, 0), p_BF)
+        p, _, _ = predicted(truth, X)
+        seen = (np.abs(p[:, 0]) < 0.020) & (p[:, 1] > 0.058) & (p[:, 1] < 0.095)
+        if seen.all() and abs(truth.direction @ R_BF @ truth.rotation[:, 1]) > 0.45:
+            R.append(X.rotation)
+            t.append(X.translation)
+    poses = FlangePoses(np.concatenate(R), np.concatenate(t))
+    points = _noisy(predicted(truth, poses)[0], noise, rng)
+    told = FlangePoses(poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape))
+    ball_poses, ball = _ball(truth, noise, rng)
+    return EdgeTrial(told, points, truth, noise, ball_poses, ball)
+
+
+def _noisy(p: Floats, noise: EdgeNoise, rng: np.random.Generator) -> Floats:
+    q = p + rng.standard_normal(p.shape) * [noise.x_m, noise.z_m]
+    q[..., 1] = np.round(q[..., 1] / noise.step_m) * noise.step_m
+    return np.asarray(q)
+
+
+def _ball(truth: EdgeState, noise: EdgeNoise, rng: np.random.Generator) -> tuple[FlangePoses, Floats]:
+    """Ten orientations of six cuts of a ball where the edge was."""
+    down = np.diag([1.0, -1.0, -1.0])
+    turn = Rotation.from_euler("ZYX", rng.uniform(-1, 1, (10, 3)) * [60.0, 15.0, 15.0], degrees=True).as_matrix()
+    R = np.repeat(down @ turn @ truth.rotation.T, 6, axis=0)
+    c = np.column_stack(
+        [rng.uniform(-0.003, 0.003, 60), np.tile(np.linspace(-0.011, 0.011, 6), 10), rng.uniform(0.083, 0.089, 60)]
+    )
+    t = truth.point - np.einsum("nij,nj->ni", R, c @ truth.rotation.T + truth.translation)
+    r = np.sqrt(BALL_M**2 - c[:, 1:2] ** 2)
+    a = np.linspace(-0.9, 0.9, 60)
+    p = np.stack([c[:, :1] + r * np.sin(a), c[:, 2:] - r * np.cos(a)], axis=2)
+    return FlangePoses(R, t + noise.robot_m * rng.standard_normal(t.shape)), _noisy(p, noise, rng)
