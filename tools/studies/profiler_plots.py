@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from weldcal.tools.report.plots_demo import OURS, PLANNED, svg
+from weldcal.tools.report.plots_weld import OURS, PLANNED, svg
 from weldcal.tools.studies.profiler_edge import COUNTS, EdgeRow
 from weldcal.tools.studies.profiler_sphere import METHODS, WorldResult
 
