@@ -156,8 +156,9 @@ def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     if not (proven or state.delta_axial > 0.33 * config.axial_d_m):
         return changed(state, refined=drop_pending(state.refined), proven=proven)
     arc = progress_at(state, state.measurement.capture_time)
-    refined = refine(state.refined, state.measurement.point, arc, config.refinement)
-    plan_fit = state.plan_fit
+    plan_fit, corner = state.plan_fit, config.refinement.corner
+    is_corner = plan_fit.curve.least_radius(state.s_tip, corner.reach_m) < corner.planned_radius_m
+    refined = refine(state.refined, state.measurement.point, arc, config.refinement, is_corner)
     if len(refined) > len(state.refined):
         plan_fit = add_point(plan_fit, refined.points[-1], float(refined.arc[-1]), config.plan_fit)
     return changed(state, refined=refined, plan_fit=plan_fit, proven=proven)

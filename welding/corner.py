@@ -23,6 +23,7 @@ class CornerConfig:
         reach_m: farther than this from the points felt the sides do not meet.
         radius_m: of the rounding; half of delta_d halves the largest error over all radii that spring.
         spacing_m: of the points filled in.
+        planned_radius_m: where the plan, which rounds its corners, bends less than this within `reach_m` there is none.
     """
 
     jump_m: float = 1.2e-3
@@ -33,6 +34,7 @@ class CornerConfig:
     reach_m: float = 8.0e-3
     radius_m: float = 1.0e-3
     spacing_m: float = 0.2e-3
+    planned_radius_m: float = 12.5e-3
 
 
 @dataclass(frozen=True)

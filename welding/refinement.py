@@ -90,8 +90,14 @@ def tip_point(X_BT_at_capture: RigidTransform, deflection_T: Array) -> Array:
     return np.asarray(X_BT_at_capture.translation() + X_BT_at_capture.rotation().matrix() @ deflection_T)
 
 
-def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig) -> RefinedSeam:
-    """The seam after one more good frame: its point queues, and the oldest of a full queue is committed."""
+def refine(
+    seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig, is_corner: bool = True
+) -> RefinedSeam:
+    """The seam after one more good frame: its point queues, and the oldest of a full queue is committed.
+
+    A hole in the points is filled in as a corner only where the plan has one (`is_corner`): in a gentle bend a tip that
+    stuck and let go leaves a hole too.
+    """
     pending = (*seam.pending, PendingPoint(point, arc))
     if len(pending) <= config.frames_to_commit:
         return replace(seam, pending=pending)
@@ -106,7 +112,7 @@ def refine(seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig
         extra = max(0.0, step - (arc - float(seam.arc[-1])))
         # What was felt in the middle of a jump belongs to neither side.
         before = len(seam) if seam.jump is None or len(seam) - seam.jump[1] > 4 else seam.jump[0]
-        seam = replace(seam, sprung=seam.sprung + extra, jump=(before, len(seam)))
+        seam = replace(seam, sprung=seam.sprung + extra, jump=(before, len(seam)) if is_corner else None)
         arc += extra
     elif len(seam) >= _STEPS:
         # Where the tip hardly comes on, as in a concave corner that the rest point goes round outside, the parameter goes

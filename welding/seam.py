@@ -208,6 +208,10 @@ class SeamCurve:
             np.array((px, py, pz)), np.array((tx, ty, tz)), np.array((nx, ny, nz)), np.array((ux, uy, uz)), bend
         )
 
+    def least_radius(self, s: float, within: float) -> float:
+        """The least radius of curvature m in five places at most `within` m from an arc length s m; at most 1000 km."""
+        return 1.0 / max(1e-6, *(abs(self.frame(s + k * within).curvature) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)))
+
     def nearest(self, p: Array, s_near: float, window: float = 0.01) -> float:
         """The arc length m of the point nearest to p (3,) m, by Newton's steps from s_near, never `window` m away."""
         step, last = self._scale

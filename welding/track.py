@@ -23,6 +23,7 @@ _BEND_OVER_M = (
     3.0e-3,
     10.0e-3,
 )  # least and most of the path whose bend is carried on; 0.4 of the plan's radius between
+_RISE = 0.05  # slope of the path against the plan's surface
 _WINDOW_M = 5.0e-3  # two sigma of the widest fit
 _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
@@ -71,7 +72,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         inside = clip(arc, first + 1e-3, max(last - 1e-3, first + 1e-3))
         radius = 1.0 / max(abs(plan.curvature), 1e-6)
         if _nearest_point(seam.arc, inside) < config.refinement.bridge_from_m:
-            fit = local_fit(seam, inside, plan.tangent, radius, config.refinement, _least_radius(curve, s))
+            fit = local_fit(seam, inside, plan.tangent, radius, config.refinement, curve.least_radius(s, _WINDOW_M))
         # Before the first point, and where the window is empty, the plan leads and carries the nearest residual.
         if fit is not None:
             here = curve.frame(curve.nearest(fit.point, s + inside - arc))
@@ -92,7 +93,10 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
-        t, on_path = fit.tangent, fit.point
+        # The plan knows its surface better than a few points beside a corner do: the path leaves it by three degrees at most.
+        rise = dot(fit.tangent, plan.up)
+        t = unit(fit.tangent + (clip(rise, -_RISE, _RISE) - rise) * plan.up, fit.tangent)
+        on_path = fit.point
         up = unit(plan.up - dot(plan.up, t) * t, plan.up)
         step = dot(p_BW - on_path, t) / fit.speed
     n = cross(up, t)
@@ -137,11 +141,6 @@ def _carried_on(
         return None
     tangent = unit(fit.tangent + ahead * bend, fit.tangent)
     return LocalFit(fit.point + ahead * fit.tangent + 0.5 * ahead**2 * bend, tangent, bend, 1.0, fit.effective)
-
-
-def _least_radius(curve: SeamCurve, s: float) -> float:
-    """The plan's least radius of curvature m within the widest window around an arc length m."""
-    return 1.0 / max(1e-6, *(abs(curve.frame(s + k * _WINDOW_M).curvature) for k in (-1.0, -0.5, 0.0, 0.5, 1.0)))
 
 
 def _nearest_point(arcs: Array, arc: float) -> float:

@@ -7,8 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from weldcal.tools.studies.seams import arcs
 from weldcal.welding.corner import CornerConfig, fill_corner, is_jump
 from weldcal.welding.refinement import RefinedSeam, RefinementConfig, local_fit, refine
+from weldcal.welding.seam import SeamCurve
 
 MM = 1e-3
 CONFIG = CornerConfig()
@@ -90,3 +92,19 @@ def test_a_seam_felt_on_both_sides_of_a_corner_is_whole_again() -> None:
     apex = CONFIG.radius_m * (math.sqrt(2.0) - 1.0) * np.array([-1.0, 1.0, 0.0]) / math.sqrt(2.0)
     np.testing.assert_allclose(fit.point, apex, atol=0.1 * MM)
     assert math.degrees(math.atan2(fit.tangent[1], fit.tangent[0])) == pytest.approx(45.0, abs=8.0)
+
+
+def test_where_the_plan_has_no_corner_a_hole_is_left_to_it() -> None:
+    before, after = sides(40.0, 1.5 * MM, n=40)
+    seam, config = RefinedSeam.empty(), RefinementConfig(frames_to_commit=0)
+    for k, point in enumerate(np.vstack([before, after])):
+        seam = refine(seam, point, 0.27 * MM * k, config, is_corner=False)
+    assert len(seam) == 80
+    assert len(seam.corners) == 0
+    # The parameter still grows by what the tip sprang, so that bridging it on the plan is right.
+    hole = float(np.linalg.norm(after[0] - before[-1]))
+    assert seam.arc[40] - seam.arc[39] == pytest.approx(hole, abs=1e-9)
+    curve = SeamCurve.from_points(arcs((0.03, 0.0), (0.03, 50.0), (0.03, 0.0)))
+    assert curve.least_radius(0.045, 8.0 * MM) == pytest.approx(0.020, rel=0.05)
+    assert curve.least_radius(0.026, 8.0 * MM) == pytest.approx(0.020, rel=0.05)
+    assert curve.least_radius(0.010, 8.0 * MM) > 1.0
