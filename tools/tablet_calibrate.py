@@ -46,6 +46,12 @@ def calibrate_tablet(inputs: TabletInputs, folder: Path) -> dict[str, object]:
 
     Raises InputError and its kin: one sentence that says what to change; nothing is written then.
     """
+    if not inputs.file.is_file():
+        raise InputError(f"There is no file '{inputs.file}': give the page's CSV, or an npz of planar touches.")
+    if inputs.file.suffix not in (".npz", ".csv"):
+        raise InputError(
+            f"'{inputs.file.name}' is neither .csv nor .npz: give the page's CSV, or an npz of planar touches."
+        )
     start = time.perf_counter()
     result = _planar(inputs) if inputs.file.suffix == ".npz" else _wrist(inputs)
     seconds = time.perf_counter() - start

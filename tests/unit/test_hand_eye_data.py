@@ -10,6 +10,7 @@ from scipy.stats import chi2
 
 from weldcal.calibration.handeye.files import read_pairs
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
+from weldcal.models.errors import InputError
 from weldcal.tools.benchmarks.hand_eye import HandEyeBenchmark, run_hand_eye_benchmark, write_table
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/handeye"
@@ -79,3 +80,8 @@ def test_corners_find_the_principal_point_that_hides_the_truth(report: HandEyeBe
         assert row.truth_nees_corners is not None
         assert row.truth_nees > three_sigma > row.truth_nees_corners
         assert "principal point shifted" in row.corners
+
+
+def test_a_folder_without_sets_is_refused_before_any_work(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="holds no sets"):
+        run_hand_eye_benchmark(tmp_path)

@@ -186,6 +186,8 @@ def test_options_that_do_not_belong_together_are_told(npz: Path, visit: Path, tm
     for arguments, sentence in (
         ((npz, "--poses", visit / "poses.csv"), "holds everything"),
         ((visit / "touches.csv",), "need the robot's poses"),
+        ((visit / "nothing.csv",), "There is no file"),
+        ((visit / "picture.png",), "neither .csv nor .npz"),
         (csv_options(visit), "--image"),
         ((*csv_options(visit), "--seen", visit / "seen.csv", "--two-stages"), "belong to planar touches"),
         ((*csv_options(visit), "--image", visit / "picture.png", "--look", "stars"), "rings or dots"),

@@ -26,6 +26,7 @@ from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out,
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
 from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.result import write_atomically
+from weldcal.models.errors import InputError
 from weldcal.tools.simulation import Progress, no_progress
 
 Array = NDArray[np.float64]
@@ -248,11 +249,13 @@ def run_hand_eye_benchmark(
     data: Path | None, *, quick: bool = False, seed: int = 0, progress: Progress = no_progress
 ) -> HandEyeBenchmark:
     """All of it; ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials and
-    no OpenCV on the sets, for a test."""
+    no OpenCV on the sets, for a test. Raises InputError, before any work, where the folder holds no set."""
     from weldcal.calibration.handeye.files import read_pairs
 
     report = HandEyeBenchmark()
     sets = sorted(data.glob("*/pairs.npz")) if data is not None else []
+    if data is not None and not sets:
+        raise InputError(f"'{data}' holds no sets: give a folder of folders, each with a pairs.npz.")
     for k, path in enumerate(sets):
         pairs = read_pairs(path)
         row = dataset_row(path.parent.name, pairs.F, pairs.G, pairs.X_true, opencv=not quick)
