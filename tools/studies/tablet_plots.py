@@ -17,7 +17,7 @@ SIGN_WORDS = {Sign.PRINTED: "as printed (−)", Sign.NONE: "left out", Sign.CORR
 
 def sign_residuals(touches: TabletTouches) -> bytes:
     """For each sign of Eq. 20: the nine hand positions, and by how much a similarity of the tablet and a pen miss them."""
-    picture = Figure(figsize=(9.6, 2.3), layout="constrained")
+    picture = Figure(figsize=(9.6, 3.0), layout="constrained")
     every = picture.subplots(1, 3, sharex=True, sharey=True)
     for axes, sign in zip(every, Sign, strict=True):
         points = touches.pitch_m * (touches.landmark_px - sign * touches.delta_px)
