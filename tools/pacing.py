@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+
+from weldcal.systems.drivers.picture_worker import PICTURE_THREAD
 
 LATE_S = 0.020  # of the Diagram's time
 
@@ -79,16 +82,20 @@ def draw_in_this_thread() -> None:
 def real_time_priority() -> Iterator[None]:
     """Run this thread before ordinary programs for the duration of the block, where the system lets it (rtprio, or root).
 
-    Below the link's worker and the emulated controller, so that neither waits for the cell. Threads and processes that it
-    starts meanwhile are ordinary ones.
+    Below the link's worker and the emulated controller, so that neither waits for the cell. The threads that draw what this one
+    will wait for run beside it. Threads and processes that it starts meanwhile are ordinary ones.
     """
-    before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    drawing = [t.native_id for t in threading.enumerate() if t.name.startswith(PICTURE_THREAD) and t.native_id]
+    before = {thread: (os.sched_getscheduler(thread), os.sched_getparam(thread)) for thread in (0, *drawing)}
     try:
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+        for thread in before:
+            os.sched_setscheduler(thread, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
     except OSError:
         yield
         return
     try:
         yield
     finally:
-        os.sched_setscheduler(0, before, parameter)
+        for thread, (policy, parameter) in before.items():
+            with suppress(ProcessLookupError):  # a drawing thread may have ended
+                os.sched_setscheduler(thread, policy, parameter)

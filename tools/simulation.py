@@ -15,6 +15,7 @@ from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, job_plan
+from weldcal.systems.drivers.rendered_finger_camera import StreamingColourCamera
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import Scan
 from weldcal.systems.operator_panel import PACE_SLIDER
@@ -182,6 +183,8 @@ def _first_pictures(cell: Cell, root: Context) -> None:
             context = system.GetMyContextFromRoot(root)
             for port in (system.color_image_output_port(), system.depth_image_32F_output_port()):
                 port.Eval(context)
+        elif isinstance(system, StreamingColourCamera):
+            system.first_picture(system.GetMyContextFromRoot(root))
 
 
 def _keep_pace(run: Run, root: Context) -> None:

@@ -24,15 +24,6 @@ from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 from weldcal.systems.messages import Message
 
 
-@dataclass(frozen=True)
-class PictureScene(Message):
-    """A scene graph with one renderer, and the frames of the bodies that move in it."""
-
-    scene_graph: SceneGraph
-    renderer: str
-    frames: dict[BodyIndex, FrameId]
-
-
 class PicturePoses(LeafSystem):
     """Where the bodies stand that a camera may see.
 
@@ -67,6 +58,20 @@ class PicturePoses(LeafSystem):
         output.set_value(found)
 
 
+@dataclass(frozen=True)
+class PictureScene(Message):
+    """A scene graph with one renderer, the frames of the bodies that move in it, and who knows where they stand.
+
+    `apart`: the builder it is in where it is not in the cell's own Diagram; `frame_poses` is that one's input.
+    """
+
+    scene_graph: SceneGraph
+    renderer: str
+    frames: dict[BodyIndex, FrameId]
+    poses: PicturePoses
+    apart: DiagramBuilder | None = None
+
+
 def add_picture_scene(
     builder: DiagramBuilder,
     plant: MultibodyPlant,
@@ -75,6 +80,7 @@ def add_picture_scene(
     mount: str | None = None,
     only: Collection[str] | None = None,
     background: tuple[float, float, float] | None = None,
+    apart: DiagramBuilder | None = None,
 ) -> PictureScene:
     """Add a scene with what the bodies of `plant` look like in the scene graph `drawn`.
 
@@ -84,8 +90,9 @@ def add_picture_scene(
         mount: name of the body that carries the camera; None: it stands still.
         only: names of the geometries that are seen; None: all.
         background: red, green and blue, 0 to 1, of what lies behind; None: the renderer's own.
+        apart: a builder that gets the scene, for a Diagram of its own; only the poses stay in `builder` then.
     """
-    scene = builder.AddSystem(SceneGraph())
+    scene = (builder if apart is None else apart).AddSystem(SceneGraph())
     scene.set_name(f"{renderer}_scene")
     parameters = RenderEngineVtkParams()
     if background is not None:
@@ -118,5 +125,8 @@ def add_picture_scene(
     poses = builder.AddSystem(PicturePoses(plant, frames))
     poses.set_name(f"{renderer}_poses")
     builder.Connect(plant.get_body_poses_output_port(), poses.GetInputPort("body_poses"))
-    builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
-    return PictureScene(scene, renderer, frames)
+    if apart is None:
+        builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
+    else:
+        apart.ExportInput(scene.get_source_pose_port(source), "frame_poses")
+    return PictureScene(scene, renderer, frames, poses, apart)

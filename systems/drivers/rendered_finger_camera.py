@@ -1,19 +1,28 @@
 """The finger camera in simulation: the tag rendered as it moves with the soft tip, with noise and latency."""
 
 import dataclasses as dc
+from concurrent.futures import Future
 from functools import lru_cache
 from typing import Any
 
 import cv2
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.geometry import (
+    ClippingRange,
+    ColorRenderCamera,
+    DepthRange,
+    DepthRenderCamera,
+    FramePoseVector,
+    RenderCameraCore,
+)
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
-from pydrake.systems.sensors import CameraInfo, ImageRgba8U, RgbdSensor
+from pydrake.systems.sensors import CameraInfo, RgbdSensor
 from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
+from weldcal.systems.drivers.picture_worker import Draw, PictureWorker, Pixels
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Image, Message
 
@@ -38,12 +47,20 @@ class RenderedFingerCamera:
 
 
 @dc.dataclass(frozen=True, eq=False)
+class _Exposed(Message):
+    """A frame that was exposed, and its pixels (H, W), which may still be in the making."""
+
+    frame: Image
+    pixels: "Future[Pixels]"
+
+
+@dc.dataclass(frozen=True, eq=False)
 class _Stream(Message):
     """The newest frames, oldest first: some are still on their way through the latency."""
 
     started: float = -np.inf
     count: int = 0
-    frames: tuple[Image, ...] = (Image(),)
+    frames: tuple[_Exposed, ...] = ()
 
 
 @lru_cache(maxsize=4)
@@ -66,28 +83,32 @@ class StreamingColourCamera(LeafSystem):
         name: StreamingColourCamera
         input_ports:
         - streaming
-        - color_image
+        - frame_poses
         output_ports:
         - image
         - capture_time
 
-    A frame shows the world as of the plant's last step, so that is the capture time it carries.
+    A frame shows the world as of the plant's last step, so that is the capture time it carries. `frame_poses` (FramePoseVector):
+    where the bodies of the camera's scene stand; `draw` begins a picture of them, which is waited for when the frame arrives.
     """
 
-    def __init__(self, config: RenderedFingerCamera, seed: int, plant_period_s: float) -> None:
+    def __init__(self, config: RenderedFingerCamera, seed: int, plant_period_s: float, draw: Draw) -> None:
         super().__init__()
         self._config = config
         self._seed = seed
         self._plant_period_s = plant_period_s
+        self._draw = draw
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
-        self._color = self.DeclareAbstractInputPort(
-            "color_image", AbstractValue.Make(ImageRgba8U(config.width, config.height))
-        )
+        self._poses = self.DeclareAbstractInputPort("frame_poses", AbstractValue.Make(FramePoseVector()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(_Stream()))
         ticket = {self.abstract_state_ticket(self._state), self.time_ticket()}
         self.DeclareAbstractOutputPort("image", lambda: AbstractValue.Make(Image()), self._image, ticket)
         self.DeclareVectorOutputPort("capture_time", 1, self._capture_time, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / config.rate_hz, 0.0, self._expose)
+
+    def first_picture(self, context: Context) -> Pixels:
+        """The colours (H, W, 4) of what stands there now, waited for: a renderer's first picture takes a second."""
+        return self._draw(self._poses.Eval(context), lambda colours: colours.copy()).result()
 
     def _expose(self, context: Context, state: State) -> None:
         stream: _Stream = context.get_abstract_state(self._state).get_value()
@@ -97,15 +118,17 @@ class StreamingColourCamera(LeafSystem):
         started = stream.started if np.isfinite(stream.started) else now
         hidden = self._config.hidden_from_s is not None and now - started >= self._config.hidden_from_s
         rng = np.random.default_rng([self._seed, stream.count])
-        if hidden:
-            grey = np.full((self._config.height, self._config.width), 25, dtype=np.uint8)
-        else:
+        covered = np.full((self._config.height, self._config.width), 25, dtype=np.uint8)
+
+        def finish(colours: Pixels) -> Pixels:
             # The tag is black on white: one channel says it all.
-            grey = np.asarray(cv2.extractChannel(self._color.Eval(context).data, 1))
-        noisy = with_noise(grey, self._config.noise_grey, rng)
+            grey = covered if hidden else np.asarray(cv2.extractChannel(colours, 1), dtype=np.uint8)
+            return with_noise(grey, self._config.noise_grey, rng)
+
+        pixels = self._draw(self._poses.Eval(context), finish)
         step = self._plant_period_s
         taken = (np.ceil(now / step - 1e-6) - 1.0) * step  # on a tick itself the plant still shows the step before
-        frame = Image(stream.count + 1, taken, noisy, now)
+        frame = _Exposed(Image(stream.count + 1, taken, exposed_at=now), pixels)
         kept = 2 + int(self._config.latency_s * self._config.rate_hz)  # enough to look back through the latency
         new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
         state.get_mutable_abstract_state(self._state).set_value(new)
@@ -113,8 +136,8 @@ class StreamingColourCamera(LeafSystem):
     def _arrived(self, context: Context) -> Image:
         stream: _Stream = context.get_abstract_state(self._state).get_value()
         now = context.get_time()
-        ripe = [f for f in stream.frames if now >= f.exposed_at + self._config.latency_s - 1e-9]
-        return ripe[-1] if ripe else Image()
+        ripe = [e for e in stream.frames if now >= e.frame.exposed_at + self._config.latency_s - 1e-9]
+        return dc.replace(ripe[-1].frame, pixels=ripe[-1].pixels.result()) if ripe else Image()
 
     def _image(self, context: Context, output: Any) -> None:
         output.set_value(self._arrived(context))
@@ -127,7 +150,7 @@ def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None
     """Mount a colour camera in the tool and stream it."""
     world, tool = build.simulated_world(), build.tool
     view = world.finger_view
-    if tool is None or view is None:
+    if tool is None or view is None or view.apart is None:
         return
     camera = config.camera()
     K = camera.camera_matrix
@@ -137,14 +160,14 @@ def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None
     core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
     color, depth = ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.01, 0.4))
     frame = view.frames[world.plant.GetBodyByName("tool_plate", world.tool).index()]
-    sensor = build.builder.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
-    sensor.set_name("finger_camera_colour")
+    sensor = view.apart.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
+    view.apart.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    worker = PictureWorker(view.apart, sensor)
     stream = build.builder.AddSystem(
-        StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step())
+        StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step(), worker.draw)
     )
     stream.set_name("finger_camera")
-    build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    build.builder.Connect(sensor.color_image_output_port(), stream.GetInputPort("color_image"))
+    build.builder.Connect(view.poses.GetOutputPort("frame_poses"), stream.GetInputPort("frame_poses"))
     build.inputs["finger_camera.streaming"] = stream.GetInputPort("streaming")
     build.outputs["finger_camera.image"] = stream.GetOutputPort("image")
     build.outputs["finger_camera.capture_time"] = stream.GetOutputPort("capture_time")

@@ -280,6 +280,7 @@ def build_world(
             FINGER_RENDERER,
             mount="tool_plate",
             only=("tag_print", "tag_white"),
+            apart=DiagramBuilder(),  # drawn in a thread of its own
             background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
         )
     return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view)

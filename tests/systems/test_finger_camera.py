@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import ClippingRange, ColorRenderCamera, RenderCameraCore
+from pydrake.geometry import ClippingRange, ColorRenderCamera, FramePoseVector, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.sensors import CameraInfo, ImageRgba8U
+from pydrake.systems.sensors import CameraInfo
 
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation, measure_deformation
+from weldcal.systems.drivers.picture_worker import Finish, Pixels
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.messages import Image
 from weldcal.systems.pose_recorder import PoseHistory
@@ -69,15 +71,14 @@ def test_its_scene_is_the_cells_as_seen_from_the_tool() -> None:
     drive = Drive(plain_station())
     drive.place_arm(Q_HOME, MM * np.array([2.0, -3.0, 4.0]))
     world = drive.station.world
-    assert world.finger_view is not None
-    c, K = CAMERA, CAMERA.camera_matrix
+    c, K, view = CAMERA, CAMERA.camera_matrix, world.scanner_view
     info = CameraInfo(c.width, c.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
     plate = world.plant.GetBodyByName("tool_plate", world.tool).index()
-    pictures = []
-    for view in (world.finger_view, world.scanner_view):
-        core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
-        query = view.scene_graph.get_query_output_port().Eval(view.scene_graph.GetMyContextFromRoot(drive.context))
-        pictures.append(query.RenderColorImage(ColorRenderCamera(core), view.frames[plate], TOOL.X_FK).data.copy())
+    core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
+    query = view.scene_graph.get_query_output_port().Eval(view.scene_graph.GetMyContextFromRoot(drive.context))
+    whole = query.RenderColorImage(ColorRenderCamera(core), view.frames[plate], TOOL.X_FK).data.copy()
+    camera = drive.station.diagram.GetSubsystemByName("finger_camera")
+    pictures = [camera.first_picture(camera.GetMyContextFromRoot(drive.context)), whole]
     assert np.array_equal(*pictures)
     assert np.ptp(pictures[0][:, :, 1]) > 200, "the tag is in it"
 
@@ -143,17 +144,22 @@ class Bench:
     """A streaming camera alone, before a picture that the test changes."""
 
     def __init__(self, **changes: Any) -> None:
-        config = RenderedFingerCamera(width=8, height=6, **changes)
-        self.camera = StreamingColourCamera(config, 1, 0.002)
+        config = RenderedFingerCamera(**{"width": 8, "height": 6, **changes})
+        self.camera = StreamingColourCamera(config, 1, 0.002, self.draw)
         self.simulator = Simulator(self.camera)
         self.context = self.simulator.get_mutable_context()
+        self.camera.GetInputPort("frame_poses").FixValue(self.context, AbstractValue.Make(FramePoseVector()))
+        self.shape = (config.height, config.width, 4)
         self.show(100)
         self.stream(True)
 
+    def draw(self, _poses: FramePoseVector, finish: Finish) -> Future[Pixels]:
+        drawn: Future[Pixels] = Future()
+        drawn.set_result(finish(np.full(self.shape, self.grey, dtype=np.uint8)))
+        return drawn
+
     def show(self, grey: int) -> None:
-        picture = ImageRgba8U(8, 6)
-        picture.mutable_data[:] = grey
-        self.camera.GetInputPort("color_image").FixValue(self.context, AbstractValue.Make(picture))
+        self.grey = grey
 
     def stream(self, on: bool) -> None:
         self.camera.GetInputPort("streaming").FixValue(self.context, [float(on)])
@@ -198,18 +204,9 @@ def test_it_takes_no_frames_unless_it_is_asked() -> None:
 
 
 def test_its_noise_has_the_size_that_was_said_and_differs_from_frame_to_frame() -> None:
-    config = RenderedFingerCamera(width=200, height=100, noise_grey=3.0)
-    camera = StreamingColourCamera(config, 1, 0.002)
-    simulator = Simulator(camera)
-    context = simulator.get_mutable_context()
-    picture = ImageRgba8U(200, 100)
-    picture.mutable_data[:] = 128
-    camera.GetInputPort("color_image").FixValue(context, AbstractValue.Make(picture))
-    camera.GetInputPort("streaming").FixValue(context, [1.0])
-    frames = []
-    for time in (0.045, 0.080):
-        simulator.AdvanceTo(time)
-        frames.append(camera.GetOutputPort("image").Eval(context).pixels.astype(float))
+    bench = Bench(width=200, height=100, noise_grey=3.0)
+    bench.show(128)
+    frames = [bench.image_at(time).pixels.astype(float) for time in (0.045, 0.080)]
     # 20000 pixels give sigma to half a percent; grey values are cut to whole ones, half a grey below on average.
     assert np.std(frames[0]) == pytest.approx(3.0, rel=0.03)
     assert np.mean(frames[0]) == pytest.approx(127.5, abs=0.1)

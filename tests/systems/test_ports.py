@@ -7,6 +7,7 @@ import inspect
 import pkgutil
 import textwrap
 from collections.abc import Callable
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -72,7 +73,9 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
     UrRtdeArm: lambda: UrRtdeArm(the_arm(), StillLink(Q_HOME), 1.0),
     DepthSensor: lambda: DepthSensor(IDEAL, 0, 0.1),
-    StreamingColourCamera: lambda: StreamingColourCamera(RenderedFingerCamera(), 0, 0.002),
+    StreamingColourCamera: lambda: StreamingColourCamera(
+        RenderedFingerCamera(), 0, 0.002, lambda poses, finish: Future()
+    ),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
     IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, get_flange("tool-ring-63"), CALIBRATOR),
@@ -139,7 +142,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "status": UrStatus,
     },
     DepthSensor: {"trigger": 1, "depth_image": ImageDepth32F, "color_image": ImageRgba8U, "scan": Scan},
-    StreamingColourCamera: {"streaming": 1, "color_image": ImageRgba8U, "image": Image, "capture_time": 1},
+    StreamingColourCamera: {"streaming": 1, "frame_poses": FramePoseVector, "image": Image, "capture_time": 1},
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {
         "scan": Scan,
