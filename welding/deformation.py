@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import InputError
+from weldcal.welding.tag_edges import corners_from_sides
 from weldcal.welding.vectors import Array, pose
 
 _DICTIONARIES = {
@@ -84,15 +85,35 @@ def _dictionary(name: str) -> Any:
 
 
 @lru_cache(maxsize=8)
-def _detector(name: str) -> Any:
+def _detector(name: str, refine: bool) -> Any:
     parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    # The window follows the tag's cell (0.3 of it, at most 5 px): a larger one sees neighbouring edges.
-    parameters.cornerRefinementWinSize = 5
-    parameters.relativeCornerRefinmentWinSize = 0.3
-    parameters.cornerRefinementMaxIterations = 50
-    parameters.cornerRefinementMinAccuracy = 0.005
+    if refine:
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        # The window follows the tag's cell (0.3 of it, at most 5 px): a larger one sees neighbouring edges.
+        parameters.cornerRefinementWinSize = 5
+        parameters.relativeCornerRefinmentWinSize = 0.3
+        parameters.cornerRefinementMaxIterations = 50
+        parameters.cornerRefinementMinAccuracy = 0.005
     return cv2.aruco.ArucoDetector(_dictionary(name), parameters)
+
+
+def _corners(grey: NDArray[np.uint8], tag: TagModel, refine: bool) -> list[Array]:
+    """Corners (4, 2) px of each copy of the tag in the picture."""
+    found, ids, _ = _detector(tag.dictionary, refine).detectMarkers(grey)
+    if ids is None:
+        return []
+    return [
+        np.asarray(c, dtype=float).reshape(4, 2) for c, i in zip(found, ids.ravel(), strict=True) if int(i) == tag.id
+    ]
+
+
+def _sharpened(grey: NDArray[np.uint8], corners: Array, tag: TagModel) -> Array:
+    """The corners by the tag's sides, or refined one by one where a side is covered or runs out of the picture."""
+    by_sides = corners_from_sides(grey, corners, int(_dictionary(tag.dictionary).markerSize) + 2)
+    if by_sides is not None:
+        return by_sides
+    one_by_one = _corners(grey, tag, refine=True)
+    return one_by_one[0] if one_by_one else corners
 
 
 def tag_cells(tag: TagModel) -> NDArray[np.bool_]:
@@ -126,7 +147,7 @@ def detect_tag(
 ) -> TagObservation:
     """Find `tag` in one image and its pose in the camera.
 
-    ArUco corners refined to a fraction of a pixel, IPPE for a square, then Levenberg-Marquardt on the reprojection.
+    ArUco corners refined to a hundredth of a pixel by the tag's sides, IPPE for a square, then Levenberg-Marquardt on the reprojection.
     A tag square to the camera may tip either way (two poses explain it): its translation, which is all that
     `deflection_from_tag` uses, is the same in both.
 
@@ -145,13 +166,13 @@ def detect_tag(
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0.0 or K[1, 1] <= 0.0:
         raise TagError("The camera matrix must be a finite 3 x 3 array with positive focal lengths.")
     lens = None if distortion is None else np.asarray(distortion, dtype=float)
-    found, ids, _ = _detector(tag.dictionary).detectMarkers(_grey(image))
-    hits = [] if ids is None else [c for c, i in zip(found, ids.ravel(), strict=True) if int(i) == tag.id]
+    grey = _grey(image)
+    hits = _corners(grey, tag, refine=False)
     if not hits:
         return TagObservation(False, f"Tag {tag.id} is not in sight of the finger camera.")
     if len(hits) > 1:
         return TagObservation(False, f"Tag {tag.id} is seen {len(hits)} times; it must be unique.")
-    corners = np.asarray(hits[0], dtype=float).reshape(4, 2)
+    corners = _sharpened(grey, hits[0], tag)
 
     _, rotations, translations, errors = cv2.solvePnPGeneric(
         tag.corners_M, corners, K, lens, flags=cv2.SOLVEPNP_IPPE_SQUARE

@@ -58,7 +58,10 @@ DARK = (0.16, 0.18, 0.21, 1.0)
 COPPER = (0.80, 0.45, 0.20, 1.0)
 SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
-CELL_PX = 16  # texels of a tag cell: about those of the camera's picture of it, so that interpolation smooths the edges
+CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of it
+# A pixel of a camera gathers light over its area through a lens; a renderer looks at one point of each. What lens and pixel
+# blur, in texels, is put into the print, or edges would lie a tenth of a pixel off wherever they run along the pixels.
+BLUR_TEXELS = 1.2
 TIP_FRICTION = 0.2  # soft tip on steel
 # The contact model's ball is a polyhedron inside the ball it is asked for, with this share of its volume (at a resolution of half
 # the radius). It is asked for one as much larger, or the tip would sink by what the corners were cut off.
@@ -102,7 +105,8 @@ def _add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> 
 def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: TagModel) -> None:
     """The tag with a white margin of one cell, in the marker frame (x right, y up, z out of the print)."""
     cells = cv2.copyMakeBorder(255 * tag_cells(tag).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=255)
-    print_ = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
+    sharp = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
+    print_ = np.asarray(cv2.GaussianBlur(sharp, (0, 0), BLUR_TEXELS), dtype=np.uint8)
     size = tag.size_m * cells.shape[0] / (cells.shape[0] - 2)
     geometry = GeometryInstance(X, textured_board("tag", size, size, print_), "tag_print")
     geometry.set_perception_properties(PerceptionProperties())

@@ -162,6 +162,6 @@ def test_as_the_finger_camera_feels_it_the_tip_sits_where_the_tools_numbers_say(
     for left_m in (0.0018, 0.0020, 0.0022, 0.0024):  # the tag's edges meet the pixels differently in each
         X_BT, deflection = felt(pressed(groove, AXIAL_M + 0.0005, left_m))
         points.append(groove.local(X_BT @ (deflection - free)))
-    # One reading of the tag is good to a tenth along its line of sight (test_finger_camera.py), the mean of four to half that.
-    assert -np.mean(points, axis=0)[2] == pytest.approx(TOOL.seat_sink_m, abs=0.08e-3)
-    assert np.mean(points, axis=0)[1] == pytest.approx(TOOL.seat_side_m, abs=0.03e-3)
+    # The tip itself is that near to the tool's numbers (above); the tag adds a hundredth (test_finger_camera.py).
+    assert -np.mean(points, axis=0)[2] == pytest.approx(TOOL.seat_sink_m, abs=0.04e-3)
+    assert np.mean(points, axis=0)[1] == pytest.approx(TOOL.seat_side_m, abs=0.015e-3)
