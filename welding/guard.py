@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -102,8 +101,7 @@ def guarded_joint_velocity(
     jacobian, velocity = np.asarray(J, dtype=float), np.asarray(V, dtype=float)
     bound = np.asarray(q_dot_limit, dtype=float)
     rest = np.zeros(jacobian.shape[-1])
-    # What is not finite stays so in a sum; this runs 500 times a second.
-    if not isfinite(jacobian.sum() + velocity.sum() + bound.sum()):
+    if not (np.isfinite(jacobian).all() and np.isfinite(velocity).all() and np.isfinite(bound).all()):
         return GuardedVelocity(rest, 0.0, 0.0, True, "The arm was stopped: the commanded velocity is not finite.")
     row_scale = limits.row_scale
     U, sigma, Vt = np.linalg.svd(row_scale[:, None] * jacobian)
