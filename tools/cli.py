@@ -136,7 +136,8 @@ def demo(
 ) -> None:
     """The whole story: calibrate, verify, scan the workpiece, plan, weld, retract; with a report at the end."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.demo import DemoOptions, run_demo
+        from weldcal.tools.demo import DemoOptions
+        from weldcal.tools.procedures import run_procedure
 
         options = DemoOptions(
             scenario=scenario,
@@ -150,7 +151,7 @@ def demo(
             speed_factor=speed_factor,
         )
         with console.progress_bar("demo") as progress:
-            result = run_demo(options, progress)
+            result = run_procedure(options, progress)
     finish("demo", result.summary(), result.folder, json_wanted=json)
 
 
