@@ -24,20 +24,21 @@ class Outcome(Protocol):
 
 
 Runner = Callable[[Scenario, DemoOptions, Progress], Outcome]
-RUNNERS: dict[str, Runner] = {
-    "job": run_scenario,
-    "tablet": run_tablet_demo,
+JOB = "job"
+PROCEDURES: dict[str, tuple[Callable[[Scenario], bool], Runner]] = {
+    "tablet": (lambda scenario: scenario.tablet is not None, run_tablet_demo),
 }
 
 
 def kind_of(scenario: Scenario) -> str:
-    """The key of RUNNERS that a scenario belongs to; without a field of another procedure it is the main job."""
-    return "job" if scenario.tablet is None else "tablet"
+    """Which of PROCEDURES a scenario is; without the field of any of them it is the main job."""
+    return next((kind for kind, (belongs, _) in PROCEDURES.items() if belongs(scenario)), JOB)
 
 
 def runner_of(scenario: Scenario) -> Runner:
     """Who runs this scenario."""
-    return RUNNERS[kind_of(scenario)]
+    kind = kind_of(scenario)
+    return run_scenario if kind == JOB else PROCEDURES[kind][1]
 
 
 def run_procedure(options: DemoOptions, progress: Progress) -> Outcome:
