@@ -189,6 +189,8 @@ def make_cell(
     Raises:
         InputError, UnreachableScanner: the scenario cannot be done; nothing has been written or moved.
     """
+    if scenario.tablet is not None:
+        raise InputError("This scenario is a visit to a tablet: run it with weldcal tablet demo or weldcal demo.")
     station = make_station(scenario, seed, robot)
     try:
         check_way_home(scenario, station)

@@ -12,9 +12,12 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
+from weldcal.systems.drivers.simulated_tablet import SimulatedTablet
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
 from weldcal.welding.laws import get_law
 from weldcal.welding.planning import PlanningMethod
 from weldcal.welding.process import WeldProcess
@@ -148,15 +151,18 @@ class Scenario:
     arm: str = "ur10e"
     kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
     flange: str = "iso9409-1-50-4-m6"  # of the arm
-    tool: str = "welding"  # welding or none
+    tool: str = "welding"  # welding, pen or none
     robot: SimulatedUr | UrRtde | NoDevice = dc.field(default_factory=SimulatedUr)
     scanner: RenderedScanner | NoDevice = dc.field(default_factory=RenderedScanner)
     finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
+    wrist_camera: RenderedWristCamera | NoDevice = dc.field(default_factory=NoDevice)
+    digitizer: SimulatedTablet | NoDevice = dc.field(default_factory=NoDevice)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
     planning: PlanningConfig = dc.field(default_factory=PlanningConfig)
     welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
+    tablet: TabletConfig | None = None  # a visit to a tablet instead of the job
     job: JobConfig = dc.field(default_factory=JobConfig)
     visualization: VisualizationConfig = dc.field(default_factory=VisualizationConfig)
 
@@ -213,6 +219,7 @@ def check_scenario(scenario: Scenario) -> None:
         )
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
+    check_tablet(scenario)
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
         raise InputError(
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
@@ -229,8 +236,8 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
     if calibration.cost not in ("translation", "translation_and_rotation"):
         raise InputError(f"calibration.cost must be translation or translation_and_rotation, not '{calibration.cost}'.")
-    if scenario.tool not in ("welding", "none"):
-        raise InputError(f"tool must be welding or none, not '{scenario.tool}'.")
+    if scenario.tool not in ("welding", "pen", "none"):
+        raise InputError(f"tool must be welding, pen or none, not '{scenario.tool}'.")
     if (calibration.feature == "tool_ring") != (scenario.tool == "welding"):
         raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
     if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:

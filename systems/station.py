@@ -22,8 +22,10 @@ from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
+from weldcal.systems.drivers.tablet_world import tablet_fittings
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario import Scenario
+from weldcal.systems.tablet_messages import TabletTruth
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -33,6 +35,7 @@ class Truth(Message):
     X_BC: RigidTransform | None
     X_BP: RigidTransform | None
     workpiece: Workpiece | None  # the part as it really is
+    tablet: TabletTruth | None = None  # camera and pen on the wrist and the tablet on the table
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -127,7 +130,7 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
     `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
-    `query_object`.
+    `query_object`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`.
 
     Raises:
         InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the job.
@@ -148,6 +151,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
+    visit = tablet_fittings(scenario, rng)
     builder = DiagramBuilder()
     world = build_world(
         builder,
@@ -158,12 +162,15 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
         table_z_m=scenario.calibration.table_z_m,
         workpiece=real,
         X_BP=X_BP,
+        fittings=() if visit is None else (visit,),
     )
-    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot)
+    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, visit)
     apply_driver_config(scenario.robot, build)
     X_BC = apply_driver_config(scenario.scanner, build)
     apply_driver_config(scenario.finger_camera, build)
-    truth = Truth(X_BC, X_BP, real)
+    apply_driver_config(scenario.wrist_camera, build)
+    apply_driver_config(scenario.digitizer, build)
+    truth = Truth(X_BC, X_BP, real, None if visit is None else visit.truth)
     _export(build, truth)
     diagram = builder.Build()
     diagram.set_name("station")

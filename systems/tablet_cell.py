@@ -1,4 +1,4 @@
-"""The tablet cell: one Diagram of arm, wrist camera, pen and tablet, with the procedure that calibrates them."""
+"""The tablet cell: one Diagram of the station with pen, wrist camera and tablet, and the procedure that calibrates them."""
 
 from __future__ import annotations
 
@@ -6,56 +6,89 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
-    Meshcat,
-    MeshcatVisualizer,
-    RenderCameraCore,
-)
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventStatus
-from pydrake.systems.primitives import Adder
-from pydrake.systems.sensors import CameraInfo, RgbdSensor
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from weldcal.calibration.tablet.wrist import WristTouches
+from weldcal.calibration.clearance import Body, arm_bodies
 from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, load_arm
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
-from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED
-from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.drivers.tablet_world import TabletTruth, build_tablet_world, draw_truth
-from weldcal.systems.drivers.wrist_devices import TabletDigitizer, WristCamera, WristPicture
+from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED, MOVE_TIMEOUT_S, Wiring, panel
+from weldcal.systems.clear_moves import check_way_home, clear_move
+from weldcal.systems.command_arbiter import CommandArbiter
+from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
+from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.flange_mover import FlangeMover
+from weldcal.systems.pose_recorder import PoseRecorder
+from weldcal.systems.scenario import Scenario
 from weldcal.systems.slew_limiter import SlewLimiter
-from weldcal.systems.station import apply_driver_config
+from weldcal.systems.station import Station, make_station
+from weldcal.systems.tablet_messages import TabletTruth, WristPicture
 from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState
-from weldcal.systems.tablet_scenario import TabletScenario, landmarks_m
+from weldcal.systems.tablet_scenario import TabletConfig
 from weldcal.welding.guard import SlewLimits
+from weldcal.welding.servo_state import ServoConfig
 
 Array = NDArray[np.float64]
-RECORDING_FPS = 8.0
+PEN_BODY_M = 0.006  # radius of the pen where moves are to keep clear of the table
+_LOOK_ASLANT_RAD = (0.12, -0.10)  # a view that is a little aslant fixes the tablet's tilt better than one square on
+_LEAN_STEP_RAD = 2.4  # between the sides to which the pen leans, touch by touch: the golden angle, so none comes twice
 
 
 @dataclass(frozen=True, eq=False)
 class TabletCell:
-    """The Diagram and its named parts; `truth` is for reports and tests only."""
+    """The Diagram and its named parts; whoever makes one closes its station."""
 
     diagram: Diagram
-    scenario: TabletScenario
-    arm: ArmModel
+    station: Station
+    scenario: Scenario
+    plan: TabletPlan
     procedure: TabletProcedure
-    camera: WristCamera
-    truth: TabletTruth
 
     @property
-    def camera_matrix(self) -> Array:
-        """K (3, 3) of the wrist camera, centre of the first pixel at (0, 0)."""
-        r = self.scenario.rig
-        return np.array([[r.focal_px, 0, 0.5 * (r.width - 1)], [0, r.focal_px, 0.5 * (r.height - 1)], [0, 0, 1.0]])
+    def tablet(self) -> TabletConfig:
+        """The tablet as it is thought."""
+        return _tablet(self.scenario)
+
+    @property
+    def camera(self) -> RenderedWristCamera:
+        """The wrist camera as drawn."""
+        return _camera(self.scenario)
+
+    @property
+    def truth(self) -> TabletTruth:
+        """What only the simulation knows; for reports and tests."""
+        truth = self.station.truth.tablet
+        if truth is None:
+            raise RuntimeError("a station with a tablet knows where it is")
+        return truth
+
+    def state(self, root: Context) -> TabletState:
+        """Where the procedure stands in a context of the whole Diagram."""
+        return self.procedure.stands(self.procedure.GetMyContextFromRoot(root))
+
+    def picture(self, root: Context) -> WristPicture:
+        """The camera's newest picture."""
+        station = self.station.diagram
+        shown: WristPicture = station.GetOutputPort("wrist_camera.picture").Eval(station.GetMyContextFromRoot(root))
+        return shown
+
+
+def _tablet(scenario: Scenario) -> TabletConfig:
+    if scenario.tablet is None:
+        raise InputError("This scenario has no tablet: write tablet: {} and tool: pen in it, or run scenario 'tablet'.")
+    return scenario.tablet
+
+
+def _camera(scenario: Scenario) -> RenderedWristCamera:
+    if isinstance(scenario.wrist_camera, NoDevice):
+        raise InputError(
+            "A visit to the tablet needs a camera: write wrist_camera: !RenderedWristCamera {} in the scenario."
+        )
+    return scenario.wrist_camera
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
@@ -69,146 +102,145 @@ def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
     return np.asarray(turns[np.abs(turns - q_near).max(axis=1).argmin()])
 
 
-def plan_tablet(scenario: TabletScenario, arm: ArmModel) -> TabletPlan:
+def plan_tablet(scenario: Scenario, arm: ArmModel) -> TabletPlan:
     """Where to look from and how to come down on each landmark, by the drawing alone.
 
     Raises:
-        InputError: a pose is out of reach.
+        InputError: the scenario has no tablet, or a pose is out of reach.
     """
+    tablet, X_FC = _tablet(scenario), _camera(scenario).nominal()
     q_home = np.deg2rad(scenario.home_deg)
-    X_BT, page = scenario.tablet.pose.pose(), landmarks_m(scenario.tablet)
-    X_FC, p_FP = scenario.rig.camera.pose(), np.array(scenario.rig.pen_tip_m)
+    X_BT, page, p_FP = tablet.pose(), tablet.landmarks_m(), np.array(tablet.pen.tip_m)
     middle = X_BT.multiply(np.r_[0.5 * page.max(axis=0), 0.0])
-    # a view that is a little aslant fixes the tablet's tilt better than one square on
-    R_BC = X_BT.rotation() @ RotationMatrix(RollPitchYaw(0.12, -0.10, 0.0))
-    X_BC = RigidTransform(R_BC, middle - R_BC.multiply(np.array([0.0, 0.0, 1e-3 * scenario.look_distance_mm])))
+    R_BC = X_BT.rotation() @ RotationMatrix(RollPitchYaw(*_LOOK_ASLANT_RAD, 0.0))
+    X_BC = RigidTransform(R_BC, middle - R_BC.multiply(np.array([0.0, 0.0, 1e-3 * tablet.look_distance_mm])))
     q_look = nearest_joints(arm, X_BC @ X_FC.inverse(), q_home)
     start = RollPitchYaw(forward_kinematics(arm, q_home).rotation()).yaw_angle()
     above, q = [], q_look
     for k, p in enumerate(page):
-        lean = np.deg2rad(scenario.tilt_deg) * np.array([np.cos(2.4 * k), np.sin(2.4 * k)]) * (k > 0)
-        turn = start + np.deg2rad(scenario.turn_deg) * (k - 0.5 * (len(page) - 1))
+        side = _LEAN_STEP_RAD * k
+        lean = np.deg2rad(tablet.tilt_deg) * np.array([np.cos(side), np.sin(side)]) * (k > 0)
+        turn = start + np.deg2rad(tablet.turn_deg) * (k - 0.5 * (len(page) - 1))
         R = RollPitchYaw(np.pi + lean[0], lean[1], turn).ToRotationMatrix()
-        tip = X_BT.multiply(np.r_[p, 0.0]) + np.array([0.0, 0.0, 1e-3 * scenario.clearance_mm])
+        tip = X_BT.multiply(np.r_[p, 0.0]) + np.array([0.0, 0.0, 1e-3 * tablet.clearance_mm])
         q = nearest_joints(arm, RigidTransform(R, tip - R.multiply(p_FP)), q)
         above.append(q)
-    longest = (scenario.clearance_mm + scenario.deepest_mm) / scenario.descent_mm_s
-    return TabletPlan(q_look, np.array(above), q_home, p_FP, 1e-3 * scenario.descent_mm_s, longest)
+    slower = 1.0 / scenario.job.speed_factor
+    return TabletPlan(
+        q_look=q_look,
+        q_above=np.array(above),
+        q_home=q_home,
+        p_FP=p_FP,
+        descent_m_s=1e-3 * tablet.descent_mm_s,
+        longest_descent_s=(tablet.clearance_mm + tablet.deepest_mm) / tablet.descent_mm_s,
+        move_timeout_s=MOVE_TIMEOUT_S * slower,
+        maximum_time_s=scenario.job.maximum_time_s * slower,
+    )
 
 
-def make_tablet_cell(scenario: TabletScenario, seed: int = 0, meshcat: Meshcat | None = None) -> TabletCell:
-    """Build the cell; what differs between the drawing and the world comes from `seed`.
+def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
+    """Every move straight in joint space must keep arm and pen above the table and off the arm.
+
+    Raises:
+        InputError: one would not; nothing has moved.
+    """
+    pen = Capsule(6, np.zeros(3), plan.p_FP, PEN_BODY_M)
+    bodies: list[Body] = arm_bodies(station.arm, (pen,))
+    goals = [plan.q_home, plan.q_look, *plan.q_above, plan.q_home]
+    names = ["home", "the look", *(f"landmark {k + 1}" for k in range(len(plan.q_above))), "home"]
+    for k in range(len(goals) - 1):
+        if not clear_move(scenario, station, bodies, goals[k], goals[k + 1]):
+            raise InputError(
+                f"The move from {names[k]} to {names[k + 1]} would touch the table or the arm itself: choose another home_deg, "
+                "a smaller tablet.turn_deg, or another place for the tablet."
+            )
+
+
+def make_tablet_cell(
+    scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None, robot: PreparedRobot | None = None
+) -> TabletCell:
+    """Build the cell; what differs between the drawing and the world comes from `seed`. `robot`: see make_station.
 
     Raises:
         InputError: the scenario cannot be done; nothing has moved.
     """
-    rng = np.random.default_rng(seed)
-    arm = load_arm(scenario.arm)
-    plan = plan_tablet(scenario, arm)
-    truth = draw_truth(scenario, rng)
+    _tablet(scenario)
+    station = make_station(scenario, seed, robot)
+    try:
+        check_way_home(scenario, station)
+        plan = plan_tablet(scenario, station.arm)
+        check_moves(scenario, station, plan)
+        return _make_tablet_cell(scenario, station, plan, meshcat)
+    except BaseException:
+        station.close()
+        raise
+
+
+def _make_tablet_cell(scenario: Scenario, station: Station, plan: TabletPlan, meshcat: Meshcat | None) -> TabletCell:
     builder = DiagramBuilder()
-    made = build_tablet_world(builder, arm, scenario, truth)
-    plant, scene_graph, rig = made.world.plant, made.world.scene_graph, scenario.rig
-    build = StationBuild(builder, arm, None, plan.q_home, rng, made.world)
-    apply_driver_config(scenario.robot, build)
-
-    cx, cy = 0.5 * (rig.width - 1), 0.5 * (rig.height - 1)
-    view = made.world.scanner_view
-    core = RenderCameraCore(
-        view.renderer,
-        # Drake samples pixel (u, v) at (u + 0.5, v + 0.5)
-        CameraInfo(rig.width, rig.height, rig.focal_px, rig.focal_px, cx + 0.5, cy + 0.5),
-        ClippingRange(0.02, 3.0),
-        RigidTransform(),
+    builder.AddSystem(station.diagram)
+    wiring = Wiring(builder, station, scenario, ServoConfig())
+    out, into, arm, job = station.diagram.GetOutputPort, station.diagram.GetInputPort, station.arm, scenario.job
+    q_measured = out("ur10e.position_measured")
+    recorder = wiring.add("pose_recorder", PoseRecorder())
+    wiring.connect(recorder, position_measured=q_measured, sample_time=out("ur10e.sample_time"))
+    procedure = wiring.add("tablet_procedure", TabletProcedure(arm, plan))
+    mover = wiring.add("flange_mover", FlangeMover(MOVE_SPEED * job.speed_factor, MOVE_ACCELERATION * job.speed_factor))
+    command = procedure.GetOutputPort("job")
+    wiring.connect(mover, job=command, position_measured=q_measured, velocity_measured=out("ur10e.velocity_measured"))
+    wiring.connect(
+        procedure,
+        position_measured=q_measured,
+        settled_goal=mover.GetOutputPort("settled_goal"),
+        robot_status=out("ur10e.status"),
+        history=recorder.GetOutputPort("history"),
+        picture=out("wrist_camera.picture"),
+        touch=out("digitizer.touch"),
+        hold=wiring.zeros("nobody_holds", 1) if meshcat is None else panel(wiring, meshcat),
     )
-    flange = view.frames[plant.GetBodyByName("flange", made.world.arm).index()]
-    sensor = builder.AddSystem(
-        RgbdSensor(flange, truth.X_FC, ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.05, 2.0)))
+    arbiter = wiring.add("command_arbiter", CommandArbiter())
+    wiring.connect(
+        arbiter,
+        job=command,
+        robot_status=out("ur10e.status"),
+        mover_velocity=mover.GetOutputPort("velocity"),
+        servo_velocity=procedure.GetOutputPort("descent"),
     )
-    camera = builder.AddSystem(WristCamera(rig, int(rng.integers(2**31))))
-    digitizer = builder.AddSystem(TabletDigitizer(scenario.tablet, made, truth.X_BT, int(rng.integers(2**31))))
-    procedure = builder.AddSystem(TabletProcedure(arm, plan))
-    mover = builder.AddSystem(FlangeMover(MOVE_SPEED, MOVE_ACCELERATION))
-    both = builder.AddSystem(Adder(2, 6))
     limits = SlewLimits(speed=0.6 * arm.velocity_limit, acceleration=0.5 * arm.acceleration_limit, jerk=JERK_LIMIT)
-    limiter = builder.AddSystem(SlewLimiter(limits))
-    for system, name in (
-        (sensor, "wrist_rgbd"), (camera, "wrist_camera"), (digitizer, "tablet"), (procedure, "tablet_procedure"),
-        (mover, "flange_mover"), (limiter, "slew_limiter"),
-    ):  # fmt: skip
-        system.set_name(name)
-
-    connect = builder.Connect
-    connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    connect(sensor.color_image_output_port(), camera.GetInputPort("color_image"))
-    connect(sensor.depth_image_32F_output_port(), camera.GetInputPort("depth_image"))
-    connect(plant.get_contact_results_output_port(), digitizer.GetInputPort("contact_results"))
-    connect(procedure.GetOutputPort("trigger"), camera.GetInputPort("trigger"))
-    connect(camera.GetOutputPort("picture"), procedure.GetInputPort("picture"))
-    connect(digitizer.GetOutputPort("touch"), procedure.GetInputPort("touch"))
-    connect(build.outputs["ur10e.position_measured"], procedure.GetInputPort("position_measured"))
-    connect(build.outputs["ur10e.status"], procedure.GetInputPort("robot_status"))
-    connect(procedure.GetOutputPort("job"), mover.GetInputPort("job"))
-    connect(build.outputs["ur10e.position_measured"], mover.GetInputPort("position_measured"))
-    connect(build.outputs["ur10e.velocity_measured"], mover.GetInputPort("velocity_measured"))
-    connect(mover.GetOutputPort("settled_goal"), procedure.GetInputPort("settled_goal"))
-    connect(mover.GetOutputPort("velocity"), both.get_input_port(0))
-    connect(procedure.GetOutputPort("descent"), both.get_input_port(1))
-    connect(both.get_output_port(), limiter.get_input_port())
-    connect(limiter.get_output_port(), build.inputs["ur10e.velocity_command"])
+    limiter = wiring.add("slew_limiter", SlewLimiter(limits))
+    wiring.connect(limiter, velocity_wanted=arbiter.GetOutputPort("velocity_wanted"))
+    builder.Connect(limiter.get_output_port(), into("ur10e.velocity_command"))
+    builder.Connect(procedure.GetOutputPort("trigger"), into("wrist_camera.trigger"))
     if meshcat is not None:
-        MeshcatVisualizer.AddToBuilder(builder, scene_graph, meshcat)
+        period = 1.0 / scenario.visualization.recording_fps
+        params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=period)
+        visualizer = MeshcatVisualizer(meshcat, params)
+        visualizer.set_name("meshcat_visualizer")
+        builder.AddSystem(visualizer)
+        builder.Connect(out("query_object"), visualizer.query_object_input_port())
     diagram = builder.Build()
     diagram.set_name("tablet_cell")
-    return TabletCell(diagram, scenario, arm, procedure, camera, truth)
+    return TabletCell(diagram, station, scenario, plan, procedure)
 
 
 @dataclass(frozen=True, eq=False)
 class TabletVisit:
-    """What one run of the procedure left: its state, the picture, and simulated seconds."""
+    """What one run of the procedure left: its state, the picture, simulated and wall seconds, when each phase began, and why a
+    person ended it before its end (empty: nobody did)."""
 
     state: TabletState
     picture: WristPicture
     seconds: float
+    wall_seconds: float = 0.0
+    phases: tuple[tuple[str, float], ...] = ()
+    interrupted: str = ""
 
+    @property
+    def done(self) -> bool:
+        """Every landmark was touched and the arm is home."""
+        return self.state.phase == "done" and not self.interrupted
 
-def run_tablet_cell(cell: TabletCell, meshcat: Meshcat | None = None) -> TabletVisit:
-    """Run the procedure to its end (done, or held with a reason); the viewer that the cell was built with records it."""
-    simulator = Simulator(cell.diagram)
-
-    def watch(root: Context) -> EventStatus:
-        if _state(cell, root).phase in ("done", "held"):
-            return EventStatus.ReachedTermination(cell.procedure, "the procedure ended")
-        return EventStatus.DidNothing()
-
-    simulator.set_monitor(watch)
-    simulator.Initialize()
-    if meshcat is not None:
-        meshcat.StartRecording(frames_per_second=RECORDING_FPS)
-    simulator.AdvanceTo(cell.scenario.maximum_time_s)
-    if meshcat is not None:
-        meshcat.StopRecording()
-        meshcat.PublishRecording()
-    root = simulator.get_context()
-    picture: WristPicture = cell.camera.GetOutputPort("picture").Eval(cell.camera.GetMyContextFromRoot(root))
-    return TabletVisit(_state(cell, root), picture, float(root.get_time()))
-
-
-def _state(cell: TabletCell, root: Context) -> TabletState:
-    state: TabletState = cell.procedure.GetOutputPort("state").Eval(cell.procedure.GetMyContextFromRoot(root))
-    return state
-
-
-def wrist_touches(cell: TabletCell, visit: TabletVisit, uv_px: Array) -> WristTouches:
-    """The visit in the form that fit_wrist takes, with the landmarks (n, 2) px found in its picture."""
-    K, tablet = cell.camera_matrix, cell.scenario.tablet
-    touched = 1e-3 * np.array([t.position_px for t in visit.state.touches]) / tablet.px_per_mm
-    rays = (uv_px - K[:2, 2]) / K[0, 0]
-    return WristTouches(
-        X_BF=tuple(forward_kinematics(cell.arm, t.q) for t in visit.state.touches),
-        touched_m=touched,
-        landmark_m=landmarks_m(tablet),
-        views=((forward_kinematics(cell.arm, visit.state.q_look), rays),),
-        focal_px=float(K[0, 0]),
-        tip_radius_m=1e-3 * cell.scenario.rig.pen_radius_mm,
-    )
+    @property
+    def reason(self) -> str:
+        """Why it is not done."""
+        return self.interrupted or self.state.reason

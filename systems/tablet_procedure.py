@@ -11,10 +11,18 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
-from weldcal.systems.drivers.wrist_devices import TabletTouch, WristPicture
 from weldcal.systems.messages import JobCommand, Message, UrStatus
+from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 
 Array = NDArray[np.float64]
+
+MOVES = ("to_start", "to_look", "to_above", "lift", "to_home")
+ENDS = ("done", "held")
+PICTURE_TIMEOUT_S = 8.0
+# of a descent's longest time: a tablet that is touched at the very end of it still has to say so
+LATE_TOUCH_S = 0.2
+_MODES = {**dict.fromkeys(MOVES, "move"), "descend": "weld"}  # the arbiter's word for "the servo drives"
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +35,8 @@ class TabletPlan:
     p_FP: Array  # of the pen as drawn: its tip is what goes straight down
     descent_m_s: float
     longest_descent_s: float
+    move_timeout_s: float = 20.0
+    maximum_time_s: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,28 +46,106 @@ class Touched(Message):
     landmark: int
     position_px: Array
     q: Array
+    time: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
 class TabletState(Message):
     """Where the procedure stands."""
 
-    phase: str = "start"  # start, to_look, look, to_above, descend, lift, to_home, done, held
+    phase: str = "start"  # start, to_start, to_look, look, to_above, descend, lift, to_home, done, held
     since: float = 0.0
     goal_id: int = 0
     q_goal: Array | None = None
     landmark: int = 0
     trigger: int = 0
-    felt_before: int = (
-        0  # touches the tablet had felt when this descent began: a bounce on the way up is not the next one
-    )
+    # touches the tablet had felt when this descent began: a bounce on the way up is not the next one
+    felt_before: int = 0
     touches: tuple[Touched, ...] = ()
     q_look: Array = field(default_factory=lambda: np.full(6, np.nan))
     reason: str = ""
 
+    @property
+    def finished(self) -> bool:
+        """No more motion will be asked for."""
+        return self.phase in ENDS
+
+
+@dataclass(frozen=True, eq=False)
+class TabletSeen:
+    """What the procedure is told at one tick."""
+
+    time: float
+    q: Array
+    settled_goal: int
+    robot: UrStatus
+    hold: bool
+    history: PoseHistory
+    picture: WristPicture
+    touch: TabletTouch
+
+
+def next_state(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletState:
+    """Where the procedure stands after this tick; the same object where nothing changed."""
+    if s.finished:
+        return s
+    stop = _why_stop(s, seen, plan)
+    if stop:
+        return replace(s, phase="held", since=seen.time, reason=stop)
+    arrived = s.goal_id > 0 and seen.settled_goal == s.goal_id
+    if s.phase in MOVES:
+        return _after_move(s, seen, plan) if arrived else s
+    if s.phase == "start":
+        return _go(s, "to_start", plan.q_home, seen.time)
+    if s.phase == "look":
+        q = seen.history.joints_at(seen.picture.capture_time) if seen.picture.sequence == s.trigger else None
+        return s if q is None else _go(replace(s, q_look=q), "to_above", plan.q_above[0], seen.time)
+    if seen.touch.sequence > s.felt_before:
+        q = seen.history.joints_at(seen.touch.time)
+        if q is None:
+            return s
+        touches = (*s.touches, Touched(s.landmark, seen.touch.position_px, q, seen.touch.time))
+        return _go(replace(s, touches=touches), "lift", plan.q_above[s.landmark], seen.time)
+    if seen.time - s.since > plan.longest_descent_s:
+        reason = f"The pen met no tablet at landmark {s.landmark + 1}: check where the tablet lies."
+        # back the way it came, before anything else: home is not straight above
+        return _go(replace(s, reason=reason), "lift", plan.q_above[s.landmark], seen.time)
+    return s
+
+
+def _after_move(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletState:
+    if s.phase == "to_start":
+        return _go(s, "to_look", plan.q_look, seen.time)
+    if s.phase == "to_look":
+        return replace(s, phase="look", since=seen.time, trigger=s.trigger + 1)
+    if s.phase == "to_above":
+        return replace(s, phase="descend", since=seen.time, felt_before=seen.touch.sequence)
+    if s.phase == "lift" and not s.reason and s.landmark + 1 < len(plan.q_above):
+        return _go(replace(s, landmark=s.landmark + 1), "to_above", plan.q_above[s.landmark + 1], seen.time)
+    if s.phase == "lift":
+        return _go(s, "to_home", plan.q_home, seen.time)
+    return replace(s, phase="held" if s.reason else "done", since=seen.time)
+
+
+def _why_stop(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> str:
+    """Why the procedure must end where it stands; empty: it need not."""
+    if not seen.robot.ready:
+        return seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}."
+    if seen.hold:
+        return f"A person held the visit, in the phase '{s.phase}'."
+    if seen.time > plan.maximum_time_s:
+        return f"The visit took longer than {plan.maximum_time_s:.0f} s; allow more with job.maximum_time_s."
+    if s.phase in MOVES and seen.time - s.since > plan.move_timeout_s:
+        return f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s."
+    if s.phase == "look" and seen.time - s.since > PICTURE_TIMEOUT_S:
+        return f"No picture arrived within {PICTURE_TIMEOUT_S:.0f} s of its trigger."
+    if s.phase == "descend" and seen.time - s.since > plan.longest_descent_s + LATE_TOUCH_S:
+        return "The tablet felt the pen at a time at which nobody knows where the arm was: check the clocks."
+    return ""
+
 
 class TabletProcedure(LeafSystem):
-    """Runs the procedure; a robot fault, or a descent that meets no tablet, holds it with a sentence.
+    """Runs the procedure; a robot fault, a person, or a descent that meets no tablet, holds it with a sentence.
 
     .. pydrake_system::
 
@@ -66,15 +154,18 @@ class TabletProcedure(LeafSystem):
         - position_measured
         - settled_goal
         - robot_status
+        - history
         - picture
         - touch
+        - hold
         output_ports:
         - job
         - descent
         - trigger
         - state
 
-    `job` drives the FlangeMover between goals; `descent` (6) rad/s is the pen's way straight down, zero otherwise.
+    `job` drives the FlangeMover between goals and lets `descent` through the CommandArbiter while the pen goes down; `descent`
+    (6) rad/s is the pen's way straight down, zero otherwise; `hold` (1) is a person's wish to stop.
     """
 
     def __init__(self, arm: ArmModel, plan: TabletPlan, period_s: float = 0.004) -> None:
@@ -83,8 +174,10 @@ class TabletProcedure(LeafSystem):
         self._position = self.DeclareVectorInputPort("position_measured", 6)
         self._settled = self.DeclareVectorInputPort("settled_goal", 1)
         self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._picture = self.DeclareAbstractInputPort("picture", AbstractValue.Make(WristPicture()))
         self._touch = self.DeclareAbstractInputPort("touch", AbstractValue.Make(TabletTouch()))
+        self._hold = self.DeclareVectorInputPort("hold", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(TabletState()))
         out = self.DeclareDiscreteState(np.zeros(6))
         ticket = {self.abstract_state_ticket(self._state)}
@@ -94,67 +187,54 @@ class TabletProcedure(LeafSystem):
         self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(TabletState()), self._show, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
+    def stands(self, context: Context) -> TabletState:
+        """Where the procedure stands in its own context."""
+        state: TabletState = context.get_abstract_state(self._state).get_value()
+        return state
+
     def _update(self, context: Context, state: State) -> None:
-        old: TabletState = context.get_abstract_state(self._state).get_value()
-        q = np.array(self._position.Eval(context))
-        new = self._next(old, q, context)
+        old = self.stands(context)
+        seen = TabletSeen(
+            time=context.get_time(),
+            q=np.array(self._position.Eval(context)),
+            settled_goal=int(self._settled.Eval(context)[0]),
+            robot=self._status.Eval(context),
+            hold=bool(self._hold.Eval(context)[0] > 0.5),
+            history=self._history.Eval(context),
+            picture=self._picture.Eval(context),
+            touch=self._touch.Eval(context),
+        )
+        new = next_state(old, seen, self._plan)
         if new is not old:
             state.get_mutable_abstract_state(self._state).set_value(new)
         velocity = np.zeros(6)
         if new.phase == "descend":
             twist = np.array([0.0, 0.0, 0.0, 0.0, 0.0, -self._plan.descent_m_s])
-            velocity = np.linalg.solve(jacobian(self._arm, q, self._plan.p_FP), twist)
+            velocity = np.linalg.solve(jacobian(self._arm, seen.q, self._plan.p_FP), twist)
         state.get_mutable_discrete_state().set_value(velocity)
 
-    def _next(self, s: TabletState, q: Array, context: Context) -> TabletState:
-        now, plan = context.get_time(), self._plan
-        if s.phase in ("done", "held"):
-            return s
-        status: UrStatus = self._status.Eval(context)
-        if not status.ready:
-            return replace(
-                s, phase="held", since=now, reason=status.fault or "The robot does not obey velocity commands."
-            )
-        arrived = s.goal_id > 0 and int(self._settled.Eval(context)[0]) == s.goal_id
-        if s.phase == "start":
-            return _go(s, "to_look", plan.q_look, now)
-        if s.phase == "to_look" and arrived:
-            return replace(s, phase="look", since=now, trigger=s.trigger + 1)
-        if s.phase == "look":
-            picture: WristPicture = self._picture.Eval(context)
-            return _go(replace(s, q_look=q), "to_above", plan.q_above[0], now) if picture.sequence == s.trigger else s
-        if s.phase == "to_above" and arrived:
-            before: TabletTouch = self._touch.Eval(context)
-            return replace(s, phase="descend", since=now, felt_before=before.sequence)
-        if s.phase == "descend":
-            touch: TabletTouch = self._touch.Eval(context)
-            if touch.sequence > s.felt_before:
-                touches = (*s.touches, Touched(s.landmark, touch.position_px, q))
-                return _go(replace(s, touches=touches), "lift", plan.q_above[s.landmark], now)
-            if now - s.since > plan.longest_descent_s:
-                reason = f"The pen met no tablet at landmark {s.landmark + 1}: check where the tablet lies."
-                return _go(replace(s, reason=reason), "to_home", plan.q_home, now)
-        if s.phase == "lift" and arrived:
-            if s.landmark + 1 < len(plan.q_above):
-                return _go(replace(s, landmark=s.landmark + 1), "to_above", plan.q_above[s.landmark + 1], now)
-            return _go(s, "to_home", plan.q_home, now)
-        if s.phase == "to_home" and arrived:
-            return replace(s, phase="held" if s.reason else "done", since=now)
-        return s
-
     def _job(self, context: Context, output: Any) -> None:
-        s: TabletState = context.get_abstract_state(self._state).get_value()
-        moving = s.phase in ("to_look", "to_above", "lift", "to_home")
-        output.set_value(JobCommand(s.phase, "move" if moving else "hold", s.goal_id, s.q_goal))
+        s = self.stands(context)
+        output.set_value(
+            JobCommand(
+                s.phase,
+                _MODES.get(s.phase, "hold"),
+                s.goal_id,
+                s.q_goal,
+                finished=s.finished,
+                held=s.phase == "held",
+                reason=s.reason or None,
+            )
+        )
 
     def _descent(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value())
 
     def _trigger(self, context: Context, output: BasicVector) -> None:
-        output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().trigger))
+        output.SetAtIndex(0, float(self.stands(context).trigger))
 
     def _show(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
+        output.set_value(self.stands(context))
 
 
 def _go(s: TabletState, phase: str, q_goal: Array, now: float) -> TabletState:

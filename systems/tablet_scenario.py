@@ -1,43 +1,42 @@
-"""What a tablet scenario YAML may say: the rig on the wrist, the tablet on the table, and how far both are from the drawing."""
+"""What a scenario says of a visit to the tablet: pen and tablet as drawn, and how the hand goes about it."""
 
 import dataclasses as dc
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
-from weldcal.systems.scenario import ErrorConfig, PoseConfig
-from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.systems.drivers.no_device import NoDevice
+
+if TYPE_CHECKING:
+    from weldcal.systems.scenario import Scenario
+
+MOST_LANDMARKS = 100
+STEEPEST_DEG = 45.0  # of a pen that still touches with its tip and not with its side
+_POSITIVE = (
+    *("columns", "rows", "across_mm", "down_mm", "ring_mm", "margin_mm", "px_per_mm"),
+    *("look_distance_mm", "clearance_mm", "descent_mm_s", "deepest_mm"),
+)
 
 
 @dc.dataclass
-class WristRig:
-    """Camera and pen as drawn, in the flange's frame, and by how much the real ones differ."""
+class PenConfig:
+    """The sprung pen of `tool: pen`: where its tip is drawn in the flange's frame, and how far off the real one may be."""
 
-    camera: PoseConfig = dc.field(default_factory=lambda: PoseConfig([0.075, 0.0, 0.030], [0.0, 0.0, 90.0]))
-    camera_error: ErrorConfig = dc.field(default_factory=lambda: ErrorConfig(4.0, 2.0))
-    width: int = 640
-    height: int = 480
-    focal_px: float = 617.7
-    grey_noise: float = 2.0
-    depth_scale: float = 0.985  # the depth camera reads this share of the truth
-    depth_noise_mm: float = 0.8
-    pen_tip_m: list[float] = dc.field(default_factory=lambda: [0.0, -0.022, 0.165])
-    pen_error_mm: float = 3.0
-    pen_radius_mm: float = 0.7
-    pen_stiffness_N_per_m: float = 300.0
+    tip_m: list[float] = dc.field(default_factory=lambda: [0.0, -0.022, 0.165])
+    mounting_mm: float = 3.0  # the true tip differs from the drawn one by this much, drawn from the seed
+    radius_mm: float = 0.7  # of its round tip
+    stiffness_N_per_m: float = 300.0
 
 
 @dc.dataclass
-class TabletOnTable:
-    """The tablet as it is thought to lie (its first landmark, x to the right of the page, y down the page, z into it)."""
+class TabletConfig:
+    """`tablet:` the page as it is thought to lie (first landmark, x to the right, y down the page, z into it), and the visit."""
 
-    pose: PoseConfig = dc.field(default_factory=lambda: PoseConfig([0.60, 0.045, 0.010], [180.0, 0.0, 0.0]))
-    error: ErrorConfig = dc.field(default_factory=lambda: ErrorConfig(4.0, 1.5))
+    xyz_m: list[float] = dc.field(default_factory=lambda: [0.60, 0.045, 0.010])
+    rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, 0.0])
     columns: int = 3
     rows: int = 3
     across_mm: float = 60.0
@@ -45,64 +44,68 @@ class TabletOnTable:
     ring_mm: float = 8.0
     margin_mm: float = 25.0
     px_per_mm: float = 5.256  # of the page: 267 pixels per inch at a display scale of 2
-    touch_noise_px: float = 0.3
-    touch_force_N: float = 0.02  # from here on the tablet feels the pen
-
-
-@dc.dataclass
-class TabletScenario:
-    """One tablet cell."""
-
-    description: str = ""
-    arm: str = "ur10e"
-    robot: SimulatedUr = dc.field(default_factory=SimulatedUr)
-    home_deg: list[float] = dc.field(default_factory=lambda: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
-    rig: WristRig = dc.field(default_factory=WristRig)
-    tablet: TabletOnTable = dc.field(default_factory=TabletOnTable)
+    pen: PenConfig = dc.field(default_factory=PenConfig)
     look_distance_mm: float = 300.0
     clearance_mm: float = 15.0
     descent_mm_s: float = 12.0
     deepest_mm: float = 12.0  # below where the tablet is thought to be: then the touch is given up
     turn_deg: float = 22.5  # of the hand from touch to touch
     tilt_deg: float = 12.0  # of the pen, to all sides in turn; 0: an upright pen
-    maximum_time_s: float = 180.0
+
+    def pose(self) -> RigidTransform:
+        """X_BT as it is thought."""
+        return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
+
+    def landmarks_m(self) -> NDArray[np.float64]:
+        """Landmarks (n, 2) m of the page from its first, row by row."""
+        return 1e-3 * np.array(
+            [[i * self.across_mm, j * self.down_mm] for j in range(self.rows) for i in range(self.columns)]
+        )
 
 
-def landmarks_m(tablet: TabletOnTable) -> NDArray[np.float64]:
-    """Landmarks (n, 2) m of the page from its first, row by row."""
-    return 1e-3 * np.array(
-        [[i * tablet.across_mm, j * tablet.down_mm] for j in range(tablet.rows) for i in range(tablet.columns)]
-    )
-
-
-def load_tablet_scenario(path: Path | None = None, overrides: str = "") -> TabletScenario:
-    """The scenario of a YAML file (None: as it ships), `overrides` a second YAML text on top.
+def check_tablet(scenario: "Scenario") -> None:
+    """Refuse a visit to the tablet that no cell could make; a scenario without one passes.
 
     Raises:
-        InputError: no such file, an unknown key, a wrong type, or numbers that no cell can be built from.
+        InputError: one sentence that says what to change.
     """
-    if path is not None and not path.is_file():
-        raise InputError(f"There is no tablet scenario '{path}'.")
-    scenario = TabletScenario()
-    for text in ("" if path is None else path.read_text(encoding="utf-8"), overrides):
-        if text.strip():
-            try:
-                scenario = yaml_load_typed(schema=TabletScenario, data=text, defaults=scenario)
-            except Exception as error:  # Drake's loader raises several kinds
-                raise InputError(f"The tablet scenario cannot be read: {' '.join(str(error).split())}") from error
-    check_numbers(scenario)
-    if scenario.tablet.columns < 2 or scenario.tablet.rows < 2:
-        raise InputError("The tablet needs at least two columns and two rows of landmarks.")
-    if len(scenario.rig.pen_tip_m) != 3 or len(scenario.home_deg) != 6:
-        raise InputError("rig.pen_tip_m has three numbers and home_deg six.")
-    return scenario
+    tablet = scenario.tablet
+    if tablet is None:
+        if scenario.tool == "pen":
+            raise InputError("A pen touches a tablet: write tablet: {} in the scenario, or another tool.")
+        return
+    if scenario.job.calibrate or scenario.job.weld:
+        raise InputError(
+            "A visit to the tablet has no scanner to calibrate and nothing to weld: run it with weldcal demo or weldcal tablet "
+            "demo, and write job: {calibrate: false, weld: false} in its scenario."
+        )
+    if scenario.tool != "pen":
+        raise InputError(f"A visit to the tablet needs tool: pen in the scenario, not tool: {scenario.tool}.")
+    for name in ("wrist_camera", "digitizer"):
+        if isinstance(getattr(scenario, name), NoDevice):
+            example = "!RenderedWristCamera {}" if name == "wrist_camera" else "!SimulatedTablet {}"
+            raise InputError(f"A visit to the tablet needs a {name}: write {name}: {example} in the scenario.")
+    for name in _POSITIVE:
+        if getattr(tablet, name) <= 0:
+            raise InputError(f"tablet.{name} must be a positive number, not {getattr(tablet, name):g}.")
+    if tablet.columns < 2 or tablet.rows < 2:
+        raise InputError("tablet.columns and tablet.rows must be at least 2: landmarks on one line fix nothing.")
+    if tablet.columns * tablet.rows > MOST_LANDMARKS:
+        raise InputError(f"tablet.columns by tablet.rows are more than {MOST_LANDMARKS} landmarks; a dozen is plenty.")
+    if tablet.ring_mm >= min(tablet.across_mm, tablet.down_mm):
+        raise InputError(
+            "tablet.ring_mm must be smaller than the landmarks' spacing, or the rings run into one another."
+        )
+    if not 0.0 <= tablet.tilt_deg <= STEEPEST_DEG:
+        raise InputError(f"tablet.tilt_deg must be from 0 to {STEEPEST_DEG:g}, and it is {tablet.tilt_deg:g}.")
+    check_pen(tablet.pen)
 
 
-def page_in_base(tablet: TabletOnTable) -> RigidTransform:
-    """X_BT as it is thought."""
-    return tablet.pose.pose()
-
-
-def upright(turn_rad: float, lean_rad: tuple[float, float]) -> RigidTransform:
-    """Orientation of a flange that points down, turned about the vertical and leaning to two sides."""
-    return RigidTransform(RollPitchYaw(np.pi + lean_rad[0], lean_rad[1], turn_rad), [0.0, 0.0, 0.0])
+def check_pen(pen: PenConfig) -> None:
+    """Raise InputError for a pen that cannot be built."""
+    if len(pen.tip_m) != 3:
+        raise InputError(f"tablet.pen.tip_m must hold 3 numbers, not {len(pen.tip_m)}.")
+    if pen.tip_m[2] < 0.03:
+        raise InputError("tablet.pen.tip_m must stand at least 0.03 m before the flange.")
+    if pen.radius_mm <= 0.0 or pen.stiffness_N_per_m <= 0.0 or pen.mounting_mm < 0.0:
+        raise InputError("tablet.pen: radius_mm and stiffness_N_per_m must be positive, mounting_mm not negative.")

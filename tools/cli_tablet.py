@@ -95,32 +95,64 @@ def calibrate(
             printed_sign,
             two_stages,
         )
-        summary = calibrate_tablet(inputs, folder)
+        summary = calibrate_tablet(inputs, folder).summary()
     finish("tablet calibrate", summary, folder, json_wanted=json)
 
 
 @tablet.command("demo")
 def demo(
     scenario: Annotated[
-        Path | None,
-        typer.Option("--scenario", metavar="FILE", help="A tablet scenario YAML.", show_default="as it ships"),
-    ] = None,
+        str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
+    ] = "tablet",
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
     ] = None,
     seed: Annotated[
         int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
     ] = 0,
+    browser: Annotated[bool, typer.Option("--browser", help="Open the live 3D view in the web browser.")] = False,
+    realtime: Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")] = False,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="ROBOT",
+            help="simulated, emulated (a controller on loopback), or the address of a controller.",
+            show_default="the scenario's",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only look at the robot, then run on a simulated arm like it.")
+    ] = False,
+    pace: Annotated[
+        float | None, typer.Option("--pace", metavar="P", help="Emulated controller only: 0.05 to 1 of real time.")
+    ] = None,
+    speed_factor: Annotated[
+        float | None, typer.Option("--speed-factor", metavar="X", help="Make the arm's moves slower: 0.05 to 1.")
+    ] = None,
     record: Annotated[bool, typer.Option("--record", help="Also write recording.html, the run in 3D.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
-    """The whole procedure in simulation: a look, a touch of each landmark by contact, the calibration, against the truth."""
+    """The whole procedure in the station: a look, a touch of each landmark by contact, the calibration, against the truth."""
     from weldcal.tools.cli import finish, fresh_folder
 
-    folder = out or fresh_folder("tablet", "demo", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
+        from weldcal.systems.scenario import load_scenario
+        from weldcal.tools.demo import DemoOptions
         from weldcal.tools.tablet_demo import run_tablet_demo
 
-        summary = run_tablet_demo(scenario, folder, seed, progress, record=record)
-    finish("tablet demo", summary, folder, json_wanted=json)
+        options = DemoOptions(
+            scenario=scenario,
+            out=out or fresh_folder("tablet", scenario, seed),
+            seed=seed,
+            browser=browser and not json,
+            realtime=realtime,
+            robot=robot,
+            dry_run=dry_run,
+            pace=pace,
+            speed_factor=speed_factor,
+            recording=record,
+        )
+        result = run_tablet_demo(load_scenario(scenario), options, progress)
+    finish("tablet demo", result.summary(), result.folder, json_wanted=json)

@@ -19,6 +19,8 @@ from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.calibration.tablet.two_stage import AFFINE_NAMES, Sign
 from weldcal.calibration.tablet.wrist import WristFit, fit_wrist
 from weldcal.models.errors import InputError
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.tablet_report import Shown, calibration_report, marked_picture
 
 _SCALE_SIGMAS = 3.0  # a free scale farther from 1 than this, and than a quarter of a percent, is told
 _SCALE_LEAST = 2.5e-3
@@ -41,8 +43,39 @@ class TabletInputs:
     two_stages: bool = False
 
 
-def calibrate_tablet(inputs: TabletInputs, folder: Path) -> dict[str, object]:
-    """Calibrate from the files, write the result folder and return the summary for JSON.
+@dataclass(frozen=True, eq=False)
+class TabletCalibration:
+    """The result, what its report draws, the fit with full poses where it is one, and how long the work took."""
+
+    result: TabletResult
+    shown: Shown
+    wrist: WristFit | None
+    seconds: float
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `tablet calibrate`."""
+        result = self.result
+        stages = result.two_stages or {}
+        left_out = [v for v in result.leave_one_out_mm if v is not None]
+        return {
+            "state": "done",
+            "model": result.model,
+            "n_landmarks": len(self.shown.names),
+            "F1": stages.get("F1"),
+            "F2": stages.get("F2"),
+            "parameters": result.parameters,
+            "leave_one_out_mm": float(np.mean(left_out)) if left_out else None,
+            "leave_one_out_of_other_models_mm": result.other_models,
+            "X_FC": result.X_FC,
+            "p_FP_mm": None if result.p_FP_m is None else [1e3 * v for v in result.p_FP_m],
+            "warnings": result.warnings,
+            "unobservable": result.unobservable,
+            "seconds": self.seconds,
+        }
+
+
+def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration:
+    """Calibrate from the files and write the result folder, its report included.
 
     Raises InputError and its kin: one sentence that says what to change; nothing is written then.
     """
@@ -53,28 +86,14 @@ def calibrate_tablet(inputs: TabletInputs, folder: Path) -> dict[str, object]:
             f"'{inputs.file.name}' is neither .csv nor .npz: give the page's CSV, or an npz of planar touches."
         )
     start = time.perf_counter()
-    result = _planar(inputs) if inputs.file.suffix == ".npz" else _wrist(inputs)
+    result, shown, fit = _planar(inputs) if inputs.file.suffix == ".npz" else _wrist(inputs)
     seconds = time.perf_counter() - start
     save_tablet_result(result, folder)
-    stages = result.two_stages or {}
-    left_out = [v for v in result.leave_one_out_mm if v is not None]
-    return {
-        "state": "done",
-        "model": result.model,
-        "F1": stages.get("F1"),
-        "F2": stages.get("F2"),
-        "parameters": result.parameters,
-        "leave_one_out_mm": float(np.mean(left_out)) if left_out else None,
-        "leave_one_out_of_other_models_mm": result.other_models,
-        "X_FC": result.X_FC,
-        "p_FP_mm": None if result.p_FP_m is None else [1e3 * v for v in result.p_FP_m],
-        "warnings": result.warnings,
-        "unobservable": result.unobservable,
-        "seconds": seconds,
-    }
+    write_atomic(folder / "report.html", calibration_report(result, shown, seconds))
+    return TabletCalibration(result, shown, fit, seconds)
 
 
-def _planar(inputs: TabletInputs) -> TabletResult:
+def _planar(inputs: TabletInputs) -> tuple[TabletResult, Shown, None]:
     if any(path is not None for path in (inputs.poses, inputs.camera, inputs.image, inputs.seen)):
         raise InputError(
             "An npz file holds everything: leave --poses, --camera, --image and --seen out, or give the CSV."
@@ -97,7 +116,8 @@ def _planar(inputs: TabletInputs) -> TabletResult:
             "page's size with a card, or the tablet's pixels per inch."
         )
     fit, names = (planar, PLANAR_NAMES) if best == "pnp" else (linear, LINEAR_NAMES)
-    return TabletResult(
+    shown = Shown(touches.landmark_m, fit.residuals_m, tuple(str(k) for k in range(len(touches.uv_px))))
+    result = TabletResult(
         model=best,
         parameters=dict(zip(names, fit.parameters.tolist(), strict=True)),
         covariance=fit.covariance.tolist(),
@@ -108,6 +128,7 @@ def _planar(inputs: TabletInputs) -> TabletResult:
         warnings=tuple(warnings),
         data_sha256={inputs.file.name: file_hash(inputs.file)},
     )
+    return result, shown, None
 
 
 def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
@@ -122,7 +143,7 @@ def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
     }
 
 
-def _wrist(inputs: TabletInputs) -> TabletResult:
+def _wrist(inputs: TabletInputs) -> tuple[TabletResult, Shown, WristFit]:
     if inputs.poses is None or inputs.camera is None:
         raise InputError(
             "Touches in a CSV need the robot's poses (--poses FILE) and the camera's numbers (--camera FILE)."
@@ -148,7 +169,10 @@ def _wrist(inputs: TabletInputs) -> TabletResult:
         if visit.size_checked
         else ("The page's size was not checked with a card: lengths may be wrong by percents.",)
     )
-    return TabletResult(
+    in_page = fit.touch_residuals_m @ fit.X_BT.rotation().matrix()[:, :2]
+    picture = None if visit.picture is None else marked_picture(visit.picture, visit.found_px)
+    shown = Shown(visit.data.landmark_m, in_page, visit.names, picture)
+    result = TabletResult(
         model="wrist",
         parameters=_wrist_parameters(fit),
         covariance=fit.covariance.tolist(),
@@ -162,6 +186,7 @@ def _wrist(inputs: TabletInputs) -> TabletResult:
         warnings=checked,
         data_sha256={path.name: file_hash(path) for path in files if path is not None},
     )
+    return result, shown, fit
 
 
 def _wrist_parameters(fit: WristFit) -> dict[str, float]:

@@ -1,86 +1,131 @@
-"""weldcal tablet demo: the whole procedure in simulation, as files that weldcal tablet calibrate reads, held against the truth."""
+"""A visit to the tablet in a scenario: run, files that weldcal tablet calibrate reads, the calibration, held against the truth."""
 
 from __future__ import annotations
 
-import csv
-import io
 import time
-from collections.abc import Mapping, Sequence
+import webbrowser
+from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.yaml import yaml_dump
 from pydrake.geometry import Meshcat, MeshcatParams
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
-from weldcal.calibration.tablet.wrist import WristFit, fit_wrist, seen_point
+from weldcal.calibration.tablet.wrist import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.tablet_cell import TabletCell, TabletVisit, make_tablet_cell, run_tablet_cell, wrist_touches
-from weldcal.systems.tablet_scenario import landmarks_m, load_tablet_scenario
+from weldcal.systems.scenario import Scenario, check_scenario
+from weldcal.systems.tablet_cell import TabletCell, TabletVisit, make_tablet_cell
 from weldcal.tools.console import Progress
+from weldcal.tools.demo import DemoOptions
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.tablet_calibrate import TabletInputs, calibrate_tablet
+from weldcal.tools.robots import chosen_robot
+from weldcal.tools.tablet_calibrate import TabletCalibration, TabletInputs, calibrate_tablet
+from weldcal.tools.tablet_files import write_visit
+from weldcal.tools.tablet_report import visit_report
+from weldcal.tools.tablet_run import run_visit
 
 Array = NDArray[np.float64]
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
 
 
-def run_tablet_demo(
-    scenario: Path | None, folder: Path, seed: int, progress: Progress, *, record: bool = False
-) -> dict[str, object]:
-    """Run the cell, write its files and the calibration from them; returns the summary for JSON.
+@dataclass(frozen=True, eq=False)
+class TabletDemo:
+    """What a visit came to; `found` are the figures of its JSON object."""
 
-    ``record`` also writes recording.html, the run in 3D.
+    options: DemoOptions
+    cell: TabletCell
+    visit: TabletVisit
+    robot: str
+    found: dict[str, object] = field(default_factory=dict)
+    calibration: TabletCalibration | None = None
 
-    Raises InputError (the scenario), LandmarksNotFound (the picture); a procedure that was held is a summary too.
-    """
-    start = time.monotonic()
-    progress("build", 0.0)
-    meshcat = Meshcat(MeshcatParams(host="localhost", port=None)) if record else None
-    cell = make_tablet_cell(load_tablet_scenario(scenario), seed, meshcat)
-    progress("look and touch", 0.1)
-    visit = run_tablet_cell(cell, meshcat)
-    if meshcat is not None:
-        write_atomic(folder / "recording.html", meshcat.StaticHtml())
-    if visit.state.phase != "done":
-        reason = visit.state.reason or "The procedure did not end in time; allow more with maximum_time_s."
-        return {
-            "state": "held",
-            "reason": reason,
-            "n_touches": len(visit.state.touches),
-            "simulated_seconds": visit.seconds,
+    @property
+    def folder(self) -> Path:
+        """Where everything was written."""
+        return self.options.out
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `tablet demo`."""
+        said: dict[str, object] = {
+            "state": "done" if self.visit.done else "held",
+            "scenario": self.options.scenario,
+            "seed": self.options.seed,
+            "robot": self.robot,
         }
-    progress("calibrate", 0.95)
+        if self.visit.reason:
+            said["reason"] = self.visit.reason
+        seconds = {
+            "simulated_seconds": self.visit.seconds,
+            "wall_seconds": self.visit.wall_seconds,
+            "real_time_factor": self.visit.seconds / max(self.visit.wall_seconds, 1e-9),
+        }
+        return {**said, "n_touches": len(self.visit.state.touches), **self.found, **seconds}
+
+
+def run_tablet_demo(scenario: Scenario, options: DemoOptions, progress: Progress) -> TabletDemo:
+    """Run the visit, write its files, the calibration from them and a report.
+
+    Raises:
+        InputError, RobotRefused: the scenario or the options cannot be done; nothing has been written or moved.
+        LandmarksNotFound: the picture does not show the page. A visit that was held is a result too.
+    """
+    if options.speed_factor is not None:
+        scenario.job.speed_factor = options.speed_factor
+        check_scenario(scenario)
+    progress("build the cell", 0.0)
+    meshcat = None
+    with chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot:
+        if options.recording or options.browser:
+            meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
+        cell = make_tablet_cell(scenario, options.seed, meshcat, robot.prepared)
+        with closing(cell.station):
+            if meshcat is not None:
+                set_the_scene(meshcat, cell)
+                if options.browser:
+                    webbrowser.open(meshcat.web_url())
+                    time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
+            visit = run_visit(cell, progress, meshcat, options.realtime)
+    progress("calibrate and write", 0.96)
+    options.out.mkdir(parents=True, exist_ok=True)
+    demo = TabletDemo(options, cell, visit, robot.title)
+    if visit.done:
+        calibration, found = calibrate_visit(cell, visit, options)
+        demo = TabletDemo(options, cell, visit, robot.title, found, calibration)
+    if meshcat is not None:
+        write_atomic(options.out / "recording.html", meshcat.StaticHtml())
+    done = demo.calibration
+    result, shown = (None, None) if done is None else (done.result, done.shown)
+    page = visit_report(cell, visit, demo.summary(), result, shown, recording=meshcat is not None)
+    write_atomic(options.out / "report.html", page)
+    return demo
+
+
+def calibrate_visit(
+    cell: TabletCell, visit: TabletVisit, options: DemoOptions
+) -> tuple[TabletCalibration, dict[str, object]]:
+    """Write the visit's files, calibrate from them as `weldcal tablet calibrate` does, and hold it against the truth."""
+    folder, tablet = options.out, cell.tablet
     write_visit(cell, visit, folder)
-    pen_radius = 1e-3 * cell.scenario.rig.pen_radius_mm
-    found = calibrate_tablet(
+    done = calibrate_tablet(
         TabletInputs(
             folder / "touches.csv",
             folder / "poses.csv",
             folder / "camera.yaml",
             folder / "picture.png",
-            pen_radius_m=pen_radius,
+            pen_radius_m=1e-3 * tablet.pen.radius_mm,
         ),
         folder,
     )
-    tablet = cell.scenario.tablet
+    if done.wrist is None:
+        raise RuntimeError("the files of a visit hold full poses")
     uv = find_landmarks(visit.picture.grey, tablet.columns, tablet.rows)
-    fit = fit_wrist(wrist_touches(cell, visit, uv), leave_one_out=False)
-    return {
-        "state": "done",
-        "n_touches": len(visit.state.touches),
-        **compare(cell, visit, fit, seed),
-        **depth_error(cell, visit, uv),
-        "leave_one_out_mm": found["leave_one_out_mm"],
-        "parameters": found["parameters"],
-        "unobservable": found["unobservable"],
-        "simulated_seconds": visit.seconds,
-        "wall_seconds": time.monotonic() - start,
-    }
+    told, summary = ("leave_one_out_mm", "parameters", "X_FC", "p_FP_mm", "unobservable", "warnings"), done.summary()
+    compared = {**compare(cell, visit, done.wrist, options.seed), **depth_error(cell, visit, uv)}
+    return done, {**compared, **{key: summary[key] for key in told}}
 
 
 def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> dict[str, object]:
@@ -90,8 +135,8 @@ def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> d
     fit puts the pen on it, in any turn; what counts is where the true pen then is, in the tablet's plane.
     """
     truth, rng = cell.truth, np.random.default_rng([seed, 1])
-    X_BF = forward_kinematics(cell.arm, visit.state.q_look)
-    points = rng.uniform([0.0, 0.0], landmarks_m(cell.scenario.tablet).max(axis=0), (UNSEEN, 2))
+    X_BF = forward_kinematics(cell.station.arm, visit.state.q_look)
+    points = rng.uniform([0.0, 0.0], cell.tablet.landmarks_m().max(axis=0), (UNSEEN, 2))
     R_T = truth.X_BT.rotation().matrix()[:, :2]
     misses = []
     for p in points:
@@ -113,10 +158,10 @@ def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> d
 
 def depth_error(cell: TabletCell, visit: TabletVisit, uv: Array) -> dict[str, object]:
     """Depth of the landmarks off the truth, scale apart: by the tablet's plane, and by each landmark's own pixel (rms)."""
-    K, truth = cell.camera_matrix, cell.truth
-    X_CT = (forward_kinematics(cell.arm, visit.state.q_look) @ truth.X_FC).inverse() @ truth.X_BT
-    page = landmarks_m(cell.scenario.tablet)
-    true = cell.scenario.rig.depth_scale * X_CT.multiply(np.c_[page, np.zeros(len(page))].T)[2]
+    K, truth = cell.camera.camera_matrix(), cell.truth
+    X_CT = (forward_kinematics(cell.station.arm, visit.state.q_look) @ truth.X_FC).inverse() @ truth.X_BT
+    page = cell.tablet.landmarks_m()
+    true = cell.camera.depth_scale * X_CT.multiply(np.c_[page, np.zeros(len(page))].T)[2]
     by_plane = plane_depth(visit.picture.depth_m, uv, K[[0, 1], [0, 1]], K[:2, 2])
     u, v = np.round(uv).astype(int).T
     by_pixel = visit.picture.depth_m[v, u]
@@ -126,44 +171,11 @@ def depth_error(cell: TabletCell, visit: TabletVisit, uv: Array) -> dict[str, ob
     }
 
 
-def write_visit(cell: TabletCell, visit: TabletVisit, folder: Path) -> None:
-    """Write touches.csv as the page does, poses.csv, camera.yaml and picture.png."""
-    tablet, state = cell.scenario.tablet, visit.state
-    shown = 1e3 * tablet.px_per_mm * landmarks_m(tablet)
-    touches = [
-        {
-            "landmark": t.landmark,
-            "landmark_x_px": f"{shown[t.landmark, 0]:.4f}",
-            "landmark_y_px": f"{shown[t.landmark, 1]:.4f}",
-            "touch_x_px": f"{t.position_px[0]:.1f}",
-            "touch_y_px": f"{t.position_px[1]:.1f}",
-            "mm_per_px": f"{1.0 / tablet.px_per_mm:.9f}",
-            "size_checked": 1,
-            "pointer": "pen",
-        }
-        for t in state.touches
-    ]
-    poses = [_pose_row(str(t.landmark), forward_kinematics(cell.arm, t.q)) for t in state.touches]
-    poses.append(_pose_row("camera", forward_kinematics(cell.arm, state.q_look)))
-    K = cell.camera_matrix
-    intrinsics = {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
-    write_atomic(folder / "touches.csv", _csv(touches))
-    write_atomic(folder / "poses.csv", _csv(poses))
-    write_atomic(folder / "camera.yaml", yaml_dump(intrinsics))
-    write_atomic(folder / "picture.png", cv2.imencode(".png", visit.picture.grey)[1].tobytes())
-
-
-def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:
-    values = (*X.translation(), *X.rotation().ToQuaternion().wxyz())
-    return {
-        "landmark": name,
-        **{c: f"{v:.9f}" for c, v in zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True)},
-    }
-
-
-def _csv(rows: Sequence[Mapping[str, object]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
+def set_the_scene(meshcat: Meshcat, cell: TabletCell) -> None:
+    """A calm background and a viewer who stands in front of the tablet."""
+    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
+    meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
+    meshcat.SetProperty("/Grid", "visible", False)
+    meshcat.SetProperty("/Axes", "visible", False)
+    middle = cell.tablet.pose().multiply(np.r_[0.5 * cell.tablet.landmarks_m().max(axis=0), 0.0])
+    meshcat.SetCameraPose(middle + np.array([0.55, -0.35, 0.45]), middle + np.array([0.0, 0.0, 0.08]))

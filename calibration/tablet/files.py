@@ -57,10 +57,14 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class WristVisit:
-    """Touches for fit_wrist and whether a card had checked the page's size."""
+    """Touches for fit_wrist, whether a card had checked the page's size, the landmarks' names, and the image (h, w) with where
+    all landmarks of the page were found in it (n, 2) px, where there is one."""
 
     data: WristTouches
     size_checked: bool
+    names: tuple[str, ...]
+    picture: NDArray[np.uint8] | None
+    found_px: Array
 
 
 def file_hash(path: Path) -> str:
@@ -150,6 +154,7 @@ def load_visit(
     landmark = scale * np.array([[number[k]["landmark_x_px"], number[k]["landmark_y_px"]] for k in used])
     touched = scale * np.array([[number[k]["touch_x_px"], number[k]["touch_y_px"]] for k in used])
     intrinsics = load_intrinsics(camera)
+    picture, found = None, np.zeros((0, 2))
     if seen is not None:
         positions = {int(float(r["landmark"])): r for r in _table(seen, SEEN_COLUMNS)}
         missing = [k for k in used if k not in positions]
@@ -157,7 +162,8 @@ def load_visit(
             raise TabletDataError(f"'{seen.name}' lacks landmark {missing[0]}.")
         uv = np.array([[_number(positions[k][c], seen, c) for c in ("u", "v")] for k in used])
     elif image is not None:
-        uv = _in_image(image, number, look)[used]
+        picture, found = _in_image(image, number, look)
+        uv = found[used]
     else:
         raise TabletDataError("Give the camera's image (--image) or where the landmarks are in it (--seen).")
     corner = landmark.min(axis=0)
@@ -169,11 +175,12 @@ def load_visit(
         focal_px=float(intrinsics.focal_px.mean()),
         tip_radius_m=tip_radius_m,
     )
-    return WristVisit(data, all(rows[k].get("size_checked", "1").strip() != "0" for k in used))
+    checked = all(rows[k].get("size_checked", "1").strip() != "0" for k in used)
+    return WristVisit(data, checked, tuple(str(k) for k in used), picture, found)
 
 
-def _in_image(path: Path, number: Mapping[int, Mapping[str, float]], look: Look) -> Array:
-    """Positions (n, 2) of all landmarks of the page, whose columns and rows their coordinates tell."""
+def _in_image(path: Path, number: Mapping[int, Mapping[str, float]], look: Look) -> tuple[NDArray[np.uint8], Array]:
+    """The image (h, w) and positions (n, 2) of all landmarks of the page, whose columns and rows their coordinates tell."""
     picture = cv2.imread(str(_there(path)), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise TabletDataError(f"'{path.name}' is no image that can be read.")
@@ -181,7 +188,8 @@ def _in_image(path: Path, number: Mapping[int, Mapping[str, float]], look: Look)
     rows = len({round(n["landmark_y_px"], 1) for n in number.values()})
     if columns * rows != len(number) or set(number) != set(range(len(number))):
         raise TabletDataError("The landmarks touched are not the page's whole grid; touch all, or give --seen.")
-    return find_landmarks(np.asarray(picture, dtype=np.uint8), columns, rows, look)
+    grey = np.asarray(picture, dtype=np.uint8)
+    return grey, find_landmarks(grey, columns, rows, look)
 
 
 def _flange_pose(row: Mapping[str, str], path: Path) -> RigidTransform:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -81,6 +83,13 @@ class SimulatedWorld(Message):
     tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
     finger_view: PictureScene | None
+
+
+class Fittings(Protocol):
+    """What else a scenario puts into the world: bodies on the flange and on the table."""
+
+    def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
+        """Add them before the plant is finalised; returns the model instance whose springs are to rest at zero."""
 
 
 def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
@@ -232,6 +241,7 @@ def build_world(
     table_z_m: float,
     workpiece: Workpiece | None,
     X_BP: RigidTransform | None,
+    fittings: Sequence[Fittings] = (),
     time_step_s: float = 0.002,
 ) -> SimulatedWorld:
     """Build the plant with everything the station needs; the arm stands at `q_start` and hangs in its implicit joint servos.
@@ -261,6 +271,7 @@ def build_world(
         plant.RegisterCollisionGeometry(
             world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
         )
+    fitted = [fitting.add(plant, instance) for fitting in fittings]
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
         servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
@@ -269,11 +280,15 @@ def build_world(
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):
         raise RuntimeError("the six joint servos of the arm are not in place")
     plant.SetDefaultPositions(instance, q_start)
-    compensate_gravity(builder, plant, [m for m in (instance, tool_instance) if m is not None])
+    compensate_gravity(builder, plant, [m for m in (instance, tool_instance, *fitted) if m is not None])
     if tool_instance is not None:
         rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
         rest.set_name("tip_at_rest")
         builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(tool_instance))
+    for k, model in enumerate(fitted):
+        still = builder.AddSystem(ConstantVectorSource(np.zeros(2 * plant.num_actuated_dofs(model))))
+        still.set_name(f"fittings_at_rest_{k}")
+        builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(model))
     scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
     finger_view = None
     if tool_instance is not None:

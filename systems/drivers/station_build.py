@@ -13,6 +13,7 @@ from weldcal.models.tool import WeldingTool
 
 if TYPE_CHECKING:
     from weldcal.systems.drivers.simulated_world import SimulatedWorld
+    from weldcal.systems.drivers.tablet_world import TabletFittings
 
 
 class Closable(Protocol):
@@ -52,6 +53,7 @@ class StationBuild:
     rng: np.random.Generator
     world: SimulatedWorld | None = None
     robot: PreparedRobot | None = None
+    visit: TabletFittings | None = None  # camera, pen and tablet as they truly are, where there is a tablet
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
 

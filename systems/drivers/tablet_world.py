@@ -1,89 +1,103 @@
-"""The simulated world of the tablet cell: an arm with camera and sprung pen, and a tablet that lies not quite where it is thought."""
+"""What a visit to the tablet adds to the simulated world: plate, camera body and sprung pen on the flange, a tablet on the table."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
     AddContactMaterial,
+    AddRigidHydroelasticProperties,
     Box,
     Cylinder,
-    GeometryId,
     GeometryInstance,
     IllustrationProperties,
     PerceptionProperties,
     ProximityProperties,
+    Shape,
     Sphere,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.parsing import Parser
-from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlantConfig
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
-    JointActuatorIndex,
+    ModelInstanceIndex,
     PdControllerGains,
     PrismaticJoint,
+    RigidBody,
     SpatialInertia,
     UnitInertia,
 )
-from pydrake.systems.framework import DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource
 
-from weldcal.models.arms.kinematics import ArmModel
-from weldcal.models.arms.urdf import arm_urdf
-from weldcal.systems.drivers.picture_scene import add_picture_scene
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
-from weldcal.systems.drivers.simulated_world import (
-    DARK,
-    JOINT_DAMPING,
-    JOINT_STIFFNESS,
-    STEEL,
-    TABLE,
-    SimulatedWorld,
-    compensate_gravity,
-)
-from weldcal.systems.messages import Message
-from weldcal.systems.tablet_scenario import TabletOnTable, TabletScenario, landmarks_m
+from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
+from weldcal.systems.drivers.simulated_tablet import GLASS, NIB, SimulatedTablet
+from weldcal.systems.drivers.simulated_world import DARK, STEEL
+from weldcal.systems.tablet_messages import TabletTruth
+from weldcal.systems.tablet_scenario import TabletConfig
 from weldcal.systems.textured_board import textured_board
 
-WRIST_RENDERER = "wrist"
+if TYPE_CHECKING:
+    from weldcal.systems.scenario import Scenario
+
 _TEXELS_PER_MM = 8
 _PEN_MASS_KG = 0.02
 _PEN_DAMPING = 3.0  # N s / m
+_PEN_MODULUS_PA = 1e7  # of the soft nib
+_PEN_FRICTION = 0.1
+_NIB_FACETS = 8.0  # edges of the contact model's nib per radius: the touched point is a centroid of its facets
 _HOLE = 0.62  # of a ring's radius, as the page draws it
+_FRAME_M, _THICK_M = 0.010, 0.008  # the tablet's frame around the page, and how thick the tablet is
+_CAMERA_BOX = Box(0.09, 0.024, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
-class TabletTruth(Message):
-    """What only the simulation knows: camera and pen tip (at rest) on the flange, tablet in the base."""
+class TabletFittings:
+    """What `build_world` is to add, standing where it truly stands."""
 
-    X_FC: RigidTransform
-    p_FP: NDArray[np.float64]
-    X_BT: RigidTransform
+    tablet: TabletConfig
+    truth: TabletTruth
+
+    def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
+        """Add everything before the plant is finalised; returns the model instance of what the flange carries."""
+        _add_tablet(plant, self.tablet, self.truth.X_BT)
+        return _add_rig(plant, arm, self.tablet, self.truth)
 
 
-def draw_truth(scenario: TabletScenario, rng: np.random.Generator) -> TabletTruth:
-    """How the real rig differs from the drawing, from the seed; the tablet lies flat but for its error in place and turn."""
-    camera, c = scenario.rig.camera.pose(), scenario.rig.camera_error
-    off = random_pose_error(rng, 1e-3 * c.translation_mm, np.deg2rad(c.rotation_deg))
-    X_FC = RigidTransform(camera.rotation() @ off.rotation(), camera.translation() + off.translation())
+def tablet_fittings(scenario: Scenario, rng: np.random.Generator) -> TabletFittings | None:
+    """How camera, pen and tablet really are, from the seed; None where the scenario has no tablet.
+
+    What a device's driver does not simulate stands as drawn. The tablet lies flat but for its error in place and turn.
+    """
+    tablet = scenario.tablet
+    if tablet is None:
+        return None
+    camera, page = scenario.wrist_camera, scenario.digitizer
+    X_FC, X_BT = RigidTransform(), tablet.pose()
+    if isinstance(camera, RenderedWristCamera):
+        off = random_pose_error(rng, 1e-3 * camera.mounting_translation_mm, np.deg2rad(camera.mounting_rotation_deg))
+        drawn = camera.nominal()
+        X_FC = RigidTransform(drawn.rotation() @ off.rotation(), drawn.translation() + off.translation())
     direction = rng.normal(size=3)
-    p_FP = np.array(scenario.rig.pen_tip_m) + 1e-3 * scenario.rig.pen_error_mm * direction / np.linalg.norm(direction)
-    t = scenario.tablet.error
-    moved = random_pose_error(rng, 1e-3 * t.translation_mm, np.deg2rad(t.rotation_deg))
-    return TabletTruth(X_FC, p_FP, scenario.tablet.pose.pose() @ moved)
+    p_FP = np.array(tablet.pen.tip_m) + 1e-3 * tablet.pen.mounting_mm * direction / np.linalg.norm(direction)
+    if isinstance(page, SimulatedTablet):
+        X_BT = X_BT @ random_pose_error(
+            rng, 1e-3 * page.placement_translation_mm, np.deg2rad(page.placement_rotation_deg)
+        )
+    return TabletFittings(tablet, TabletTruth(X_FC, p_FP, X_BT))
 
 
-def page_picture(tablet: TabletOnTable) -> NDArray[np.uint8]:
+def page_picture(tablet: TabletConfig) -> NDArray[np.uint8]:
     """The screen as the page draws it (h, w), its first landmark `margin_mm` from the upper left."""
-    size = 1e3 * landmarks_m(tablet).max(axis=0) + 2.0 * tablet.margin_mm
+    size = 1e3 * tablet.landmarks_m().max(axis=0) + 2.0 * tablet.margin_mm
     w, h = (round(v * _TEXELS_PER_MM) for v in size)
     screen = np.full((h, w), 235, dtype=np.uint8)
     fine = 4  # fractional bits of OpenCV's centres and radii
-    for k, p in enumerate(1e3 * landmarks_m(tablet) + tablet.margin_mm):
+    for k, p in enumerate(1e3 * tablet.landmarks_m() + tablet.margin_mm):
         x, y = (round((v * _TEXELS_PER_MM - 0.5) * 2**fine) for v in p)
         radius = 0.5 * tablet.ring_mm * _TEXELS_PER_MM * 2**fine
         cv2.circle(screen, (x, y), round(radius), 15, -1, cv2.LINE_AA, fine)
@@ -92,76 +106,61 @@ def page_picture(tablet: TabletOnTable) -> NDArray[np.uint8]:
     return screen
 
 
-@dataclass(frozen=True, eq=False)
-class TabletWorld:
-    """The plant's handles, and the two geometries that touch."""
-
-    world: SimulatedWorld
-    glass: GeometryId
-    nib: GeometryId
+def _show(
+    plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]
+) -> None:
+    plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
 
 
-def build_tablet_world(
-    builder: DiagramBuilder, arm: ArmModel, scenario: TabletScenario, truth: TabletTruth, time_step_s: float = 0.004
-) -> TabletWorld:
-    """Build arm, rig, table and tablet. Frame: the world is the base B. The pen gives way along z_F against its spring."""
-    plant, scene_graph = AddMultibodyPlant(
-        MultibodyPlantConfig(time_step=time_step_s, contact_model="point", discrete_contact_approximation="lagged"),
-        builder,
-    )
-    (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
-    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
-    flange = plant.GetBodyByName("flange", instance)
-    rig = plant.AddModelInstance("rig")
+def _contact() -> ProximityProperties:
+    touching = ProximityProperties()
+    friction = CoulombFriction(_PEN_FRICTION, _PEN_FRICTION)
+    AddContactMaterial(dissipation=1.0, friction=friction, properties=touching)
+    return touching
+
+
+def _add_rig(
+    plant: MultibodyPlant, arm: ModelInstanceIndex, tablet: TabletConfig, truth: TabletTruth
+) -> ModelInstanceIndex:
+    """Plate and camera welded to the flange; the pen gives way along z_F against its spring."""
+    pen = tablet.pen
+    rig = plant.AddModelInstance("pen_rig")
     inertia = SpatialInertia(0.4, np.zeros(3), UnitInertia.SolidBox(0.14, 0.07, 0.03))
     plate = plant.AddRigidBody("rig_plate", rig, inertia)
-    plant.WeldFrames(flange.body_frame(), plate.body_frame())
-
-    def show(body: object, X: RigidTransform, shape: object, name: str, rgba: tuple[float, ...]) -> None:
-        plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
-
-    show(plate, RigidTransform([0.03, 0.0, 0.006]), Box(0.14, 0.07, 0.012), "plate", DARK)
-    show(plate, truth.X_FC @ RigidTransform([0.0, 0.0, -0.016]), Box(0.09, 0.024, 0.02), "camera", STEEL)
+    plant.WeldFrames(plant.GetFrameByName("flange", arm), plate.body_frame())
+    _show(plant, plate, RigidTransform([0.03, 0.0, 0.006]), Box(0.14, 0.07, 0.012), "rig_plate", DARK)
+    _show(plant, plate, truth.X_FC @ RigidTransform([0.0, 0.0, -0.016]), _CAMERA_BOX, "wrist_camera_body", STEEL)
     X_FP = RigidTransform(truth.p_FP)
-    offset = plant.AddFrame(FixedOffsetFrame("pen_rest", plate.body_frame(), X_FP, rig))
-    pen = plant.AddRigidBody("pen", rig, SpatialInertia(_PEN_MASS_KG, np.zeros(3), UnitInertia.SolidSphere(0.02)))
-    joint = plant.AddJoint(PrismaticJoint("pen", offset, pen.body_frame(), [0.0, 0.0, 1.0], -0.012, 0.0005, 0.0))
+    rest = plant.AddFrame(FixedOffsetFrame("pen_rest", plate.body_frame(), X_FP, rig))
+    nib = plant.AddRigidBody("pen", rig, SpatialInertia(_PEN_MASS_KG, np.zeros(3), UnitInertia.SolidSphere(0.02)))
+    joint = plant.AddJoint(PrismaticJoint("pen", rest, nib.body_frame(), [0.0, 0.0, 1.0], -0.012, 0.0005, 0.0))
     spring = plant.AddJointActuator("pen", joint)
-    spring.set_controller_gains(PdControllerGains(p=scenario.rig.pen_stiffness_N_per_m, d=_PEN_DAMPING))
-    radius, length = 1e-3 * scenario.rig.pen_radius_mm, float(truth.p_FP[2]) - 0.012
-    show(pen, RigidTransform([0.0, 0.0, -0.5 * length - 0.004]), Cylinder(0.0045, length - 0.008), "pen_body", DARK)
-    show(pen, RigidTransform([0.0, 0.0, -0.002]), Cylinder(radius, 0.004), "nib", STEEL)
-    touching = ProximityProperties()
-    AddContactMaterial(dissipation=1.0, friction=CoulombFriction(0.1, 0.1), properties=touching)
-    nib = plant.RegisterCollisionGeometry(pen, RigidTransform(), Sphere(radius), "nib_contact", touching)
+    spring.set_controller_gains(PdControllerGains(p=pen.stiffness_N_per_m, d=_PEN_DAMPING))
+    radius, length = 1e-3 * pen.radius_mm, float(truth.p_FP[2]) - 0.012
+    _show(plant, nib, RigidTransform([0.0, 0.0, -0.5 * length - 0.004]), Cylinder(0.0045, length - 0.008), "pen", DARK)
+    _show(plant, nib, RigidTransform([0.0, 0.0, -0.002]), Cylinder(radius, 0.004), "nib_body", STEEL)
+    soft = _contact()
+    AddCompliantHydroelasticProperties(
+        resolution_hint=radius / _NIB_FACETS, hydroelastic_modulus=_PEN_MODULUS_PA, properties=soft
+    )
+    plant.RegisterCollisionGeometry(nib, RigidTransform(), Sphere(radius), NIB, soft)
+    return rig
 
+
+def _add_tablet(plant: MultibodyPlant, tablet: TabletConfig, X_BT: RigidTransform) -> None:
+    """The tablet with its page, that cameras see, and its glass, that the pen meets; frame: the world is the base B."""
     ground = plant.world_body()
-    tablet = scenario.tablet
-    size = landmarks_m(tablet).max(axis=0) + 2e-3 * tablet.margin_mm
-    middle = truth.X_BT @ RigidTransform(np.r_[0.5 * landmarks_m(tablet).max(axis=0), 0.0])
-    show(ground, RigidTransform([0.45, 0.0, -0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
-    show(
-        ground, middle @ RigidTransform([0.0, 0.0, 0.0045]), Box(size[0] + 0.02, size[1] + 0.02, 0.008), "tablet", DARK
-    )
+    far = tablet.landmarks_m().max(axis=0)
+    width, height = far + 2e-3 * tablet.margin_mm
+    middle = X_BT @ RigidTransform(np.r_[0.5 * far, 0.0])
+    slab = Box(width + 2.0 * _FRAME_M, height + 2.0 * _FRAME_M, _THICK_M)
+    _show(plant, ground, middle @ RigidTransform([0.0, 0.0, 0.5 * _THICK_M + 0.0005]), slab, "tablet", DARK)
     facing = RotationMatrix.MakeXRotation(np.pi)  # the board looks along its z, the tablet's z goes into it
-    board = GeometryInstance(
-        middle @ RigidTransform(facing),
-        textured_board("page", float(size[0]), float(size[1]), page_picture(tablet)),
-        "page",
-    )
-    board.set_perception_properties(PerceptionProperties())
-    board.set_illustration_properties(IllustrationProperties())
-    plant.RegisterVisualGeometry(ground, board)
-    slab = Box(size[0] + 0.02, size[1] + 0.02, 0.008)
-    glass = plant.RegisterCollisionGeometry(ground, middle @ RigidTransform([0.0, 0.0, 0.004]), slab, "glass", touching)
-    for k in range(6):  # by index: the indices of one model instance are not known before Finalize
-        servo = plant.get_joint_actuator(JointActuatorIndex(k))
-        servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
-    plant.Finalize()
-    plant.SetDefaultPositions(instance, np.deg2rad(scenario.home_deg))
-    compensate_gravity(builder, plant, [instance, rig])
-    rest = builder.AddSystem(ConstantVectorSource(np.zeros(2)))
-    rest.set_name("pen_at_rest")
-    builder.Connect(rest.get_output_port(), plant.get_desired_state_input_port(rig))
-    view = add_picture_scene(builder, plant, scene_graph, WRIST_RENDERER, mount="flange")
-    return TabletWorld(SimulatedWorld(plant, scene_graph, instance, rig, (joint,), view, None), glass, nib)
+    board = textured_board("page", float(width), float(height), page_picture(tablet))
+    page = GeometryInstance(middle @ RigidTransform(facing), board, "page")
+    page.set_perception_properties(PerceptionProperties())
+    page.set_illustration_properties(IllustrationProperties())
+    plant.RegisterVisualGeometry(ground, page)
+    hard = _contact()
+    AddRigidHydroelasticProperties(properties=hard)
+    plant.RegisterCollisionGeometry(ground, middle @ RigidTransform([0.0, 0.0, 0.5 * _THICK_M]), slab, GLASS, hard)

@@ -1,4 +1,4 @@
-"""The tablet cell from the first look to the last touch: the pen meets the glass, and camera and pen are found."""
+"""A visit to the tablet in the station, from the first look to the last touch: the pen meets the glass, and camera and pen are found."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from pydrake.systems.analysis import Simulator
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.wrist_devices import TabletTouch, WristPicture
+from weldcal.systems.cell import make_cell
 from weldcal.systems.messages import UrStatus
+from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.scenario import load_scenario
+from weldcal.systems.station import Station
 from weldcal.systems.tablet_cell import make_tablet_cell, plan_tablet
+from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState
-from weldcal.systems.tablet_scenario import load_tablet_scenario
-from weldcal.tools.tablet_demo import run_tablet_demo
+from weldcal.tools.demo import DemoOptions, known_camera
+from weldcal.tools.procedures import kind_of, run_procedure
 
 # six landmarks and quick descents: half of the shipped scenario's time
-SHORT = "{tablet: {rows: 2, across_mm: 60.0, down_mm: 60.0}, turn_deg: 36.0, clearance_mm: 12.0, descent_mm_s: 25.0}"
+SHORT = "tablet: {rows: 2, across_mm: 60.0, down_mm: 60.0, turn_deg: 36.0, clearance_mm: 12.0, descent_mm_s: 25.0}"
 
 
 @dataclass(frozen=True)
@@ -30,14 +34,18 @@ class Demo:
 
     summary: dict[str, Any]
     folder: Path
+    station: Station
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Demo:
+def demo(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Demo:
     folder = tmp_path_factory.mktemp("tablet")
-    (folder / "short.yaml").write_text(SHORT)
-    summary = run_tablet_demo(folder / "short.yaml", folder / "out", 3, lambda *_: None)
-    return Demo(summary, folder / "out")
+    shipped = (repository / "models" / "scenarios" / "tablet.yaml").read_text(encoding="utf-8")
+    before, after = shipped[: shipped.index("tablet:\n")], shipped[shipped.index("calibration:") :]
+    (folder / "short.yaml").write_text(f"{before}{SHORT}\n{after}")
+    options = DemoOptions(str(folder / "short.yaml"), folder / "out", seed=3, recording=False)
+    result = run_procedure(options, lambda *_: None)
+    return Demo(result.summary(), result.folder, result.cell.station)  # type: ignore[attr-defined]
 
 
 def test_every_landmark_is_touched(demo: Demo) -> None:
@@ -65,7 +73,19 @@ def test_depth_by_the_plane_beats_depth_by_the_pixel(demo: Demo) -> None:
 
 def test_the_run_leaves_what_the_calibration_reads(demo: Demo) -> None:
     names = {path.name for path in demo.folder.iterdir()}
-    assert {"touches.csv", "poses.csv", "camera.yaml", "picture.png", "tablet.yaml", "ur_pose.script"} <= names
+    files = {"touches.csv", "poses.csv", "camera.yaml", "picture.png", "tablet.yaml", "ur_pose.script", "report.html"}
+    assert files <= names
+    assert "Camera and pen are found" in (demo.folder / "report.html").read_text(encoding="utf-8")
+
+
+def test_it_is_the_one_station_with_a_pen_a_camera_and_a_tablet(demo: Demo) -> None:
+    diagram = demo.station.diagram
+    for name in ("wrist_camera.trigger", "ur10e.velocity_command"):
+        assert diagram.HasInputPort(name)
+    for name in ("wrist_camera.picture", "digitizer.touch", "ur10e.position_measured", "cheat.truth"):
+        assert diagram.HasOutputPort(name)
+    assert not diagram.HasInputPort("scanner.trigger")
+    assert demo.station.truth.tablet is not None
 
 
 @dataclass(eq=False)
@@ -89,14 +109,18 @@ class Alone:
         for _ in range(round(seconds / 0.01)):
             if self.state.goal_id:
                 self.tell(settled_goal=[self.state.goal_id], position_measured=np.array(self.state.q_goal))
+            now = float(self.simulator.get_context().get_time())
+            if self.state.q_goal is not None:
+                here = np.tile(self.state.q_goal, (2, 1))
+                self.tell(history=AbstractValue.Make(PoseHistory(np.array([-1.0, now + 1.0]), here)))
             if self.state.phase == "look":
-                self.tell(picture=AbstractValue.Make(WristPicture(self.state.trigger)))
-            self.simulator.AdvanceTo(self.simulator.get_context().get_time() + 0.01)
+                self.tell(picture=AbstractValue.Make(WristPicture(self.state.trigger, now)))
+            self.simulator.AdvanceTo(now + 0.01)
 
 
 @pytest.fixture
 def alone() -> Alone:
-    arm, scenario = load_arm("ur10e"), load_tablet_scenario()
+    arm, scenario = load_arm("ur10e"), load_scenario("tablet")
     plan = plan_tablet(scenario, arm)
     procedure = TabletProcedure(arm, plan)
     made = Alone(Simulator(procedure), procedure, plan)
@@ -106,6 +130,8 @@ def alone() -> Alone:
         robot_status=AbstractValue.Make(UrStatus()),
         picture=AbstractValue.Make(WristPicture()),
         touch=AbstractValue.Make(TabletTouch()),
+        history=AbstractValue.Make(PoseHistory()),
+        hold=[0.0],
     )
     return made
 
@@ -138,12 +164,68 @@ def test_a_stopped_robot_holds_the_procedure_with_its_own_words(alone: Alone) ->
     assert not alone.procedure.GetOutputPort("descent").Eval(alone.simulator.get_context()).any()
 
 
-def test_a_tablet_out_of_reach_is_refused_before_anything_moves(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot reach the tablet"):
-        make_tablet_cell(
-            load_tablet_scenario(None, "tablet: {pose: {xyz_m: [2.5, 0.0, 0.0], rpy_deg: [180.0, 0.0, 0.0]}}")
-        )
-    with pytest.raises(InputError, match="no tablet scenario"):
-        load_tablet_scenario(tmp_path / "none.yaml")
-    with pytest.raises(InputError, match="cannot be read"):
-        load_tablet_scenario(None, "colour: red")
+def test_a_person_holds_the_visit(alone: Alone) -> None:
+    alone.run(0.5)
+    alone.tell(hold=[1.0])
+    alone.run(0.05)
+    assert (alone.state.phase, alone.state.finished) == ("held", True)
+    assert "A person held the visit, in the phase 'descend'" in alone.state.reason
+
+
+def test_a_touch_at_a_time_that_no_pose_is_known_for_is_not_used(alone: Alone) -> None:
+    alone.run(0.5)
+    alone.tell(touch=AbstractValue.Make(TabletTouch(1, 99.0, np.zeros(2), True)))
+    alone.run(alone.plan.longest_descent_s + 0.5)
+    assert alone.state.touches == ()
+    assert (alone.state.phase, "check the clocks" in alone.state.reason) == ("held", True)
+
+
+OUT_OF_REACH = "tablet: {xyz_m: [2.5, 0.0, 0.0]}"
+UNDER_THE_TABLE = "calibration: {table_z_m: 0.2}"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (OUT_OF_REACH, "cannot reach the tablet"),
+        (UNDER_THE_TABLE, "The move from home to the look would touch the table"),
+    ],
+)
+def test_a_visit_that_cannot_be_made_is_refused_before_anything_moves(overrides: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        make_tablet_cell(load_scenario("tablet", overrides))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ("tool: none", "needs tool: pen"),
+        ("wrist_camera: !NoDevice {}", "needs a wrist_camera"),
+        ("digitizer: !NoDevice {}", "needs a digitizer"),
+        ("tablet: null", "A pen touches a tablet"),
+        ("tablet: {columns: 1}", "at least 2"),
+        ("tablet: {columns: 40}", "more than 100 landmarks"),
+        ("tablet: {across_mm: -1.0}", "tablet.across_mm must be a positive number"),
+        ("tablet: {ring_mm: 50.0}", "run into one another"),
+        ("tablet: {tilt_deg: 80.0}", "from 0 to 45"),
+        ("tablet: {pen: {radius_mm: 0.0}}", "must be positive"),
+        ("tablet: {pen: {tip_m: [0.0, 0.0]}}", "must hold 3 numbers"),
+        ("tablet: {pen: {tip_m: [0.0, 0.0, 0.0]}}", "0.03 m before the flange"),
+        ("scanner: !RenderedScanner {}\njob: {calibrate: true}", "no scanner to calibrate"),
+        ("colour: red", "colour"),
+    ],
+)
+def test_a_scenario_that_makes_no_sense_says_what_to_change(overrides: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        load_scenario("tablet", overrides)
+
+
+def test_each_procedure_is_told_to_use_its_own_command() -> None:
+    assert kind_of(load_scenario("tablet")) == "tablet"
+    assert kind_of(load_scenario("s_groove")) == "job"
+    with pytest.raises(InputError, match="weldcal tablet demo"):
+        make_cell(load_scenario("tablet"))
+    with pytest.raises(InputError, match="weldcal tablet demo"):
+        known_camera("tablet")
+    with pytest.raises(InputError, match="has no tablet"):
+        make_tablet_cell(load_scenario("straight_groove"))

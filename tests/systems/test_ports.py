@@ -30,10 +30,10 @@ from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.picture_scene import PicturePoses
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.drivers.rendered_scanner import DepthSensor
+from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera, WristCamera
+from weldcal.systems.drivers.simulated_tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
-from weldcal.systems.drivers.tablet_world import TabletWorld
 from weldcal.systems.drivers.ur_rtde import UrRtdeArm
-from weldcal.systems.drivers.wrist_devices import TabletDigitizer, TabletTouch, WristCamera, WristPicture
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
@@ -50,14 +50,14 @@ from weldcal.systems.messages import (
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.process_switch import ProcessSwitch
-from weldcal.systems.scenario import VisualizationConfig
+from weldcal.systems.scenario import VisualizationConfig, load_scenario
 from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.tablet_cell import plan_tablet
+from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 from weldcal.systems.tablet_procedure import TabletProcedure, TabletState
-from weldcal.systems.tablet_scenario import TabletOnTable, TabletScenario, WristRig
 from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.welding.guard import SlewLimits
 from weldcal.welding.servo_state import ServoConfig
@@ -100,10 +100,10 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     OperatorPanel: lambda: OperatorPanel(Meshcat(MeshcatParams(host="localhost", port=0))),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
-    TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(TabletScenario(), the_arm())),
-    WristCamera: lambda: WristCamera(WristRig(), 0),
+    TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(load_scenario("tablet"), the_arm())),
+    WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
     TabletDigitizer: lambda: TabletDigitizer(
-        TabletOnTable(), TabletWorld(plain_station().world, GeometryId.get_new_id(), GeometryId.get_new_id()), X, 0
+        SimulatedTablet(), 5256.0, {GeometryId.get_new_id(), GeometryId.get_new_id()}, X, 0
     ),
 }
 
@@ -113,8 +113,10 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "position_measured": 6,
         "settled_goal": 1,
         "robot_status": UrStatus,
+        "history": PoseHistory,
         "picture": WristPicture,
         "touch": TabletTouch,
+        "hold": 1,
         "job": JobCommand,
         "descent": 6,
         "trigger": 1,

@@ -24,7 +24,7 @@ description: Every option, each with a value that is not its default.
 arm: ur10e
 kinematics: my_robot/kinematics.yaml
 flange: iso9409-1-80-6-m8
-tool: none
+tool: pen
 robot: !SimulatedUr
   control_period_s: 0.004
   following_error_rad: 0.1
@@ -46,6 +46,39 @@ finger_camera: !RenderedFingerCamera
   latency_s: 0.02
   noise_grey: 1.0
   hidden_from_s: 3.0
+wrist_camera: !RenderedWristCamera
+  xyz_m: [0.07, 0.01, 0.04]
+  rpy_deg: [1.0, 2.0, 91.0]
+  mounting_translation_mm: 3.0
+  mounting_rotation_deg: 1.0
+  width: 800
+  height: 600
+  focal_px: 700.0
+  noise_grey: 1.0
+  depth_scale: 0.99
+  depth_noise_mm: 0.5
+digitizer: !SimulatedTablet
+  placement_translation_mm: 2.0
+  placement_rotation_deg: 1.0
+  touch_noise_px: 0.2
+  touch_force_N: 0.05
+tablet:
+  xyz_m: [0.55, 0.05, 0.02]
+  rpy_deg: [180.0, 1.0, 2.0]
+  columns: 4
+  rows: 2
+  across_mm: 50.0
+  down_mm: 40.0
+  ring_mm: 9.0
+  margin_mm: 20.0
+  px_per_mm: 6.0
+  pen: {tip_m: [0.0, -0.03, 0.15], mounting_mm: 2.0, radius_mm: 0.8, stiffness_N_per_m: 250.0}
+  look_distance_mm: 280.0
+  clearance_mm: 14.0
+  descent_mm_s: 10.0
+  deepest_mm: 11.0
+  turn_deg: 20.0
+  tilt_deg: 10.0
 home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
 calibration:
   feature: flange

@@ -1,0 +1,118 @@
+"""A depth camera on the wrist in simulation: takes one picture of the world as it really stands when it is asked."""
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import ClippingRange, ColorRenderCamera, DepthRange, DepthRenderCamera, RenderCameraCore
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
+
+from weldcal.systems.drivers.picture_scene import add_picture_scene
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.tablet_messages import WristPicture
+
+RENDERER = "wrist"
+_NEAR_M, _FAR_M = 0.05, 2.0
+
+
+@dc.dataclass
+class RenderedWristCamera:
+    """`!RenderedWristCamera`: a camera on the flange as drawn, by how much the real one differs, and its noise."""
+
+    xyz_m: list[float] = dc.field(default_factory=lambda: [0.075, 0.0, 0.030])  # nominal X_FC
+    rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 90.0])
+    mounting_translation_mm: float = 4.0  # the true pose differs from the nominal one by this much, drawn from the seed
+    mounting_rotation_deg: float = 2.0
+    width: int = 640
+    height: int = 480
+    focal_px: float = 617.7
+    noise_grey: float = 2.0
+    depth_scale: float = 0.985  # it reads this share of the true depth
+    depth_noise_mm: float = 0.8
+
+    def nominal(self) -> RigidTransform:
+        """X_FC as drawn."""
+        return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
+
+    def camera_matrix(self) -> NDArray[np.float64]:
+        """K (3, 3), centre of the first pixel at (0, 0)."""
+        f, cx, cy = self.focal_px, 0.5 * (self.width - 1), 0.5 * (self.height - 1)
+        return np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]])
+
+
+class WristCamera(LeafSystem):
+    """Takes a picture when the trigger grows.
+
+    .. pydrake_system::
+
+        name: WristCamera
+        input_ports:
+        - trigger
+        - color_image
+        - depth_image
+        output_ports:
+        - picture
+
+    `trigger` (1) is the sequence number of the newest picture that was asked for; its noise follows from seed and number.
+    """
+
+    def __init__(self, config: RenderedWristCamera, seed: int, period_s: float = 0.02) -> None:
+        super().__init__()
+        self._config, self._seed = config, seed
+        size = (config.width, config.height)
+        self._trigger = self.DeclareVectorInputPort("trigger", 1)
+        self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(*size)))
+        self._depth = self.DeclareAbstractInputPort("depth_image", AbstractValue.Make(ImageDepth32F(*size)))
+        self._shown = self.DeclareAbstractState(AbstractValue.Make(WristPicture()))
+        ticket = {self.abstract_state_ticket(self._shown)}
+        self.DeclareAbstractOutputPort("picture", lambda: AbstractValue.Make(WristPicture()), self._output, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        shown: WristPicture = context.get_abstract_state(self._shown).get_value()
+        wanted = int(self._trigger.Eval(context)[0])
+        if wanted <= shown.sequence:
+            return
+        rng, config = np.random.default_rng([self._seed, wanted]), self._config
+        colour = np.asarray(self._color.Eval(context).data[:, :, :3], dtype=float)
+        grey = colour @ np.array([0.299, 0.587, 0.114])
+        noisy = np.clip(np.round(grey + rng.normal(0.0, config.noise_grey, grey.shape)), 0, 255).astype(np.uint8)
+        depth = np.array(self._depth.Eval(context).data[:, :, 0], dtype=float)
+        depth = config.depth_scale * depth + rng.normal(0.0, 1e-3 * config.depth_noise_mm, depth.shape)
+        depth[~np.isfinite(depth)] = 0.0
+        picture = WristPicture(wanted, context.get_time(), noisy, depth)
+        state.get_mutable_abstract_state(self._shown).set_value(picture)
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._shown).get_value())
+
+
+def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:
+    """Hang the camera on the flange of the simulated arm where it truly is (known to `cheat.truth` alone)."""
+    world, builder = build.simulated_world(), build.builder
+    if build.visit is None:
+        raise RuntimeError("the wrist camera hangs where the fittings of a visit to the tablet say")
+    view = add_picture_scene(builder, world.plant, world.scene_graph, RENDERER, mount="flange")
+    K = config.camera_matrix()
+    core = RenderCameraCore(
+        view.renderer,
+        # Drake samples pixel (u, v) at (u + 0.5, v + 0.5)
+        CameraInfo(config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5),
+        ClippingRange(0.02, 3.0),
+        RigidTransform(),
+    )
+    flange = view.frames[world.plant.GetBodyByName("flange", world.arm).index()]
+    depth = DepthRenderCamera(core, DepthRange(_NEAR_M, _FAR_M))
+    sensor = builder.AddSystem(RgbdSensor(flange, build.visit.truth.X_FC, ColorRenderCamera(core, False), depth))
+    sensor.set_name("wrist_rgbd")
+    camera = builder.AddSystem(WristCamera(config, int(build.rng.integers(2**31))))
+    camera.set_name("wrist_camera")
+    builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
+    builder.Connect(sensor.color_image_output_port(), camera.GetInputPort("color_image"))
+    builder.Connect(sensor.depth_image_32F_output_port(), camera.GetInputPort("depth_image"))
+    build.inputs["wrist_camera.trigger"] = camera.GetInputPort("trigger")
+    build.outputs["wrist_camera.picture"] = camera.GetOutputPort("picture")

@@ -1,0 +1,105 @@
+"""A tablet in simulation: its glass feels the pen by the contact force, and says where to a tenth of a pixel."""
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import GeometryId
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import ContactResults, MultibodyPlant
+from pydrake.systems.framework import Context, LeafSystem, State
+
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.tablet_messages import TabletTouch
+
+GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two geometries that touch
+
+
+@dc.dataclass
+class SimulatedTablet:
+    """`!SimulatedTablet`: how far it lies from where it is thought to lie, and how it feels."""
+
+    placement_translation_mm: float = 4.0  # drawn from the seed
+    placement_rotation_deg: float = 1.5
+    touch_noise_px: float = 0.3
+    touch_force_N: float = 0.02  # from here on it feels the pen
+
+
+class TabletDigitizer(LeafSystem):
+    """Feels the pen through the glass: a touch begins when the contact force passes its threshold, and counts once.
+
+    .. pydrake_system::
+
+        name: TabletDigitizer
+        input_ports:
+        - contact_results
+        output_ports:
+        - touch
+    """
+
+    def __init__(
+        self,
+        config: SimulatedTablet,
+        px_per_m: float,
+        pair: set[GeometryId],
+        X_BT: RigidTransform,
+        seed: int,
+        period_s: float = 0.004,
+    ) -> None:
+        super().__init__()
+        self._config, self._px_per_m, self._pair = config, px_per_m, pair
+        self._X_TB, self._seed = X_BT.inverse(), seed
+        self._contacts = self.DeclareAbstractInputPort("contact_results", AbstractValue.Make(ContactResults()))
+        self._touch = self.DeclareAbstractState(AbstractValue.Make(TabletTouch()))
+        ticket = {self.abstract_state_ticket(self._touch)}
+        self.DeclareAbstractOutputPort("touch", lambda: AbstractValue.Make(TabletTouch()), self._output, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        old: TabletTouch = context.get_abstract_state(self._touch).get_value()
+        felt = self._felt(self._contacts.Eval(context))
+        if (felt is not None) == old.down:
+            return
+        if felt is None:
+            new = dc.replace(old, down=False)
+        else:
+            rng = np.random.default_rng([self._seed, old.sequence + 1])
+            px = self._px_per_m * felt + rng.normal(0.0, self._config.touch_noise_px, 2)
+            new = TabletTouch(old.sequence + 1, context.get_time(), np.round(px, 1), True)
+        state.get_mutable_abstract_state(self._touch).set_value(new)
+
+    def _felt(self, results: ContactResults) -> np.ndarray | None:
+        """Where on the page (2,) m the pen presses hard enough; None where it does not."""
+        for k in range(results.num_hydroelastic_contacts()):
+            info = results.hydroelastic_contact_info(k)
+            surface = info.contact_surface()
+            if {surface.id_M(), surface.id_N()} != self._pair:
+                continue
+            if np.linalg.norm(info.F_Ac_W().translational()) > self._config.touch_force_N:
+                return np.asarray(self._X_TB.multiply(surface.centroid())[:2])
+        return None
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._touch).get_value())
+
+
+def _geometry(plant: MultibodyPlant, body: str, build: StationBuild, name: str) -> GeometryId:
+    """The collision geometry of that name on a body."""
+    inspector = build.simulated_world().scene_graph.model_inspector()
+    found = plant.GetCollisionGeometriesForBody(plant.world_body() if not body else plant.GetBodyByName(body))
+    (geometry,) = (g for g in found if inspector.GetName(g).endswith(name))
+    return geometry
+
+
+def ApplyDriverConfig(config: SimulatedTablet, build: StationBuild) -> None:
+    """Let the glass of the simulated world feel the pen."""
+    plant = build.simulated_world().plant
+    if build.visit is None:
+        raise RuntimeError("the tablet lies where the fittings of a visit to it say")
+    pair = {_geometry(plant, "", build, GLASS), _geometry(plant, "pen", build, NIB)}
+    px_per_m, X_BT = 1e3 * build.visit.tablet.px_per_mm, build.visit.truth.X_BT
+    tablet = build.builder.AddSystem(TabletDigitizer(config, px_per_m, pair, X_BT, int(build.rng.integers(2**31))))
+    tablet.set_name("tablet")
+    build.builder.Connect(plant.get_contact_results_output_port(), tablet.GetInputPort("contact_results"))
+    build.outputs["digitizer.touch"] = tablet.GetOutputPort("touch")

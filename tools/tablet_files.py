@@ -1,0 +1,59 @@
+"""A visit to the tablet as the files of a real one: touches.csv as the page writes it, poses.csv, camera.yaml and picture.png."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+from pydrake.common.yaml import yaml_dump
+from pydrake.math import RigidTransform
+
+from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.systems.tablet_cell import TabletCell, TabletVisit
+from weldcal.tools.report.render import write_atomic
+
+
+def write_visit(cell: TabletCell, visit: TabletVisit, folder: Path) -> None:
+    """Write the four files, each whole or not at all."""
+    tablet, state, arm = cell.tablet, visit.state, cell.station.arm
+    shown = 1e3 * tablet.px_per_mm * tablet.landmarks_m()
+    touches = [
+        {
+            "landmark": t.landmark,
+            "landmark_x_px": f"{shown[t.landmark, 0]:.4f}",
+            "landmark_y_px": f"{shown[t.landmark, 1]:.4f}",
+            "touch_x_px": f"{t.position_px[0]:.1f}",
+            "touch_y_px": f"{t.position_px[1]:.1f}",
+            "mm_per_px": f"{1.0 / tablet.px_per_mm:.9f}",
+            "size_checked": 1,
+            "pointer": "pen",
+        }
+        for t in state.touches
+    ]
+    poses = [_pose_row(str(t.landmark), forward_kinematics(arm, t.q)) for t in state.touches]
+    poses.append(_pose_row("camera", forward_kinematics(arm, state.q_look)))
+    K = cell.camera.camera_matrix()
+    intrinsics = {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    write_atomic(folder / "touches.csv", _csv(touches))
+    write_atomic(folder / "poses.csv", _csv(poses))
+    write_atomic(folder / "camera.yaml", yaml_dump(intrinsics))
+    write_atomic(folder / "picture.png", cv2.imencode(".png", visit.picture.grey)[1].tobytes())
+
+
+def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:
+    values = (*X.translation(), *X.rotation().ToQuaternion().wxyz())
+    return {
+        "landmark": name,
+        **{c: f"{v:.9f}" for c, v in zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True)},
+    }
+
+
+def _csv(rows: Sequence[Mapping[str, object]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

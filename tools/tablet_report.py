@@ -1,0 +1,240 @@
+"""The report of a tablet calibration, from files or from a visit: what came out, what each landmark says, what the camera saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
+from weldcal.calibration.tablet.result import TabletResult
+from weldcal.systems.tablet_cell import TabletCell, TabletVisit
+from weldcal.tools.report.pictures import OURS, svg
+from weldcal.tools.report.render import fixed, render
+
+Array = NDArray[np.float64]
+Card = tuple[str, str, str, str, str]
+_MARK = (40, 60, 220)  # BGR
+_MODELS = {
+    "wrist": "full robot poses: touches fix tablet and pen, the picture fixes the camera",
+    "pnp": "the tablet's true size (PnP), then a rigid motion and the pen",
+    "closed_form": "one linear least squares of six unknowns",
+}
+_UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180.0 / np.pi)}
+_UNITS |= {"pitch": _UNITS["roll"], "yaw": _UNITS["roll"]}
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What the report draws: landmarks (n, 2) m of the page, in-plane misses (n, 2) m of their touches, the names of the
+    landmarks, and the camera's picture (PNG bytes) with what was found in it."""
+
+    landmark_m: Array
+    miss_m: Array
+    names: tuple[str, ...]
+    picture: bytes | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """What tablet.html.j2 fills in."""
+
+    title: str
+    subtitle: str
+    verdict: tuple[str, str, str]
+    cards: Sequence[Card]
+    provenance: Sequence[tuple[str, str]]
+    notes: Sequence[str] = ()
+    truth: Sequence[tuple[str, ...]] = ()
+    arrows: bytes | None = None
+    header: tuple[str, ...] = ()
+    rows: Sequence[tuple[str, ...]] = ()
+    picture: bytes | None = None
+    pose_title: str = ""
+    pose: Sequence[tuple[str, str]] = ()
+    timing: Sequence[tuple[str, str]] = ()
+    recording: bool = False
+
+
+def marked_picture(grey: NDArray[np.uint8], uv_px: Array) -> bytes:
+    """The picture (h, w) as PNG with a numbered mark at each landmark (n, 2) px."""
+    image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    size = max(grey.shape[1] / 640.0, 1.0)
+    for k, (u, v) in enumerate(uv_px):
+        at = (round(u), round(v))
+        cv2.drawMarker(image, at, _MARK, cv2.MARKER_CROSS, round(14 * size), max(round(size), 1), cv2.LINE_AA)
+        beside = (at[0] + round(9 * size), at[1] - round(9 * size))
+        cv2.putText(
+            image, str(k), beside, cv2.FONT_HERSHEY_SIMPLEX, 0.55 * size, _MARK, max(round(size), 1), cv2.LINE_AA
+        )
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def miss_arrows(shown: Shown) -> bytes:
+    """Misses as arrows at the landmarks, the page upright."""
+    p, miss = 1e3 * shown.landmark_m, 1e3 * shown.miss_m
+    extent = max(float(np.ptp(p, axis=0).max()), 1.0)
+    largest = max(float(np.linalg.norm(miss, axis=1).max()), 1e-9)
+    times = 10.0 ** np.floor(np.log10(0.18 * extent / largest))
+    times = next(t for t in (5.0 * times, 2.0 * times, times) if t * largest <= 0.25 * extent)
+    ratio = float(np.ptp(p[:, 1])) / extent
+    figure = Figure(figsize=(6.4, float(np.clip(1.6 + 5.2 * ratio, 2.6, 7.0))), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(p[:, 0], p[:, 1], "o", color="#555", markersize=4)
+    axes.quiver(p[:, 0], p[:, 1], *(times * miss).T, angles="xy", scale_units="xy", scale=1, color=OURS, width=0.006)
+    for name, (x, y) in zip(shown.names, p, strict=True):
+        axes.annotate(name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=9, color="#333")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.invert_yaxis()
+    axes.margins(0.2)
+    axes.set_xlabel("page x, mm")
+    axes.set_ylabel("page y, mm")
+    axes.set_title(f"misses, {times:g} times enlarged (largest {largest:.2f} mm)", fontsize=9, loc="left")
+    return svg(figure, axes)
+
+
+def landmark_rows(result: TabletResult, names: Sequence[str]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Header and a row per landmark."""
+    left = result.leave_one_out_mm or [float("nan")] * len(names)
+    rows: list[tuple[str, ...]] = [
+        (n, fixed(r, 3), fixed(lo, 3)) for n, r, lo in zip(names, result.residual_mm, left, strict=True)
+    ]
+    return ("landmark", "in the fit, mm", "left out, mm"), rows
+
+
+def calibration_report(result: TabletResult, shown: Shown, seconds: float) -> str:
+    """The page of `weldcal tablet calibrate`."""
+    left = [v for v in result.leave_one_out_mm if v is not None]
+    mean = float(np.mean(left)) if left else float("nan")
+    header, rows = landmark_rows(result, shown.names)
+    cards: list[Card] = [
+        ("Left-out landmark, mean", fixed(mean, 3), "mm", "plain", "each predicted by a fit that never saw it"),
+        ("In the fit, mean", fixed(float(np.mean(result.residual_mm)), 3), "mm", "plain", "of the touches"),
+        ("Landmarks", str(len(shown.names)), "", "plain", "touched and seen"),
+    ]
+    sentence = f"Left-out landmarks are missed by {fixed(mean, 2)} mm." if left else "Nothing could be left out."
+    tone = "warn" if result.warnings or result.unobservable else "good"
+    return render(
+        "tablet.html.j2",
+        page=Page(
+            title="Camera and pen by a tablet",
+            subtitle=f"Model: {_MODELS.get(result.model, result.model)}.",
+            verdict=(tone, "Camera and pen are found" + (", with reserve" if tone == "warn" else ""), sentence),
+            cards=cards,
+            notes=(*result.warnings, *result.unobservable),
+            arrows=miss_arrows(shown),
+            header=header,
+            rows=rows,
+            picture=shown.picture,
+            pose_title="Camera on the flange" if result.X_FC is not None else "Parameters",
+            pose=_pose(result),
+            provenance=[*_files(result), ("seconds", fixed(seconds, 3))],
+        ),
+    )
+
+
+def visit_report(
+    cell: TabletCell, visit: TabletVisit, found: Mapping[str, Any], result: TabletResult | None, shown: Shown | None,
+    *, recording: bool,
+) -> str:  # fmt: skip
+    """The page of a visit in a scenario; `result` and `shown` None where it was held before its end."""
+    scenario, name = cell.scenario, str(found["scenario"])
+    subtitle = f"{scenario.description.rstrip('.')}. " if scenario.description else ""
+    robot = "Simulation" if found["robot"] == "simulated" else f"Rendered sensors; robot: {found['robot']}"
+    provenance = [
+        ("software", software_version()), ("scenario", name), ("seed", str(found["seed"])),
+        ("real-time factor", fixed(float(found["real_time_factor"]), 2)),
+    ]  # fmt: skip
+    common: dict[str, Any] = {
+        "title": "A visit to the tablet",
+        "subtitle": f"{subtitle}{robot}, seed {found['seed']}.",
+        "timing": _timing(visit),
+        "recording": recording,
+    }
+    touched = ("Landmarks touched", str(found["n_touches"]), f"of {len(cell.plan.q_above)}", "plain", "by contact")
+    if result is None or shown is None:
+        verdict = ("bad", "The visit was held", str(found.get("reason", "")))
+        return render("tablet.html.j2", page=Page(verdict=verdict, cards=[touched], provenance=provenance, **common))
+    unseen = found["unseen_touch_mm"]
+    header, rows = landmark_rows(result, shown.names)
+    cards: list[Card] = [
+        ("Points never touched", fixed(unseen["mean"], 3), "mm", "good", f"mean miss of 50; largest {fixed(unseen['max'], 3)}"),
+        ("Left-out landmark, mean", fixed(found["leave_one_out_mm"], 3), "mm", "plain", "by a fit that never saw it"),
+        ("Camera off the truth", fixed(found["X_FC_error_mm"], 2), "mm", "plain", f"{fixed(found['X_FC_error_deg'], 3)} deg"),
+        ("Pen off the truth", fixed(found["pen_error_mm"], 3), "mm", "plain", "its tip, on the flange"),
+        touched,
+    ]  # fmt: skip
+    return render(
+        "tablet.html.j2",
+        page=Page(
+            verdict=("good", "Camera and pen are found", f"Points nobody touched are met within {fixed(unseen['max'], 2)} mm."),
+            cards=cards,
+            notes=(*result.warnings, *result.unobservable),
+            truth=_truth(cell, found),
+            arrows=miss_arrows(shown),
+            header=header,
+            rows=rows,
+            picture=shown.picture,
+            pose_title="Camera on the flange",
+            pose=_pose(result),
+            provenance=[*provenance, *_files(result)],
+            **common,
+        ),
+    )  # fmt: skip
+
+
+def _truth(cell: TabletCell, found: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    truth, drawn = cell.truth, cell.camera.nominal()
+    turn = np.degrees(abs((drawn.rotation().inverse() @ truth.X_FC.rotation()).ToAngleAxis().angle()))
+    off = 1e3 * float(np.linalg.norm(drawn.translation() - truth.X_FC.translation()))
+    pen = 1e3 * float(np.linalg.norm(np.array(cell.tablet.pen.tip_m) - truth.p_FP))
+    return [
+        ("camera, place, mm off", fixed(off, 2), fixed(found["X_FC_error_mm"], 2)),
+        ("camera, turn, deg off", fixed(float(turn), 3), fixed(found["X_FC_error_deg"], 3)),
+        ("pen tip, mm off", fixed(pen, 2), fixed(found["pen_error_mm"], 3)),
+        ("depth by the tablet's plane, mm rms", "", fixed(found["depth_by_plane_mm"], 3)),
+        ("depth by the landmark's own pixel, mm rms", "", fixed(found["depth_by_pixel_mm"], 3)),
+    ]
+
+
+def _pose(result: TabletResult) -> list[tuple[str, str]]:
+    if result.X_FC is None or result.p_FP_m is None or result.p_FP_covariance is None:
+        scaled = {n: _UNITS.get(n, ("mm", 1e3)) for n in result.parameters}
+        return [(n, f"{fixed(scaled[n][1] * v, 4)} {scaled[n][0]}".strip()) for n, v in result.parameters.items()]
+    sigma = np.sqrt(np.diag(np.array(result.X_FC_covariance)))
+    pen = np.sqrt(np.diag(np.array(result.p_FP_covariance)))
+    return [
+        ("position on the flange, mm", _three(1e3 * result.X_FC.translation(), 3)),
+        ("one sigma, mm", _three(1e3 * sigma[3:], 3)),
+        ("one sigma of the rotation, deg", _three(np.degrees(sigma[:3]), 4)),
+        ("pen tip on the flange, mm", _three(1e3 * np.array(result.p_FP_m), 3)),
+        ("one sigma of it, mm", _three(1e3 * pen, 3)),
+        ("ROS 2", export_ros2(result.X_FC, "flange", "camera_optical_frame").strip()),
+        ("URScript", export_ur_pose(result.X_FC).strip()),
+    ]
+
+
+def _three(values: Array, digits: int) -> str:
+    return "  ".join(fixed(float(v), digits) for v in values)
+
+
+def _files(result: TabletResult) -> list[tuple[str, str]]:
+    return [("software", software_version()), *((f"SHA-256 of {n}", h) for n, h in result.data_sha256.items())]
+
+
+def _timing(visit: TabletVisit) -> list[tuple[str, str]]:
+    """Simulated seconds per kind of phase."""
+    says = {"to_start": "moves", "to_look": "moves", "to_above": "moves", "lift": "moves", "to_home": "moves"}
+    says |= {"look": "look", "descend": "come down and touch"}
+    ends = [*(t for _, t in visit.phases[1:]), visit.seconds]
+    spent: dict[str, float] = {}
+    for (name, since), until in zip(visit.phases, ends, strict=True):
+        kind = says.get(name)
+        if kind is not None:
+            spent[kind] = spent.get(kind, 0.0) + until - since
+    return [*((kind, fixed(s, 1)) for kind, s in spent.items()), ("all", fixed(visit.seconds, 1))]
