@@ -19,7 +19,6 @@ from weldcal.calibration.handeye.determinacy import (
     with_open_directions,
     without_drift,
 )
-from weldcal.calibration.handeye.fit import extent
 from weldcal.calibration.handeye.problem import NAMES, Problem, State, residuals
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.models.errors import InputError, WeldcalError
@@ -212,7 +211,7 @@ def solve_problem(
     used = problem if keep.all() else problem.pick(keep)
     if not keep.all():
         check_poses(used, allow_coplanar=config.allow_coplanar)
-    length = extent(problem)
+    length = problem.extent
     s = choice.fit.scaled
     noise = choice.fit.noise
     found = determinacy(

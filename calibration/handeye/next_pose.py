@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.hand_eye import HandEyeResult, as_transform
-from weldcal.calibration.handeye.fit import Loss, Noise, Scaled, inverse_information
 from weldcal.calibration.handeye.mountings import Mounting
 from weldcal.calibration.handeye.problem import Problem, State, linearise
+from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled, inverse_information
 from weldcal.calibration.handeye.se3 import exp_rotation, inverse
 from weldcal.calibration.rigid import skew
 from weldcal.models.arms.inverse import inverse_kinematics
