@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.handeye.choose import CANDIDATES
 from weldcal.calibration.handeye.corners import refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
 from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
 from weldcal.calibration.handeye.files import PosePairs, read_pairs
+from weldcal.calibration.handeye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.handeye.mountings import Mounting, get_mounting
 from weldcal.calibration.handeye.next_pose import NextPose, next_pose
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.handeye.problem import Problem, full_problem
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
 
@@ -183,46 +183,17 @@ def _only_camera(result: HandEyeResult) -> HandEyeResult:
 
 def _solved(problem: Problem, pairs: PosePairs, config: HandEyeConfig, mounting: Mounting) -> HandEyeResult:
     try:
-        return solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
+        result = solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
     except InconsistentPoses as e:
-        mistake = likely_mistake(pairs, config)
+        mistake = likely_mistake(pairs, None, config)
         if mistake is None:
             raise
         raise InconsistentPoses(mistake) from e
-
-
-def likely_mistake(pairs: PosePairs, config: HandEyeConfig) -> str | None:
-    """The one correction of the input, of those people need most, under which the poses agree; None where none does."""
-    if pairs.mode not in ("eye_in_hand", "eye_on_base"):
-        return None
-    quick = replace(config, folds=0, candidates=CANDIDATES[:1])
-
-    def scaled(X: Array, s: float) -> Array:
-        out = X.copy()
-        out[:, :3, 3] *= s
-        return out
-
-    # with both inverted the equation holds as well, X and Y exchanged: no data can tell
-    other = "eye_on_base" if pairs.mode == "eye_in_hand" else "eye_in_hand"
-    trials = (
-        (pairs.F, scaled(pairs.G, 1e-3), "the camera's positions are millimetres while the robot's are metres"),
-        (scaled(pairs.F, 1e-3), pairs.G, "the robot's positions are millimetres while the camera's are metres"),
-        (
-            inverse(pairs.F),
-            pairs.G,
-            f"the camera is mounted {other}, or either the robot or the camera poses are inverted",
-        ),
-    )
-    for F, G, sentence in trials:
-        try:
-            result = solve_problem(full_problem(F, G), config=quick)
-        except WeldcalError:
-            continue
-        if result.sigma_translation < 0.05 * result.extent and result.sigma_rotation_rad < 0.05:
-            return (
-                f"These poses contradict each other as given, but agree if {sentence}: correct the file and run again."
-            )
-    return None
+    mistake = likely_mistake(pairs, result, config)
+    if mistake is not None:
+        raise InconsistentPoses(mistake)
+    scale = scale_warning(problem, result)
+    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
 
 
 def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
