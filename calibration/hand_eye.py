@@ -26,6 +26,8 @@ from weldcal.models.errors import InputError, WeldcalError
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
+_SPARE = 2.5  # numbers per unknown below which an answer cannot be checked
+
 
 @dataclass(frozen=True)
 class HandEyeConfig:
@@ -223,6 +225,12 @@ def solve_problem(
     w, d = residuals(problem, state)
     seen = problem.full | problem.normal
     warnings = list(found.warnings)
+    numbers = float(used.numbers_w.sum()) + 3.0 * len(used)
+    if numbers < _SPARE * problem.size:
+        warnings.append(
+            f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size} unknowns: "
+            "a wrong sample or a wrong convention would hardly show; add some before trusting the answer."
+        )
     if not keep.all():
         names = ", ".join(str(i) for i in np.nonzero(~keep)[0])
         warnings.insert(

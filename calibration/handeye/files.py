@@ -46,6 +46,11 @@ class PosePairs:
     q: Array | None = None
 
     @property
+    def has_corners(self) -> bool:
+        """Whether the file holds the corners of a board, and the camera that saw them."""
+        return self.img is not None and self.obj is not None and self.K is not None
+
+    @property
     def F(self) -> Array:
         """F of F X G = Y H Z."""
         return chain(get_mounting(self.mode), self.robot, self.link, self.robot2)[0]
