@@ -19,13 +19,14 @@ from weldcal.calibration.handeye.determinacy import (
     with_open_directions,
     without_drift,
 )
-from weldcal.calibration.handeye.fit import extent
 from weldcal.calibration.handeye.problem import NAMES, Problem, State, residuals
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.models.errors import InputError, WeldcalError
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+_SPARE = 2.5  # numbers per unknown below which an answer cannot be checked
 
 
 @dataclass(frozen=True)
@@ -212,7 +213,7 @@ def solve_problem(
     used = problem if keep.all() else problem.pick(keep)
     if not keep.all():
         check_poses(used, allow_coplanar=config.allow_coplanar)
-    length = extent(problem)
+    length = problem.extent
     s = choice.fit.scaled
     noise = choice.fit.noise
     found = determinacy(
@@ -224,6 +225,12 @@ def solve_problem(
     w, d = residuals(problem, state)
     seen = problem.full | problem.normal
     warnings = list(found.warnings)
+    numbers = float(used.numbers_w.sum()) + 3.0 * len(used)
+    if numbers < _SPARE * problem.size:
+        warnings.append(
+            f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size} unknowns: "
+            "a wrong sample or a wrong convention would hardly show; add some before trusting the answer."
+        )
     if not keep.all():
         names = ", ".join(str(i) for i in np.nonzero(~keep)[0])
         warnings.insert(

@@ -33,9 +33,25 @@ MotionsOption = Annotated[
     bool, typer.Option("--motions", help="The file holds motions (A X = X B as they stand), not poses.")
 ]
 CornersOption = Annotated[
-    bool,
+    bool | None,
     typer.Option(
-        "--corners", help="Use the board's corners in the file: reproject, and look for a shifted principal point."
+        "--corners/--no-corners",
+        help="Use the board's corners: reproject, and look for a shifted principal point.",
+        show_default="where the file holds them",
+    ),
+]
+RobotOption = Annotated[
+    str | None,
+    typer.Option("--robot", metavar="NAME", help="The arm, ur10e for example: the next pose is then one it reaches."),
+]
+ScannerOption = Annotated[
+    str | None,
+    typer.Option("--camera", metavar="NAME", help="The scanner, phoxi_s for example: the next pose is in its view."),
+]
+RefineOption = Annotated[
+    str | None,
+    typer.Option(
+        "--refine", metavar="KIND", help="joints or links: look for errors of the robot (--robot, joint angles q)."
     ),
 ]
 
@@ -65,14 +81,17 @@ def ax_yb(
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
-    corners: CornersOption = False,
+    corners: CornersOption = None,
+    robot: RobotOption = None,
+    camera: ScannerOption = None,
+    refine: RefineOption = None,
     out: OutOption = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
     """AX = YB: the poses of camera and target together, with the next pose to add."""
-    _run("ax-yb", file, mounting, unit, False, out, seed, json, debug, corners)
+    _run("ax-yb", file, mounting, unit, False, out, seed, json, debug, corners, robot, camera, refine)
 
 
 @hand_eye.command("axb-ycz")
@@ -80,13 +99,15 @@ def axb_ycz(
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
+    robot: RobotOption = None,
+    camera: ScannerOption = None,
     out: OutOption = None,
     seed: SeedOption = 0,
     json: JsonOption = False,
     debug: DebugOption = False,
 ) -> None:
     """AXB = YCZ: two robots, one with the camera and one with the target; camera, second base and target."""
-    _run("axb-ycz", file, mounting, unit, False, out, seed, json, debug)
+    _run("axb-ycz", file, mounting, unit, False, out, seed, json, debug, False, robot, camera)
 
 
 def benchmark(
@@ -127,7 +148,10 @@ def _run(
     seed: int,
     json: bool,
     debug: bool,
-    corners: bool = False,
+    corners: bool | None = False,
+    robot: str | None = None,
+    camera: str | None = None,
+    refine: str | None = None,
 ) -> None:
     from weldcal.tools.cli import fresh_folder
 
@@ -140,7 +164,18 @@ def _run(
                 typer.echo(sentence)
 
         report = run_hand_eye(
-            equation, file, folder, mounting=mounting, unit=unit, motions=motions, corners=corners, seed=seed, say=say
+            equation,
+            file,
+            folder,
+            mounting=mounting,
+            unit=unit,
+            motions=motions,
+            corners=corners,
+            robot=robot,
+            camera=camera,
+            refine=refine,
+            seed=seed,
+            say=say,
         )
     if json:
         console.emit_json(report.summary())

@@ -11,19 +11,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.handeye.choose import CANDIDATES
-from weldcal.calibration.handeye.corners import refine_with_corners
+from weldcal.calibration.handeye.corners import poses_from_corners, refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
 from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
 from weldcal.calibration.handeye.files import PosePairs, read_pairs
+from weldcal.calibration.handeye.joints import refine_joints
+from weldcal.calibration.handeye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.handeye.mountings import Mounting, get_mounting
 from weldcal.calibration.handeye.next_pose import NextPose, next_pose
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.handeye.problem import Problem, full_problem
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
-from weldcal.models.errors import InputError, WeldcalError
+from weldcal.calibration.handeye.view import view_of
+from weldcal.models.arms.chain import load_chain
+from weldcal.models.errors import InputError
+from weldcal.models.scanners import get_scanner
 
 Array = NDArray[np.float64]
 
@@ -122,18 +126,28 @@ def run_hand_eye(
     mounting: str | None = None,
     unit: str | None = None,
     motions: bool = False,
-    corners: bool = False,
+    corners: bool | None = False,
+    robot: str | None = None,
+    camera: str | None = None,
+    refine: str | None = None,
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
     """Calibrate from a file; ``say`` gets the pose-diversity report before anything is solved.
 
+    ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the scanner, for
+    the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and robot errors is applied:
+    the robot's errors are sought in the poses that the corners left).
     Raises InputError and WeldcalError with one sentence; where the poses contradict each other, the sentence names the
     one mistake (unit, inverse, mounting) whose correction makes them agree, if there is one.
     """
     begin = time.perf_counter()
     if equation not in EQUATIONS:
         raise InputError(f"There is no equation '{equation}'; choose one of {', '.join(EQUATIONS)}.")
+    arm = None if robot is None else load_chain(robot)
+    scanner = None if camera is None else get_scanner(camera)
+    if refine is not None and arm is None:
+        raise InputError("Robot errors (--refine) need the robot's name: add --robot, ur10e for example.")
     pairs = read_pairs(file, mounting=mounting, length=unit)
     found = get_mounting(pairs.mode)
     if (equation == "axb-ycz") != (found.name == "co_manipulation"):
@@ -146,26 +160,38 @@ def run_hand_eye(
         result = solve_ax_xb(pairs.robot, pairs.camera, config)
         problem = full_problem(pairs.robot, inverse(pairs.camera), free=(True, False, False), tied=True)
     else:
-        problem = full_problem(pairs.F, pairs.G, pairs.H, free=(True, True, found.name == "co_manipulation"))
+        problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
-        result = _solved(problem, pairs, config, found)
-    said = ""
+        result = solve_pairs(pairs, config)
+    said, adopted = [], False
+    if corners is None:
+        corners = pairs.has_corners and not motions and found.name in ("eye_in_hand", "eye_on_base")
     if corners:
         if motions or found.name == "co_manipulation":
             raise InputError("Corners (--corners) go with the poses of one robot.")
         refined = refine_with_corners(pairs, config)
-        said = refined.sentence
+        said.append(refined.sentence)
         if refined.accepted:
-            result = replace(refined.result, labels=found.labels, equation=found.equation)
+            adopted = True
+            result = replace(refined.result, labels=found.labels, equation=found.equation, warnings=result.warnings)
+            pairs = replace(pairs, camera=poses_from_corners(pairs, refined.shift_px))
+            problem = problem_of_pairs(pairs)
+    if refine is not None and arm is not None:
+        robot_errors = refine_joints(pairs, result, arm, refine, config=config)
+        said.append(robot_errors.sentence)
+        result, adopted = robot_errors.result, adopted or robot_errors.accepted
     if equation == "ax-xb":
         result = _only_camera(result)
-    # with corners applied the measured poses are others, so that a comparison would be of two data
-    plain = said == "" or "does not help" in said
-    comparison = () if motions or not plain else _compare(problem, result)
-    advice = None if motions or equation == "ax-xb" else next_pose(problem, result, found, (IDENTITY,) * 3)
+    # with corners or robot errors applied the poses are others, so that a comparison would be of two data
+    comparison = () if motions or adopted else _compare(problem, result)
+    advice = None
+    if not motions and equation != "ax-xb":
+        view = view_of(problem.G, pairs.K if pairs.has_corners else None, scanner)
+        advice = next_pose(problem, result, found, (IDENTITY,) * 3, arm=arm, view=view)
     provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
     files = export_hand_eye(result, found, out, provenance)
-    return HandEyeReport(result, found, comparison, advice, files, time.perf_counter() - begin, said)
+    seconds = time.perf_counter() - begin
+    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said))
 
 
 def _file(path: Path) -> Path:
@@ -181,48 +207,28 @@ def _only_camera(result: HandEyeResult) -> HandEyeResult:
     )
 
 
-def _solved(problem: Problem, pairs: PosePairs, config: HandEyeConfig, mounting: Mounting) -> HandEyeResult:
+def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEyeResult:
+    """The poses of a file's mounting, with a look at the usual mistakes: where one of them makes the poses agree far better,
+    InconsistentPoses names it. Raises as solve_problem."""
+    config, mounting = config or HandEyeConfig(), get_mounting(pairs.mode)
+    problem = problem_of_pairs(pairs)
     try:
-        return solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
-    except InconsistentPoses as e:
-        mistake = likely_mistake(pairs, config)
+        result = solve_problem(problem, config=config, equation=mounting.equation, labels=mounting.labels)
+    except (InconsistentPoses, UndeterminedPoses) as e:
+        mistake = likely_mistake(pairs, None, config)
         if mistake is None:
             raise
         raise InconsistentPoses(mistake) from e
+    mistake = likely_mistake(pairs, result, config)
+    if mistake is not None:
+        raise InconsistentPoses(mistake)
+    scale = scale_warning(problem, result)
+    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
 
 
-def likely_mistake(pairs: PosePairs, config: HandEyeConfig) -> str | None:
-    """The one correction of the input, of those people need most, under which the poses agree; None where none does."""
-    if pairs.mode not in ("eye_in_hand", "eye_on_base"):
-        return None
-    quick = replace(config, folds=0, candidates=CANDIDATES[:1])
-
-    def scaled(X: Array, s: float) -> Array:
-        out = X.copy()
-        out[:, :3, 3] *= s
-        return out
-
-    # with both inverted the equation holds as well, X and Y exchanged: no data can tell
-    other = "eye_on_base" if pairs.mode == "eye_in_hand" else "eye_in_hand"
-    trials = (
-        (pairs.F, scaled(pairs.G, 1e-3), "the camera's positions are millimetres while the robot's are metres"),
-        (scaled(pairs.F, 1e-3), pairs.G, "the robot's positions are millimetres while the camera's are metres"),
-        (
-            inverse(pairs.F),
-            pairs.G,
-            f"the camera is mounted {other}, or either the robot or the camera poses are inverted",
-        ),
-    )
-    for F, G, sentence in trials:
-        try:
-            result = solve_problem(full_problem(F, G), config=quick)
-        except WeldcalError:
-            continue
-        if result.sigma_translation < 0.05 * result.extent and result.sigma_rotation_rad < 0.05:
-            return (
-                f"These poses contradict each other as given, but agree if {sentence}: correct the file and run again."
-            )
-    return None
+def problem_of_pairs(pairs: PosePairs) -> Problem:
+    """The equation of a file's mounting."""
+    return full_problem(pairs.F, pairs.G, pairs.H, free=(True, True, pairs.mode == "co_manipulation"))
 
 
 def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:

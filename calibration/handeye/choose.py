@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.handeye.fit import Fit, Loss, descend, extent, fit, noise_of
+from weldcal.calibration.handeye.fit import Fit, descend, fit, noise_of
 from weldcal.calibration.handeye.problem import Problem, State, residuals
+from weldcal.calibration.handeye.scaled import Loss
 from weldcal.calibration.handeye.se3 import exp_rotation, mean_of
 from weldcal.calibration.handeye.starts import closed_forms, grid
 
@@ -73,11 +74,12 @@ def solve(
     where no rigid poses explain enough sightings.
     """
     state, name = _start(problem, known, seed, starts)
-    keep = gate(problem, state)
+    w, d = residuals(problem, state)
+    keep = _gate(problem, w, d)
     base: Fit | None = None
     tried_sets: set[bytes] = set()
     for _ in range(10):
-        noise = noise_of(problem, *residuals(problem, state), keep) if base is None else base.noise
+        noise = noise_of(problem, w, d, keep) if base is None else base.noise
         base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
         state = base.state
         tried_sets.add(keep.tobytes())
@@ -94,10 +96,10 @@ def solve(
         )
     seen = bool((problem.full | problem.normal).any())
     turned = float(np.sqrt(base.noise.rotation)) if seen else 0.0
-    if np.sqrt(base.noise.translation) > _WORST_SHARE * extent(problem) or turned > _WORST_TURN_RAD:
+    if np.sqrt(base.noise.translation) > _WORST_SHARE * problem.extent or turned > _WORST_TURN_RAD:
         raise InconsistentPoses(
             f"The poses disagree by {np.degrees(turned):.1f} deg and "
-            f"{100.0 * np.sqrt(base.noise.translation) / extent(problem):.0f} % of their own extent; check units, pose "
+            f"{100.0 * np.sqrt(base.noise.translation) / problem.extent:.0f} % of their own extent; check units, pose "
             "order, the quaternion order, and which pose is stated from which frame."
         )
     fits: dict[str, Fit] = {}
@@ -109,7 +111,14 @@ def solve(
         noise = replace(near.noise, ratio=c.ratio)
         # the first candidate finds the noise centre for all
         fits[c.name] = fit(
-            problem, near.state, centre=near.centre, noise=noise, loss=c.loss, keep=keep, hold_centre=bool(fits)
+            problem,
+            near.state,
+            centre=near.centre,
+            noise=noise,
+            loss=c.loss,
+            keep=keep,
+            hold_centre=bool(fits),
+            begin=near.lin if fits else None,
         )
     agreed = _alike(fits)
     best = fits[agreed[0]]
@@ -126,9 +135,8 @@ def solve(
     return Choice(state, 0.5 * (covariance + covariance.T), best, " + ".join(agreed), name, scores)
 
 
-def gate(problem: Problem, state: State, centre: Array | None = None) -> Flags:
+def _gate(problem: Problem, w: Array, d: Array) -> Flags:
     """Sightings (n,) whose residuals lie within the gate, the noise taken from the medians."""
-    w, d = residuals(problem, state, centre)
     everything = np.ones(len(problem), dtype=bool)
     if len(problem) <= 4:
         return everything
@@ -182,7 +190,7 @@ def _best(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[
     """The start with the least cost after a descent from the most promising ones."""
     if not pool:
         return None, np.inf, ""
-    length = extent(problem)
+    length = problem.extent
     ranked: list[tuple[float, int, str, State]] = []
     for name, state in pool:
         if not all(np.isfinite(X).all() for X in state):
@@ -205,8 +213,8 @@ def _clean(problem: Problem, state: State) -> bool:
     w, d = residuals(problem, state)
     noise = noise_of(problem, w, d, np.ones(len(problem), dtype=bool))
     turned = np.sqrt(noise.rotation) if (problem.full | problem.normal).any() else 0.0
-    few = int((~gate(problem, state)).sum()) <= max(0.02 * len(problem), 1)
-    return few and np.sqrt(noise.translation) < 0.05 * extent(problem) and bool(turned < 0.1)
+    few = int((~_gate(problem, w, d)).sum()) <= max(0.02 * len(problem), 1)
+    return few and np.sqrt(noise.translation) < 0.05 * problem.extent and bool(turned < 0.1)
 
 
 def _left_out(fits: dict[str, Fit]) -> dict[str, Array]:

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
-from weldcal.calibration.handeye.fit import RANK
 from weldcal.calibration.handeye.problem import NAMES, Problem, State
+from weldcal.calibration.handeye.scaled import RANK
 from weldcal.calibration.handeye.se3 import log_rotation, nearest_rotation
 
 Array = NDArray[np.float64]
@@ -77,6 +77,8 @@ def _distinct(stated: list[Array], extent: float) -> int:
         # chordal distance 2 sqrt(2) sin(angle / 2) of rotation matrices
         same &= cdist(X[:, :3, :3].reshape(n, 9), X[:, :3, :3].reshape(n, 9)) < np.sqrt(2.0) * SAME_TURN_RAD
         same &= cdist(X[:, :3, 3], X[:, :3, 3]) < limit
+    if int(same.sum()) == n:  # each is like itself alone
+        return n
     left = np.ones(n, dtype=bool)
     count = 0
     while left.any():
@@ -221,7 +223,7 @@ def _common_axis(problem: Problem) -> tuple[Array, float]:
     w = turns(problem.F[:, :3, :3])
     if problem.tied:
         w = log_rotation(problem.F[:, :3, :3])
-    _, s, Vt = np.linalg.svd(w, full_matrices=True)
+    _, s, Vt = np.linalg.svd(w, full_matrices=False)
     return np.asarray(Vt[0]), float(s[1]) / np.sqrt(len(w))
 
 

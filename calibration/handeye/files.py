@@ -30,7 +30,7 @@ class PosePairs:
     """What a file holds, in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
     of a second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
     published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
-    given (NaN: not seen)."""
+    given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given."""
 
     source: str
     robot: Array
@@ -43,6 +43,12 @@ class PosePairs:
     obj: Array | None = None
     K: Array | None = None
     dist: Array | None = None
+    q: Array | None = None
+
+    @property
+    def has_corners(self) -> bool:
+        """Whether the file holds the corners of a board, and the camera that saw them."""
+        return self.img is not None and self.obj is not None and self.K is not None
 
     @property
     def F(self) -> Array:
@@ -130,9 +136,19 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
         mode,
         poses["robot2"],
         poses["link"],
-        None if X_true is None else np.asarray(X_true, dtype=float),
-        **{k: None if raw.get(k) is None else np.asarray(raw[k], dtype=float) for k in ("img", "obj", "K", "dist")},
+        None if X_true is None else _array(path, "X_true", X_true),
+        **{k: None if raw.get(k) is None else _array(path, k, raw[k]) for k in ("img", "obj", "K", "dist", "q")},
     )
+
+
+def _array(path: Path, name: str, value: Any) -> Array:
+    try:
+        out = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as e:
+        raise DatasetError(f"'{name}' of '{path.name}' is no array of numbers.") from e
+    if name != "img" and not np.isfinite(out).all():
+        raise DatasetError(f"'{name}' of '{path.name}' holds numbers that are not finite.")
+    return out
 
 
 def _npz(path: Path) -> dict[str, Any]:
@@ -141,7 +157,7 @@ def _npz(path: Path) -> dict[str, Any]:
             raw = {k: z[k] for k in z.files}
     except (OSError, ValueError) as e:
         raise DatasetError(f"'{path.name}' is not an npz file of plain arrays.") from e
-    out: dict[str, Any] = {k: raw[k] for k in ("X_true", "img", "obj", "K", "dist") if k in raw}
+    out: dict[str, Any] = {k: raw[k] for k in ("X_true", "img", "obj", "K", "dist", "q") if k in raw}
     out["robot"], out["camera"] = raw.get("A", raw.get("robot")), raw.get("B", raw.get("camera"))
     out["robot2"], out["link"] = raw.get("C", raw.get("robot2")), raw.get("L", raw.get("link"))
     out["mode"] = str(raw.get("mode", raw.get("configuration", "")))
@@ -177,6 +193,9 @@ def _csv(path: Path) -> dict[str, Any]:
     for who in ("robot", "camera", "robot2", "link"):
         if f"{who}_x" in names:
             out[who] = _columns(path, names, table, who)
+    joints = [names.index(f"q{i}") for i in range(1, 10) if f"q{i}" in names]
+    if joints:
+        out["q"] = table[:, joints]
     return out
 
 
@@ -221,7 +240,8 @@ def _document(path: Path) -> dict[str, Any]:
         out["unit"] = document.get("unit") or ""
         out["X_true"] = document.get("X_true")
         if "A" in document and "B" in document:
-            return out | {"robot": document["A"], "camera": document["B"], "robot2": document.get("C")}
+            more = {"robot2": document.get("C"), "q": document.get("q")}
+            return out | {"robot": document["A"], "camera": document["B"]} | more
         samples = document.get("samples", document.get("poses"))
     if not isinstance(samples, list) or not samples:
         raise DatasetError(f"'{path.name}' holds no list of samples.")
@@ -241,6 +261,8 @@ def _document(path: Path) -> dict[str, Any]:
     for key, name in (("robot", robot), ("camera", camera), ("robot2", "robot2"), ("link", "link")):
         if isinstance(first, dict) and name in first:
             out[key] = np.array([_one(path, s, name, i) for i, s in enumerate(samples)])
+    if isinstance(first, dict) and "q" in first:
+        out["q"] = [s.get("q") for s in samples]
     return out
 
 

@@ -1,7 +1,8 @@
-"""Which pose to add: the one that would shrink the uncertainty at the work point most, the target still in view."""
+"""Which pose to add: the one that would shrink the uncertainty at the work point most, reachable and visible."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,24 +10,32 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.hand_eye import HandEyeResult, as_transform
-from weldcal.calibration.handeye.fit import Loss, Noise, Scaled, inverse_information
 from weldcal.calibration.handeye.mountings import Mounting
 from weldcal.calibration.handeye.problem import Problem, State, linearise
-from weldcal.calibration.handeye.se3 import exp_rotation, inverse
+from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
+from weldcal.calibration.handeye.se3 import exp_rotation, inverse, log_rotation
+from weldcal.calibration.handeye.view import View, view_of
 from weldcal.calibration.rigid import skew
+from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.kinematics import known_arms, load_arm
 
 Array = NDArray[np.float64]
 
-_TURNS_RAD = (float(np.radians(20.0)), float(np.radians(40.0)))
+_TURNS_RAD = np.radians([20.0, 40.0, 60.0])
 _PRIOR_SHARE = 10.0  # what is believed of an open direction: ten radians or extents
+_SAMPLES = 15
+_TRIED = 40  # candidates, best first, whose joint angles are sought; fewer where these are found step by step
+_TRIED_BY_STEPS = 12
+_ROOM = 0.1  # of their spread: how far from the places so far a pose may lie where no robot is named
+_MOST = 0.8  # of the poses so far that a robot must reach, to be the one that took them
 
 
 @dataclass(frozen=True)
 class NextPose:
-    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open), target in the camera
-    X_CM, like which taken sample and turned how, and the predicted sigma (3-D) at the work point before and after."""
+    """A pose to add: robot pose X_BF (the first robot's, or None where the mounting leaves it open) with joint angles ``q``
+    (rad) where a robot was named, target in the camera X_CM, like which taken sample and turned how, the predicted sigma (3-D)
+    at the work point before and after, and what was ``checked``."""
 
     X_BF: RigidTransform | None
     X_CM: RigidTransform
@@ -35,58 +44,155 @@ class NextPose:
     axis_C: Array
     sigma_before: float
     sigma_after: float
+    q: Array | None = None
+    checked: str = ""
 
     def sentence(self) -> str:
         """What to do, for a person."""
-        a = "(" + ", ".join(f"{v:+.2f}" for v in self.axis_C) + ")"
+        a = "(" + ", ".join(f"{v + 0.0:+.2f}" for v in self.axis_C) + ")"
         before = "open" if not np.isfinite(self.sigma_before) else f"{1e3 * self.sigma_before:.2f} mm"
+        where = ""
+        if self.X_BF is not None:
+            p, w = 1e3 * self.X_BF.translation(), log_rotation(self.X_BF.rotation().matrix()[None])[0]
+            where = (
+                f" Flange at ({p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f}) mm, rotation vector "
+                f"({w[0]:.3f}, {w[1]:.3f}, {w[2]:.3f}) rad."
+            )
+        joints = ""
+        if self.q is not None:
+            joints = " Joints (" + ", ".join(f"{v:.1f}" for v in np.degrees(self.q)) + ") deg."
         return (
             f"Like sample {self.like}, with the target seen turned by {self.turn_deg:.0f} deg about {a} of the camera: the "
-            f"uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm."
-        )
+            f"uncertainty at the work point goes from {before} to {1e3 * self.sigma_after:.2f} mm.{where}{joints} {self.checked}"
+        ).rstrip()
 
 
 def next_pose(
-    problem: Problem, result: HandEyeResult, mounting: Mounting, known: State, *, arm: ArmModel | None = None
+    problem: Problem,
+    result: HandEyeResult,
+    mounting: Mounting,
+    known: State,
+    *,
+    arm: Chain | None = None,
+    view: View | None = None,
 ) -> NextPose | None:
-    """The most telling of poses that show the target where the camera saw it before, turned by 20 or 40 degrees.
+    """The most telling of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
 
-    Visible: the same place in the picture. Reachable: by ``arm``'s inverse kinematics, where one is given. The work point
-    is the mean place of the target before the camera. None where no candidate is left. For a scanner that watches a
-    flange, pose_planning plans with the arm's bodies and the scanner's field of view as well.
+    Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for it
+    within its limits; where none is named, or where it does not even reach the poses so far (another base or tool frame), the
+    flange stays about where it has been, and ``checked`` says so. The work point is the mean place of the target before the
+    camera. None where no candidate is left. For a scanner that watches a flange, pose_planning plans with the arm's bodies too.
     """
     state = _state(result, known, problem)
     used = problem.pick(result.inliers)
+    taken = np.nonzero(result.inliers)[0]
     noise = Noise(
         max(float(np.nan_to_num(result.sigma_rotation_rad)) ** 2, 1e-12), max(result.sigma_translation**2, 1e-14)
     )
     now = Scaled(used, linearise(used, state, np.zeros(3)), noise, Loss.SQUARES)
-    length = result.extent
-    scale = np.tile([1.0, 1.0, 1.0, length, length, length], problem.size // 6)
-    prior = np.diag(1.0 / (_PRIOR_SHARE * scale) ** 2)
+    scale = np.tile(np.repeat([1.0, result.extent], 3), problem.size // 6)
+    information = now.Gw + now.Gd + np.diag(1.0 / (_PRIOR_SHARE * scale) ** 2)
     work_C = used.G[:, :3, 3].mean(axis=0)
-    best: NextPose | None = None
-    before = _sigma(now.Gw + now.Gd + prior, state, work_C)
-    n = len(used)
-    taken = np.nonzero(result.inliers)[0]
-    for i in range(0, n, max(1, n // 15)):
-        for axis in np.vstack([np.eye(3), -np.eye(3)]):
-            for angle in _TURNS_RAD:
-                G = used.G[i].copy()
-                G[:3, :3] = exp_rotation(angle * axis) @ _seen_rotation(used, state, i)
-                H = used.H[i]
-                F = (state[1] @ H @ state[2]) @ inverse(state[0] @ G)
-                X_BF = _robot_pose(mounting, F)
-                if X_BF is not None and arm is not None and not len(inverse_kinematics(arm, X_BF)):
-                    continue
-                one = Problem(
-                    F[None], G[None], H[None], used.full[i : i + 1], used.normal[i : i + 1], None, problem.free
-                )
-                add = Scaled(one, linearise(one, state, np.zeros(3)), noise, Loss.SQUARES)
-                after = _sigma(now.Gw + now.Gd + add.Gw + add.Gd + prior, state, work_C)
-                if best is None or after < best.sigma_after:
-                    best = NextPose(X_BF, as_transform(G), int(taken[i]), float(np.degrees(angle)), axis, before, after)
-    return best
+    seen = used.G.copy()
+    seen[:, :3, :3] = [_seen_rotation(used, state, i) for i in range(len(used))]
+    view = view or view_of(seen)
+    like, angle, axis, G = _candidates(seen, view)
+    if not len(like):
+        return None
+    one = Problem(
+        (state[1] @ used.H[like] @ state[2]) @ inverse(state[0] @ G),
+        G,
+        used.H[like],
+        used.full[like],
+        used.normal[like],
+        None,
+        problem.free,
+    )
+    lin = linearise(one, state, np.zeros(3))
+    more = np.swapaxes(lin.Jw, 1, 2) @ lin.Jw / noise.rotation + np.swapaxes(lin.Jd, 1, 2) @ lin.Jd / noise.translation
+    after = _sigmas(information + more, state, work_C)
+    before = float(_sigmas(information[None], state, work_C)[0])
+    robot = _robot_poses(mounting, one.F)
+    reach, checked, tries = _reach(mounting, used.F, robot, arm)
+    found = None
+    for k in np.argsort(after, kind="stable")[:tries] if tries else np.argsort(after, kind="stable"):
+        ok, q = reach(int(k))
+        if ok:
+            found = int(k), q
+            break
+    if found is None:
+        return None
+    k, q = found
+    return NextPose(
+        None if robot is None else as_transform(robot[k]),
+        as_transform(G[k]),
+        int(taken[like[k]]),
+        float(np.degrees(angle[k])),
+        axis[k],
+        before if before < result.extent else float("inf"),
+        float(after[k]),
+        q,
+        f"{checked} Seen within {view.source}.",
+    )
+
+
+def _candidates(seen: Array, view: View) -> tuple[NDArray[np.int64], Array, Array, Array]:
+    """Sample (k,), turn (k,) rad, its axis (k, 3), and the target in the camera (k, 4, 4) of all that is visible."""
+    samples = np.arange(0, len(seen), max(1, len(seen) // _SAMPLES))
+    axes = np.vstack([np.eye(3), -np.eye(3)])
+    depth = float(np.clip(np.median(seen[:, 2, 3]), view.near, view.far))
+    side = 0.7 * np.array([[x * view.tan_x, y * view.tan_y, 1.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)]) * depth
+    like, turn, axis, place = (
+        a.reshape(-1)
+        for a in np.meshgrid(samples, np.arange(len(_TURNS_RAD)), np.arange(6), np.arange(1 + len(side)), indexing="ij")
+    )
+    G = seen[like].copy()
+    G[:, :3, :3] = exp_rotation(_TURNS_RAD[turn][:, None] * axes[axis]) @ G[:, :3, :3]
+    elsewhere = place > 0
+    G[elsewhere, :3, 3] = side[place[elsewhere] - 1]
+    ok = view.sees(G)
+    return like[ok], _TURNS_RAD[turn[ok]], axes[axis[ok]], G[ok]
+
+
+def _reach(
+    mounting: Mounting, F: Array, robot: Array | None, arm: Chain | None
+) -> tuple[Callable[[int], tuple[bool, Array | None]], str, int]:
+    """Whether a candidate can be reached, with joint angles; in words; and how many to try (0: all)."""
+    taken = _robot_poses(mounting, F)
+    if robot is None or taken is None:
+        return lambda _: (True, None), "Reach not checked: this mounting leaves the arm's pose open.", 0
+    why = "Reach not checked beyond staying near the poses so far: name the robot with --robot."
+    if arm is not None:
+        solve, tries = _inverse_of(arm)
+        some = taken[:: max(1, len(taken) // 8)]
+        if float(np.mean([solve(X) is not None for X in some])) >= _MOST:
+
+            def reached(k: int) -> tuple[bool, Array | None]:
+                q = solve(robot[k])
+                return q is not None, q
+
+            return reached, f"Within reach and limits of {arm.name}.", tries
+        why = f"Reach not checked: {arm.name} does not reach the poses so far (another base or tool frame?)."
+    p = taken[:, :3, 3]
+    room = _ROOM * float(np.ptp(p, axis=0).max())
+    low, high = p.min(axis=0) - room, p.max(axis=0) + room
+
+    def near(k: int) -> tuple[bool, Array | None]:
+        return bool(((robot[k, :3, 3] >= low) & (robot[k, :3, 3] <= high)).all()), None
+
+    return near, why, 0
+
+
+def _inverse_of(arm: Chain) -> tuple[Callable[[Array], Array | None], int]:
+    if arm.name in known_arms():
+        model = load_arm(arm.name)
+
+        def closed(X: Array) -> Array | None:
+            found = inverse_kinematics(model, as_transform(X))
+            return found[int(np.argmin(np.abs(found).max(axis=1)))] if len(found) else None
+
+        return closed, _TRIED
+    return lambda X: chain_inverse(arm, as_transform(X)), _TRIED_BY_STEPS
 
 
 def _seen_rotation(problem: Problem, state: State, i: int) -> Array:
@@ -96,10 +202,10 @@ def _seen_rotation(problem: Problem, state: State, i: int) -> Array:
     return np.asarray(seen[:3, :3])
 
 
-def _robot_pose(mounting: Mounting, F: Array) -> RigidTransform | None:
+def _robot_poses(mounting: Mounting, F: Array) -> Array | None:
     if mounting.name in ("eye_in_hand", "co_manipulation"):
-        return as_transform(F)
-    return as_transform(inverse(F)) if mounting.name == "eye_on_base" else None
+        return F
+    return inverse(F) if mounting.name == "eye_on_base" else None
 
 
 def _state(result: HandEyeResult, known: State, problem: Problem) -> State:
@@ -109,8 +215,9 @@ def _state(result: HandEyeResult, known: State, problem: Problem) -> State:
     return out[0], out[1], out[2]
 
 
-def _sigma(information: Array, state: State, work_C: Array) -> float:
-    """Predicted standard deviation (3-D) of a point at the work point, in the parent frame of the camera."""
-    C = inverse_information(information)[:6, :6]
+def _sigmas(information: Array, state: State, work_C: Array) -> Array:
+    """Predicted standard deviations (k,) (3-D) of a point at the work point, in the parent frame of the camera."""
+    s = 1.0 / np.sqrt(np.diagonal(information, axis1=1, axis2=2))
+    C = np.linalg.inv(information * s[:, :, None] * s[:, None, :]) * s[:, :, None] * s[:, None, :]
     J = np.hstack([-skew(state[0][:3, :3] @ work_C), np.eye(3)])
-    return float(np.sqrt(max(float(np.trace(J @ C @ J.T)), 0.0)))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ij,njk,ik->n", J, C[:, :6, :6], J), 0.0)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +48,22 @@ class Problem:
 
     def __len__(self) -> int:
         return len(self.F)
+
+    @cached_property
+    def extent(self) -> float:
+        """A length that goes with the data: rms spread of what robots and camera state."""
+        parts = [self.F[:, :3, 3], self.G[:, :3, 3], self.H[:, :3, 3]]
+        return float(np.sqrt(sum((((p - p.mean(axis=0)) ** 2).sum(axis=1)).mean() for p in parts))) or 1.0
+
+    @cached_property
+    def numbers_w(self) -> Array:
+        """How many numbers (n,) of each sighting speak of rotation: 3, 2 or 0."""
+        return np.where(self.full, 3.0, np.where(self.normal, 2.0, 0.0))
+
+    @cached_property
+    def all_full(self) -> bool:
+        """Whether every sighting is a full pose."""
+        return bool(self.full.all())
 
     @property
     def size(self) -> int:
@@ -93,10 +110,27 @@ class Linearised:
     Jw: Array
     Jd: Array
 
+    @cached_property
+    def Gw(self) -> Array:
+        """Products (m, m) of the derivatives of all rotations."""
+        return gram(self.Jw)
+
+    @cached_property
+    def Gd(self) -> Array:
+        """Products (m, m) of the derivatives of all displacements."""
+        return gram(self.Jd)
+
+    def after(self, change: Array) -> Linearised:
+        """What these derivatives predict after a small change (m,) of the unknowns."""
+        out = replace(self, w=self.w + self.Jw @ change, d=self.d + self.Jd @ change)
+        # the derivatives are the same, and so are their products
+        out.__dict__.update(Gw=self.Gw, Gd=self.Gd)
+        return out
+
 
 def residuals(problem: Problem, state: State, centre: Array | None = None) -> tuple[Array, Array]:
     """Rotations (n, 3) rad and displacements (n, 3) of all sightings in the frame of the target."""
-    w, d, *_ = _evaluate(problem, state, np.zeros(3) if centre is None else centre)
+    w, d, *_ = _evaluate(problem, state, np.zeros(3) if centre is None else centre, slopes=False)
     return w, d
 
 
@@ -134,10 +168,18 @@ def linearise(problem: Problem, state: State, centre: Array) -> Linearised:
     return Linearised(w, d, turn @ delta, shift)
 
 
-def _evaluate(problem: Problem, state: State, centre: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
+def gram(J: Array) -> Array:
+    """Products (m, m) of the columns of derivatives (n, 3, m)."""
+    flat = J.reshape(-1, J.shape[2])
+    return np.asarray(flat.T @ flat)
+
+
+def _evaluate(
+    problem: Problem, state: State, centre: Array, *, slopes: bool = True
+) -> tuple[Array, Array, Array, Array, Array, Array]:
     X, Y, Z = state
     full, normal = problem.full, problem.normal
-    everywhere = bool(full.all())
+    everywhere = problem.all_full
     p = np.broadcast_to(centre, (len(problem), 3)) if everywhere else np.where(full[:, None], centre, 0.0)
     g = (problem.G[:, :3, :3] @ p[:, :, None])[:, :, 0] + problem.G[:, :3, 3]
     FX = problem.F @ X
@@ -147,7 +189,7 @@ def _evaluate(problem: Problem, state: State, centre: Array) -> tuple[Array, Arr
     d = ((point - L[:, :3, 3])[:, None, :] @ RL)[:, 0] - p
     RD = np.swapaxes(RL, 1, 2) @ (FX[:, :3, :3] @ problem.G[:, :3, :3])
     w = log_rotation(RD)
-    turn = left_jacobian_inverse(w)
+    turn = left_jacobian_inverse(w) if slopes else np.zeros_like(RD)
     if not everywhere:
         m = RD[:, :, 2]
         side = np.column_stack([-m[:, 1], m[:, 0], np.zeros(len(m))])

@@ -96,6 +96,7 @@ def mean_of(poses: list[Array]) -> Array:
     (Pennec and Arsigny 2013, bi-invariant mean)."""
     M = poses[0]
     stack = np.array(poses)
+    before = np.inf
     for _ in range(50):
         D = inverse(M) @ stack
         w = log_rotation(D[:, :3, :3])
@@ -104,6 +105,8 @@ def mean_of(poses: list[Array]) -> Array:
         step = pose(exp_rotation(omega), np.linalg.solve(left_jacobian_inverse(omega[None])[0], rho))
         M = M @ step
         M = pose(nearest_rotation(M[:3, :3]), M[:3, 3])
-        if float(np.linalg.norm(omega)) < 1e-15:
+        size = float(np.linalg.norm(omega))
+        if size < 1e-15 or (size < 1e-12 and size >= 0.5 * before):  # rounding: nothing left to gain
             break
+        before = size
     return M

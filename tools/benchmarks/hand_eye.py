@@ -20,10 +20,10 @@ from weldcal.calibration.hand_eye import (
     solve_problem,
 )
 from weldcal.calibration.handeye.corners import refine_with_corners
-from weldcal.calibration.handeye.fit import Loss, Noise, Scaled
 from weldcal.calibration.handeye.mountings import MOUNTINGS
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out, opencv_solve
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
+from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
 from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.result import write_atomically
 from weldcal.models.errors import InputError

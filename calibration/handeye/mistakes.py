@@ -1,0 +1,195 @@
+"""The usual mistakes in a file of poses: each undone in turn, and named where the poses then agree far better."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import f as fisher
+
+from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.handeye.choose import CANDIDATES
+from weldcal.calibration.handeye.determinacy import diversity
+from weldcal.calibration.handeye.files import PosePairs
+from weldcal.calibration.handeye.fit import descend
+from weldcal.calibration.handeye.problem import Problem, full_problem, linearise, residuals
+from weldcal.calibration.handeye.scaled import inverse_information
+from weldcal.calibration.handeye.se3 import IDENTITY, inverse
+from weldcal.calibration.handeye.starts import grid, kronecker, with_positions
+from weldcal.models.errors import WeldcalError
+
+Array = NDArray[np.float64]
+
+_FAR_BETTER = 3.0  # times smaller residuals: no chance, whatever the noise
+_HARDLY_WORSE = 0.5  # one kind of residuals may grow by two, where the wrong answer had turned it down
+_ROUGH_STEPS = 6
+_CHANCE = 1e-4  # at which few poses may agree that much better by luck
+_ONE_AXIS = 0.1  # share of the turns off the main axis below which no closed form is to be trusted
+_FEWEST = 5
+_AGREE = 0.05  # rad, or share of the extent: residuals of poses that agree
+_STEP = 1e-4  # of the scale, for its derivative
+_SURE = 6.0  # standard deviations at which a scale is off
+_LEAST_SCALE = 3e-3  # and by how much it must be, to be worth a sentence
+
+
+@dataclass(frozen=True)
+class _Trial:
+    F: Array
+    G: Array
+    sentence: str
+
+
+def likely_mistake(pairs: PosePairs, given: HandEyeResult | None, config: HandEyeConfig) -> str | None:
+    """The one correction of the input under which the poses agree, and far better than in ``given`` (None: where they do not
+    agree at all as they stand); None where no correction does. One robot only.
+
+    With both lists inverted the equation holds as well, camera and target exchanged: no data can tell.
+    """
+    if pairs.mode not in ("eye_in_hand", "eye_on_base") or len(pairs.robot) < _FEWEST:
+        return None
+    quick = replace(config, folds=0, candidates=CANDIDATES[:1])
+    rough = _rough(pairs.F, pairs.G)
+    ranked = []
+    for k, trial in enumerate(_trials(pairs)):
+        turn, shift = _rough(trial.F, trial.G)
+        # a closed form is enough to see which corrections are worth a fit
+        if _times(turn, rough[0]) * _times(shift, rough[1]) < 0.6:
+            ranked.append((turn + shift, k, trial))
+    for _, _, trial in sorted(ranked, key=lambda r: r[:2])[:4]:
+        try:
+            result = solve_problem(full_problem(trial.F, trial.G), config=quick)
+        except WeldcalError:
+            continue
+        if _agrees(result) and (given is None or _far_better(result, given)):
+            return f"These poses contradict each other as given, but agree if {trial.sentence}: correct the file and run again."
+    return None
+
+
+def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
+    """A sentence where the robot's motion says that all camera distances are too long or too short by one factor (a target of
+    another size, a wrong focal length): such an error shifts the answer without showing in any reprojection."""
+    used = problem.pick(result.inliers)
+    if problem.tied or not used.all_full or 6 * len(used) < problem.size + 12 or result.unobservable:
+        return None
+    X, Y = (np.asarray(result.poses[k].GetAsMatrix4()) if k in result.poses else IDENTITY for k in "XY")
+    Z = np.asarray(result.poses["Z"].GetAsMatrix4()) if "Z" in result.poses else IDENTITY
+    state = X, Y, Z
+    lin = linearise(used, state, np.zeros(3))
+    _, up = residuals(replace(used, G=_scaled(used.G, 1.0 + _STEP)), state)
+    column = (up - lin.d)[:, :, None] / _STEP
+    Jd = np.concatenate([lin.Jd, column], axis=2).reshape(-1, problem.size + 1)
+    Jw = np.concatenate([lin.Jw, np.zeros_like(column)], axis=2).reshape(-1, problem.size + 1)
+    w, d = lin.w.reshape(-1), lin.d.reshape(-1)
+    a, b = (max(float(e @ e) / (e.size - 0.5 * problem.size), 1e-30) for e in (w, d))
+    V = inverse_information(Jw.T @ Jw / a + Jd.T @ Jd / b)
+    s = -float(V[-1] @ (Jw.T @ w / a + Jd.T @ d / b))
+    sigma = float(np.sqrt(V[-1, -1]))
+    if abs(s) < max(_SURE * sigma, _LEAST_SCALE):
+        return None
+    # the positions fit when multiplied by 1 + s
+    return (
+        f"The camera's distances seem {abs(100 * s):.1f} % (+- {100 * sigma:.1f}) too {'short' if s > 0.0 else 'long'} for the "
+        "robot's motion; check the size of the target and the camera's focal length, for an error there shifts the answer."
+    )
+
+
+def _trials(pairs: PosePairs) -> Iterator[_Trial]:
+    F, G = pairs.F, pairs.G
+    other = "eye_on_base" if pairs.mode == "eye_in_hand" else "eye_in_hand"
+    yield _Trial(inverse(F), G, f"the camera is mounted {other}, or either the robot or the camera poses are inverted")
+
+    def again(robot: Array, camera: Array) -> tuple[Array, Array]:
+        return (robot if pairs.mode == "eye_in_hand" else inverse(robot)), camera
+
+    robot, camera = pairs.robot, pairs.camera
+    yield _Trial(*again(_transposed(robot), camera), "the rotations of the robot are transposed")
+    yield _Trial(*again(robot, _transposed(camera)), "the rotations of the camera are transposed")
+    yield _Trial(*again(_transposed(robot), _transposed(camera)), "the rotations of robot and camera are transposed")
+    for by, order in ((1, "x, y, z, w"), (-1, "w, x, y, z")):
+        a, b = _rolled(robot, by), _rolled(camera, by)
+        yield _Trial(*again(a, camera), f"the robot's quaternions are in the order {order}")
+        yield _Trial(*again(robot, b), f"the camera's quaternions are in the order {order}")
+        yield _Trial(*again(a, b), f"all quaternions are in the order {order}")
+    yield _Trial(F[1:], G[:-1], "the camera poses come one sample later than the robot poses")
+    yield _Trial(F[:-1], G[1:], "the camera poses come one sample earlier than the robot poses")
+    for mount, A in (("", F), (f"the camera is mounted {other} and ", inverse(F))):
+        for s in (1e-3, 1e3, _scale(A, G)):
+            if s is None or abs(np.log(s)) < 0.05:
+                continue
+            what = {
+                0.001: "are millimetres while the robot's are metres",
+                1000.0: "are metres while the robot's are millimetres",
+            }
+            near = [words for unit, words in what.items() if abs(np.log(s / unit)) < 0.3]
+            words = near[0] if near else f"are multiplied by {s:.4g} (a monocular scale, or a target of another size)"
+            yield _Trial(A, _scaled(G, s), f"{mount}the camera's positions {words}")
+
+
+def _rough(F: Array, G: Array) -> tuple[float, float]:
+    """Medians of the residuals after a few steps from a closed form (where the robot turns about one axis only: from turns of
+    the cube): rad, and share of the extent."""
+    problem = full_problem(F, G)
+    state = (IDENTITY, IDENTITY, IDENTITY)
+    a, b, _ = diversity(problem).turn_spread_deg
+    if b > _ONE_AXIS * a:
+        state, _ = descend(problem, with_positions(problem, kronecker(problem, state), state), iterations=_ROUGH_STEPS)
+    else:
+        starts = [s for _, s in grid(problem, state, np.random.default_rng(0))]
+        state = min((descend(problem, s, iterations=_ROUGH_STEPS) for s in starts), key=lambda found: found[1])[0]
+    w, d = residuals(problem, state)
+    return (
+        float(np.median(np.linalg.norm(w, axis=1))),
+        float(np.median(np.linalg.norm(d, axis=1))) / problem.extent,
+    )
+
+
+def _scale(F: Array, G: Array) -> float | None:
+    """Factor on the camera's positions that makes them fit the robot's, rotations from the closed form (linear)."""
+    problem = full_problem(F, G)
+    RX, _, _ = kronecker(problem, (IDENTITY, IDENTITY, IDENTITY))
+    n = len(F)
+    R = F[:, :3, :3]
+    seen = (R @ (G[:, :3, 3] @ RX.T)[:, :, None])[:, :, 0]
+    A = np.concatenate([R, np.broadcast_to(-np.eye(3), (n, 3, 3)), seen[:, :, None]], axis=2).reshape(3 * n, 7)
+    scale = np.maximum(np.abs(A).max(axis=0), 1e-30)
+    x = np.linalg.lstsq(A / scale, -F[:, :3, 3].reshape(-1), rcond=1e-9)[0] / scale
+    return float(x[6]) if np.isfinite(x[6]) and float(x[6]) > 1e-6 else None
+
+
+def _agrees(result: HandEyeResult) -> bool:
+    return result.sigma_translation < _AGREE * result.extent and result.sigma_rotation_rad < _AGREE
+
+
+def _far_better(new: HandEyeResult, given: HandEyeResult) -> bool:
+    """Neither kind of residuals much worse, and their product smaller by far more than chance."""
+    turn = given.sigma_rotation_rad / max(new.sigma_rotation_rad, 1e-12)
+    shift = (given.sigma_translation / given.extent) / max(new.sigma_translation / new.extent, 1e-12)
+    lucky = float(np.sqrt(fisher.ppf(1.0 - _CHANCE, given.degrees_of_freedom, new.degrees_of_freedom)))
+    return min(turn, shift) > _HARDLY_WORSE and turn * shift > max(_FAR_BETTER, lucky)
+
+
+def _times(new: float, old: float) -> float:
+    return max(new, 1e-9) / max(old, 1e-9)
+
+
+def _scaled(X: Array, s: float) -> Array:
+    out = X.copy()
+    out[:, :3, 3] *= s
+    return out
+
+
+def _transposed(X: Array) -> Array:
+    out = X.copy()
+    out[:, :3, :3] = np.swapaxes(X[:, :3, :3], 1, 2)
+    return out
+
+
+def _rolled(X: Array, by: int) -> Array:
+    """Rotations whose quaternion numbers (w, x, y, z) are shifted by one place."""
+    q = np.roll(Rotation.from_matrix(X[:, :3, :3]).as_quat(scalar_first=True), by, axis=1)
+    out = X.copy()
+    out[:, :3, :3] = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    return out

@@ -1,0 +1,257 @@
+"""One linearisation in units of its noise: normal equations, robust weights, covariance, errors left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.handeye.problem import Linearised, Problem, gram
+
+Array = NDArray[np.float64]
+
+_HUBER = 2.0  # in sigma per axis
+_STUDENT = 5.0  # degrees of freedom of the heavy-tailed loss
+TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
+RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the sightings do not fix
+_SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
+
+
+class Loss(Enum):
+    """How much a sighting's own residual may cost."""
+
+    SQUARES = "least squares"
+    HUBER = "Huber"
+    STUDENT = "Student's t"
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variances per axis beyond the sightings' own covariances: rotation rad^2 and translation of the noise centre.
+
+    ``ratio``: factor on the translation's sigma in the weights only: > 1 lets the rotations decide the rotations.
+    """
+
+    rotation: float
+    translation: float
+    ratio: float = 1.0
+
+
+class Scaled:
+    """The sightings of a linearisation, weighed. ``lin`` may hold three more columns than the problem has unknowns: those of
+    the noise centre."""
+
+    def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss) -> None:
+        self.size, self.full = problem.size, problem.full
+        n = len(problem)
+        self.loss, self.noise, self.n = loss, noise, n
+        self.numbers_w = problem.numbers_w
+        self.total_w, self.total_d = float(self.numbers_w.sum()), 3.0 * n
+        self.m_w = np.maximum(self.numbers_w, 1.0)
+        self.inflate = noise.ratio**2
+        self.root: Array | None = None
+        self.share_w: Array | float = 1.0  # how much of each sighting's variance is the common one
+        self.share_d: Array | float = 1.0
+        if problem.covariance is None:
+            self._unit, self._a, self._b = lin, 1.0 / noise.rotation, 1.0 / noise.translation
+        else:
+            self.root = np.linalg.inv(np.linalg.cholesky(_total(problem, noise)))
+            own = np.diagonal(problem.covariance, axis1=1, axis2=2)
+            self.share_w = noise.rotation / (noise.rotation + own[:, :3].mean(axis=1))
+            self.share_d = noise.translation / (noise.translation + own[:, 3:].mean(axis=1))
+            e, J = self._whiten(lin)
+            self._unit, self._a, self._b = Linearised(e[:, :3], e[:, 3:], J[:, :3], J[:, 3:]), 1.0, 1.0
+        unit = self._unit
+        self.qw = self._a * np.einsum("ij,ij->i", unit.w, unit.w)
+        self.qd = self._b * np.einsum("ij,ij->i", unit.d, unit.d)
+        ww, slope_w = weigh(self.qw, self.m_w, loss)
+        wd, slope_d = weigh(self.qd, np.full(n, 3.0), loss)
+        self.ww, self.wd = np.where(self.numbers_w > 0.0, ww, 0.0), wd
+        self.slope_w = float(slope_w @ self.numbers_w) / max(self.total_w, 1.0)
+        self.slope_d = float(slope_d.mean())
+        self.Gw, self.Gd = self._a * unit.Gw, self._b * unit.Gd
+        self.A = self.slope_w * self.Gw + (self.slope_d / self.inflate) * self.Gd
+        self.V = inverse_information(self.A)
+        self.g = pull(unit.Jw, self._a * self.ww, unit.w) + pull(unit.Jd, self._b / self.inflate * self.wd, unit.d)
+        taken_w = self.slope_w * float((self.V * self.Gw).sum())
+        taken_d = self.slope_d / self.inflate * float((self.V * self.Gd).sum())
+        self.free_w, self.free_d = max(self.total_w - taken_w, 0.3), max(self.total_d - taken_d, 0.3)
+
+    @cached_property
+    def ew(self) -> Array:
+        """Rotations (n, 3) in units of their noise."""
+        return np.asarray(self._unit.w * np.sqrt(self._a))
+
+    @cached_property
+    def ed(self) -> Array:
+        """Displacements (n, 3) in units of their noise."""
+        return np.asarray(self._unit.d * np.sqrt(self._b))
+
+    @cached_property
+    def Jw(self) -> Array:
+        """Derivatives (n, 3, m) of ``ew``."""
+        return np.asarray(self._unit.Jw * np.sqrt(self._a))
+
+    @cached_property
+    def Jd(self) -> Array:
+        """Derivatives (n, 3, m) of ``ed``."""
+        return np.asarray(self._unit.Jd * np.sqrt(self._b))
+
+    def newton(self, moving: int) -> Array:
+        """Inverse of the exact second derivative of the robust cost (Gauss-Newton in the residuals) by the first
+        ``moving`` unknowns; that of the mean slope where the exact one is not positive."""
+        if self.loss is Loss.SQUARES:
+            return self._mean(moving)
+        N = np.zeros_like(self.A)
+        unit = self._unit
+        for J, e, q, m, w, own, inflate in (
+            (unit.Jw, unit.w, self.qw, self.m_w, self.ww, self._a, 1.0),
+            (unit.Jd, unit.d, self.qd, 3.0, self.wd, self._b, self.inflate),
+        ):
+            N += gram(J * np.sqrt(w * own / inflate)[:, None, None])
+            outside = np.where(q > m * _HUBER**2, w / np.maximum(q, 1e-300), 0.0)
+            bend = 2.0 * w / (_STUDENT + q) if self.loss is Loss.STUDENT else outside
+            along = (e * (own * np.sqrt(bend / inflate))[:, None])[:, None, :] @ J
+            along = along[:, 0]
+            N -= along.T @ along
+        s = 1.0 / np.sqrt(np.maximum(np.diag(self.A), 1e-300))
+        scaled = N * s[:, None] * s
+        if _sure_inverse(scaled) is None and float(np.linalg.eigvalsh(scaled)[0]) < -RANK:
+            return self._mean(moving)
+        return inverse_information(N[:moving, :moving])
+
+    def _mean(self, moving: int) -> Array:
+        return self.V if moving == len(self.V) else inverse_information(self.A[:moving, :moving])
+
+    def _whiten(self, lin: Linearised) -> tuple[Array, Array]:
+        assert self.root is not None
+        e = (self.root @ np.concatenate([lin.w, lin.d], axis=1)[:, :, None])[:, :, 0]
+        return e, self.root @ np.concatenate([lin.Jw, lin.Jd], axis=1)
+
+    def variances(self, lin: Linearised, noise: Noise, floor: float) -> Noise:
+        """The variances that make each group's weighted squares equal to its redundancy (one Newton step in the log)."""
+        if self.root is None:
+            qw = np.einsum("ij,ij->i", lin.w, lin.w) / noise.rotation
+            qd = np.einsum("ij,ij->i", lin.d, lin.d) / noise.translation
+        else:
+            e = (self.root @ np.concatenate([lin.w, lin.d], axis=1)[:, :, None])[:, :, 0]
+            qw, qd = (e[:, :3] ** 2).sum(axis=1), (e[:, 3:] ** 2).sum(axis=1)
+        rotation = noise.rotation
+        if self.total_w:
+            qw = np.where(self.numbers_w > 0.0, qw, 0.0)
+            rotation = max(rotation * _growth(qw, self.m_w, self.loss, self.free_w, self.share_w), TINY)
+        three = np.full(self.n, 3.0)
+        translation = max(noise.translation * _growth(qd, three, self.loss, self.free_d, self.share_d), floor)
+        return replace(noise, rotation=rotation, translation=translation)
+
+    def unsettled(self, new: Noise) -> float:
+        """How much of the sightings' variances would change, as a share of them, with other common ones."""
+        change_w = abs(new.rotation / self.noise.rotation - 1.0) * float(np.mean(self.share_w))
+        return change_w + abs(new.translation / self.noise.translation - 1.0) * float(np.mean(self.share_d))
+
+    def covariance(self) -> Array:
+        """Covariance of the unknowns for the weights used (Huber 1981, 6.3, one factor per group of residuals)."""
+        return self.cross_covariance(self)
+
+    def cross_covariance(self, other: Scaled) -> Array:
+        """Covariance between the unknowns of two fits of the same sightings, each with its own weights."""
+        cross_w = float((self.ww * other.ww * (self.ew * other.ew).sum(axis=1)).sum()) / self.free_w
+        cross_d = float((self.wd * other.wd * (self.ed * other.ed).sum(axis=1)).sum()) / self.free_d
+        k, m = self.Jw.shape[2], other.Jw.shape[2]
+        middle = cross_w * self.Jw.reshape(-1, k).T @ other.Jw.reshape(-1, m)
+        middle += cross_d / (self.inflate * other.inflate) * self.Jd.reshape(-1, k).T @ other.Jd.reshape(-1, m)
+        return np.asarray((self.V @ middle @ other.V)[: self.size, : self.size])
+
+    def information(self) -> Array:
+        """Information of the unknowns alone, unweighted by the loss, the noise centre marginalised out."""
+        N, m = self.Gw + self.Gd, self.size
+        if len(N) == m:
+            return N
+        return np.asarray(N[:m, :m] - N[:m, m:] @ np.linalg.pinv(N[m:, m:], rcond=1e-10, hermitian=True) @ N[m:, :m])
+
+    def leave_one_out(self, lin: Linearised) -> tuple[Array, Array]:
+        """Residuals (n, 3), (n, 3) of each sighting under the fit without it (exact where linear: PRESS, Allen 1974)."""
+        J = np.concatenate([self.Jw, self.Jd], axis=1)
+        m = self.size
+        u = np.repeat(np.column_stack([self.ww, self.wd / self.inflate]), 3, axis=1)
+        hat = (J @ (self.V @ np.swapaxes(J, 1, 2))) * u[:, None, :]
+        e = np.concatenate([self.ew, self.ed], axis=1)
+        eased = np.linalg.solve(np.eye(6) * (1.0 + 1e-9) - hat, e[:, :, None])
+        change = self.V @ (np.swapaxes(J, 1, 2) @ (u[:, :, None] * eased))
+        out = np.concatenate([lin.w, lin.d], axis=1)
+        out = out + (np.concatenate([lin.Jw, lin.Jd], axis=1)[:, :, :m] @ change[:, :m])[:, :, 0]
+        return out[:, :3], out[:, 3:]
+
+
+def weigh(q: Array, m: Array, loss: Loss) -> tuple[Array, Array]:
+    """Weight of squares q (n,) of m numbers each, and the mean slope of weight times residual per number."""
+    if loss is Loss.SQUARES:
+        return np.ones_like(q), np.ones_like(q)
+    if loss is Loss.STUDENT:
+        w = (_STUDENT + m) / (_STUDENT + q)
+        return w, w * (1.0 - 2.0 * q / (m * (_STUDENT + q)))
+    r = np.sqrt(np.maximum(q / m, 1e-300))
+    w = np.minimum(1.0, _HUBER / r)
+    return w, np.where(r > _HUBER, w * (1.0 - 1.0 / m), 1.0)
+
+
+def _growth(q: Array, m: Array, loss: Loss, redundancy: float, share: Array | float) -> float:
+    """Factor on a variance: squares over redundancy, to the power that makes the step a Newton step. ``share`` (n,): how
+    much of each sighting's variance it is."""
+    w, _ = weigh(q, m, loss)
+    total = float((w * q).sum())
+    if loss is Loss.STUDENT:
+        power = float((w * q * share * _STUDENT / (_STUDENT + q)).sum())
+    elif loss is Loss.HUBER:
+        power = float((w * q * share * np.where(w < 1.0, 0.5, 1.0)).sum())
+    else:
+        power = float((w * q * share).sum())
+    ratio = max(total / redundancy, 1e-12)
+    least = 0.3 if isinstance(share, float) else 0.1
+    return float(np.clip(ratio ** (1.0 / max(power / max(total, 1e-300), least)), 1e-4, 1e4))
+
+
+def _total(problem: Problem, noise: Noise) -> Array:
+    """Covariances (n, 6, 6): the sightings' own plus the common ones; numbers that are not known stand alone."""
+    C = np.array(problem.covariance)
+    unknown = np.zeros((len(problem), 6), dtype=bool)
+    unknown[:, :3] = ~problem.full[:, None]
+    unknown[problem.normal, :2] = False
+    C[unknown[:, :, None] | unknown[:, None, :]] = 0.0
+    k = np.arange(3)
+    C[:, k, k] += noise.rotation
+    C[:, k + 3, k + 3] += noise.translation
+    return np.asarray(C)
+
+
+def pull(J: Array, u: Array, e: Array) -> Array:
+    """Sum (m,) of derivatives (n, 3, m) times residuals (n, 3) times weights (n,)."""
+    return np.asarray(J.reshape(-1, J.shape[2]).T @ (u[:, None] * e).reshape(-1))
+
+
+def inverse_information(N: Array) -> Array:
+    """Inverse of an information matrix; directions without information get none (pseudo-inverse in scaled units)."""
+    s = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    scaled = N * s[:, None] * s
+    sure = _sure_inverse(scaled)
+    if sure is not None:
+        return np.asarray(sure * s[:, None] * s)
+    values, vectors = np.linalg.eigh(scaled)
+    good = values > RANK * values[-1]
+    half = vectors[:, good] / np.sqrt(values[good])
+    return np.asarray((half @ half.T) * s[:, None] * s)
+
+
+def _sure_inverse(N: Array) -> Array | None:
+    """Inverse of a matrix that is plainly positive definite, by its Cholesky factor; None where eigenvalues must decide."""
+    try:
+        L = np.linalg.cholesky(N)
+    except np.linalg.LinAlgError:
+        return None
+    half = np.linalg.inv(L)
+    inverse = half.T @ half
+    # the traces bound the largest eigenvalue from above and the least one from below
+    return inverse if float(np.trace(inverse)) * float(np.trace(N)) < 1.0 / _SURE else None
