@@ -151,12 +151,12 @@ def _settled(
     at, size = state, np.inf
     for _ in range(ITERATIONS):
         _, r, J = _system(at, poses, p, sigma_robot_m, sigmas)
-        w = inliers[:, None] / (1.0 + (r / CAUCHY) ** 2)
+        w = np.where(inliers[:, None], 1.0 / (1.0 + (r / CAUCHY) ** 2), 0.0)
         Jw = (w[:, :, None] * J).reshape(-1, 10).T
         H, g = Jw @ J.reshape(-1, 10), Jw @ r.ravel()
         scale = np.sqrt(np.diag(H)) + 1e-300
         step = np.linalg.lstsq(H / np.outer(scale, scale), g / scale, rcond=1e-12)[0] / scale
-        before, size = size, float(np.sqrt(max(step @ H @ step, 0.0)))
+        before, size = size, float(np.sqrt(max(float(step @ H @ step), 0.0)))
         if not size < before:
             return at if size < NEAR else state
         at = at.moved(step)

@@ -65,11 +65,12 @@ class WorldResult:
 
 
 def made_worlds(count: int, seed: int, grooves: int, bosses: int) -> Iterator[WorldData]:
-    """Made from seeds."""
+    """Made from seeds, as the fixed files were; no two seeds share a world."""
     for k in range(count):
-        world = SphereWorld.made(seed + k)
-        groove = scan_groove(world, seed + k) if k < grooves else None
-        yield WorldData(sphere_trial(world, seed + k), groove, scan_boss(world, seed + k) if k < bosses else None)
+        one = 1000 * seed + k
+        world = SphereWorld.like_the_files(one)
+        groove = scan_groove(world, one) if k < grooves else None
+        yield WorldData(sphere_trial(world, one), groove, scan_boss(world, one) if k < bosses else None)
 
 
 def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
