@@ -35,6 +35,7 @@ class SphereEstimate(ProfilerEstimate):
         center: (3,) m in B; tip: (3,) m in F or None; affine: (3,) [x scale, z scale, shear] about `origin` (2,) m.
         arm_errors: of the arm's joints and table; zero where the model has them not.
         wrong_poses: scans whose points lie off the sphere together.
+        whole: (m, m) covariance of all unknowns: pose, centre, tip, sensor, arm, as far as the model has them.
     """
 
     center: Floats = field(default_factory=lambda: np.zeros(3))
@@ -43,6 +44,7 @@ class SphereEstimate(ProfilerEstimate):
     origin: Floats = field(default_factory=lambda: np.zeros(2))
     arm_errors: ArmErrors = field(default_factory=ArmErrors.none)
     wrong_poses: tuple[int, ...] = ()
+    whole: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     def points_F(self, profile: ArrayLike) -> Floats:
         """Profile points (n, 2) m, corrected by the sensor's model, in F (n, 3)."""
@@ -163,10 +165,12 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     per_pose = np.array([np.mean(distance[problem.of == k]) for k in range(len(problem.count))])
     spread = max(1.4826 * float(np.median(np.abs(per_pose))), 0.2 * problem.sigmas.robot_m)
     wrong = tuple(int(k) for k in np.flatnonzero(np.abs(per_pose) > WRONG_POSE * spread))
+    whole = np.asarray(np.linalg.inv(H))
     return SphereEstimate(
         rotation=R,
         translation=np.asarray(pose[3:]),
-        covariance=np.asarray(np.linalg.inv(H)[:6, :6]),
+        covariance=whole[:6, :6],
+        whole=whole,
         residuals=np.asarray(distance),
         inliers=np.abs(r[:m]) < 5.0,
         rms_m=float(np.sqrt(np.mean(distance**2))),
