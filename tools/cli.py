@@ -10,6 +10,7 @@ import typer
 
 from weldcal.tools import cli_hand_eye, console
 from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
+from weldcal.tools.benchmarks.cli_profiler import profiler as benchmark_profiler
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_profiler import profiler
 from weldcal.tools.cli_robots import robots
@@ -39,6 +40,7 @@ mount_flange(benchmarks)
 app.add_typer(cli_hand_eye.hand_eye, name="hand-eye")
 benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
 app.add_typer(profiler, name="profiler")
+benchmarks.command("profiler")(benchmark_profiler)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

@@ -1,4 +1,4 @@
-"""A robot that is a little other than its drawing: joint offsets and sag under gravity, as a calibration may estimate them."""
+"""A robot that is a little other than its drawing: joint offsets, sag, lengths and twists, as a calibration may estimate them."""
 
 from __future__ import annotations
 
@@ -14,6 +14,29 @@ from weldcal.models.errors import InputError
 # Joint 1 turns the base and joint 6 the flange: their offsets are part of other unknowns.
 OFFSET_JOINTS = (1, 2, 3, 4)
 SAG_JOINTS = (1, 2)
+TABLE = (0, 1, 2)  # columns of the table that may be off beside the joints' offsets: a, alpha, d
+ARM_ERRORS = len(OFFSET_JOINTS) + len(SAG_JOINTS) + 6 * len(TABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmErrors:
+    """Offsets (4,) rad of joints 2 to 5, sag (2,) rad/m of joints 2 and 3, and the table's errors (6, 3): a m, alpha rad, d m."""
+
+    offsets: Floats
+    sag: Floats
+    table: Floats
+
+    @staticmethod
+    def of(values: Floats) -> ArmErrors:
+        """From a vector (24,) in this order."""
+        k = len(OFFSET_JOINTS)
+        m = k + len(SAG_JOINTS)
+        return ArmErrors(values[:k], values[k:m], values[m:].reshape(6, 3))
+
+    @staticmethod
+    def none() -> ArmErrors:
+        """An arm as drawn."""
+        return ArmErrors.of(np.zeros(ARM_ERRORS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +97,44 @@ class DhArm:
 
     def poses(self, q: Floats, offsets: Floats, sag: Floats, loads: Floats) -> FlangePoses:
         """Flange poses with offsets (4,) rad of joints 2 to 5 and sag (2,) rad/m of joints 2 and 3."""
-        moved = np.array(q, float)
-        moved[:, list(OFFSET_JOINTS)] += offsets
-        moved[:, list(SAG_JOINTS)] += loads * sag
-        X = self.frames(moved)[:, 6]
+        X = self.frames(_moved(q, offsets, sag, loads))[:, 6]
         return FlangePoses(X[:, :3, :3], X[:, :3, 3])
+
+    def changed(self, table: Floats) -> DhArm:
+        """The same with errors (6, 3) of a, alpha and d added."""
+        rows = np.array(self.rows)
+        rows[:, TABLE] += table
+        return DhArm(rows)
+
+    def with_errors(self, q: Floats, errors: ArmErrors, loads: Floats) -> FlangePoses:
+        """Flange poses of the arm as it is."""
+        return self.changed(errors.table).poses(q, errors.offsets, errors.sag, loads)
+
+    def twists(self, q: Floats, errors: ArmErrors, loads: Floats) -> tuple[Floats, Floats]:
+        """How the flange moves with each error: turns w (n, 24, 3) and shifts v (n, 24, 3) with dp = w x p + v for p in B.
+
+        An offset turns all beyond it about the joint's axis, d shifts it along that axis; a shifts along, and alpha turns
+        about, the x axis of the frame after the joint.
+        """
+        moved = _moved(q, errors.offsets, errors.sag, loads)
+        X = self.changed(errors.table).frames(moved)
+        z, x, o = X[:, :6, :3, 2], X[:, 1:, :3, 0], X[:, :, :3, 3]
+        zero = np.zeros_like(z)
+        about_z = z, np.cross(o[:, :6], z)
+        about_x = x, np.cross(o[:, 1:], x)
+        table_w = np.stack([zero, about_x[0], zero], axis=2).reshape(len(q), 18, 3)
+        table_v = np.stack([x, about_x[1], z], axis=2).reshape(len(q), 18, 3)
+        off, sag = list(OFFSET_JOINTS), list(SAG_JOINTS)
+        w, v = (
+            np.concatenate([part[:, off], loads[:, :, None] * part[:, sag], table], axis=1)
+            for part, table in zip(about_z, (table_w, table_v), strict=True)
+        )
+        return w, v
+
+
+def _moved(q: Floats, offsets: Floats, sag: Floats, loads: Floats) -> Floats:
+    """Joints (n, 6) as they are."""
+    moved = np.array(q, float)
+    moved[:, list(OFFSET_JOINTS)] += offsets
+    moved[:, list(SAG_JOINTS)] += loads * sag
+    return moved

@@ -14,6 +14,7 @@ from weldcal.calibration.profiler.edge_model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew, turned
 
 ITERATIONS = 60
+SETTLED = 1e-6  # of the cost, in one step: the reprojection goes on from there
 KEPT = 3  # different optima that are polished
 SAME_RAD = 0.02
 ROBUST = 2.5  # Cauchy scale in robust sigmas of the distances
@@ -61,32 +62,32 @@ def _point_to_line(poses: FlangePoses, p: Floats) -> tuple[Floats, Floats, Float
     mean, e = _line(_in_base(poses, R, t, p_S))
     scale = _scale(_distances(_in_base(poses, R, t, p_S), mean, e))
     cost = np.full(m, np.inf)
-    r = np.empty((m, n, 3))
-    J = np.empty((m, n, 3, 10))
-    fresh = np.ones(m, bool)
+    left = np.arange(m)  # those that have not settled
     for _ in range(ITERATIONS):
-        if fresh.any():
-            r, J = _linearised(poses, R, t, mean, e, p_S)
-            scale = np.minimum(scale, _scale(r))
-            cost = _cost(r, scale)
-        w = 1.0 / (1.0 + np.einsum("mni,mni->mn", r, r) / scale[:, None] ** 2)
-        Jw = np.swapaxes((w[:, :, None, None] * J).reshape(m, -1, 10), 1, 2)
-        H, g = Jw @ J.reshape(m, -1, 10), (Jw @ r.reshape(m, -1, 1))[:, :, 0]
+        R0, e0, mean0 = R[left], e[left], mean[left]
+        r, J = _linearised(poses, R0, t[left], mean0, e0, p_S)
+        scale[left] = s = np.minimum(scale[left], _scale(r))
+        before = _cost(r, s)
+        w = 1.0 / (1.0 + np.einsum("mni,mni->mn", r, r) / s[:, None] ** 2)
+        J = J.reshape(len(left), -1, 10)
+        Jw = np.swapaxes(np.repeat(w, 3, axis=1)[:, :, None] * J, 1, 2)
+        H, g = Jw @ J, (Jw @ r.reshape(len(left), -1, 1))[:, :, 0]
         unit = np.sqrt(np.einsum("mii->mi", H)) + 1e-12
-        A = H / (unit[:, :, None] * unit[:, None, :]) + damping[:, None, None] * np.eye(10)
+        A = H / (unit[:, :, None] * unit[:, None, :]) + damping[left][:, None, None] * np.eye(10)
         step = -np.linalg.solve(A, (g / unit)[:, :, None])[:, :, 0] / unit
-        across = _tangents(e)
-        R_new, t_new = turned(R, step[:, :3]), t + step[:, 3:6]
-        mean_new = mean + np.einsum("mij,mj->mi", across, step[:, 6:8])
-        e_new = e + np.einsum("mij,mj->mi", across, step[:, 8:10])
-        e_new /= np.linalg.norm(e_new, axis=1, keepdims=True)
-        cost_new = _cost(_distances(_in_base(poses, R_new, t_new, p_S), mean_new, e_new), scale)
-        fresh = cost_new < cost
-        settled = np.abs(cost - cost_new) < 1e-9 * cost
-        R, t = np.where(fresh[:, None, None], R_new, R), np.where(fresh[:, None], t_new, t)
-        mean, e = np.where(fresh[:, None], mean_new, mean), np.where(fresh[:, None], e_new, e)
-        damping = np.clip(np.where(fresh, 0.2 * damping, 10.0 * damping), 1e-12, 1e9)
-        if (settled | (damping > 1e8)).all():
+        across = _tangents(e0)
+        R1, t1 = turned(R0, step[:, :3]), t[left] + step[:, 3:6]
+        mean1 = mean0 + np.einsum("mij,mj->mi", across, step[:, 6:8])
+        e1 = e0 + np.einsum("mij,mj->mi", across, step[:, 8:10])
+        e1 /= np.linalg.norm(e1, axis=1, keepdims=True)
+        after = _cost(_distances(_in_base(poses, R1, t1, p_S), mean1, e1), s)
+        better = after < before
+        k = left[better]
+        R[k], t[k], mean[k], e[k] = R1[better], t1[better], mean1[better], e1[better]
+        cost[left] = np.where(better, after, before)
+        damping[left] = np.clip(np.where(better, 0.2, 10.0) * damping[left], 1e-12, 1e9)
+        left = left[~((better & (before - after < SETTLED * before)) | (damping[left] > 1e8))]
+        if not left.size:
             break
     # compared at one scale: a start that explains little must not look good by its own
     common = _distances(_in_base(poses, R, t, p_S), mean, e)

@@ -30,7 +30,7 @@ class ProfilerRecord:
     Attributes:
         rotation (3, 3), translation (3,) m: X_FS; covariance (6, 6) [rotation in F; translation] or None (paper's methods).
         affine (3,), origin (2,) m: the sensor's correction; tip (3,) m in F or None.
-        arm: its table where joints were corrected, with offsets (4,) rad of joints 2 to 5 and sag (2,) rad/m.
+        arm: its table as it was found where joints were corrected, with offsets (4,) rad of joints 2 to 5 and sag (2,) rad/m.
         figures: what the command reports of the fit; data_sha256: of the file it came from.
     """
 
@@ -51,13 +51,14 @@ class ProfilerRecord:
     def of(
         method: str, e: ProfilerEstimate, figures: dict[str, Any], data_sha256: str, arm: DhArm | None = None
     ) -> ProfilerRecord:
-        """Of an edge's or a sphere's estimate; arm only where its joints were corrected."""
+        """Of an edge's or a sphere's estimate; arm, as it is drawn, only where its joints were corrected."""
         if not isinstance(e, SphereEstimate):
             return ProfilerRecord(
                 method, e.rotation, e.translation, e.covariance, figures=figures, data_sha256=data_sha256
             )
         return ProfilerRecord(
-            method, e.rotation, e.translation, e.covariance, e.affine, e.origin, e.tip, arm, e.offsets, e.sag, figures, data_sha256
+            method, e.rotation, e.translation, e.covariance, e.affine, e.origin, e.tip,
+            None if arm is None else arm.changed(e.arm_errors.table), e.arm_errors.offsets, e.arm_errors.sag, figures, data_sha256,
         )  # fmt: skip
 
     def points_F(self, points: Floats) -> Floats:

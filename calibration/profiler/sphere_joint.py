@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS
+from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
-from weldcal.calibration.profiler.motion import Floats
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
 from weldcal.calibration.profiler.sphere_model import Layout, Problem, SphereData, SphereSigmas, corrected
 from weldcal.calibration.profiler.sphere_start import sphere_starts
@@ -33,23 +33,28 @@ class SphereEstimate(ProfilerEstimate):
 
     Attributes:
         center: (3,) m in B; tip: (3,) m in F or None; affine: (3,) [x scale, z scale, shear] about `origin` (2,) m.
-        offsets: (4,) rad of joints 2 to 5; sag: (2,) rad/m; zero where the model has them not.
+        arm_errors: of the arm's joints and table; zero where the model has them not.
         wrong_poses: scans whose points lie off the sphere together.
+        whole: (m, m) covariance of all unknowns: pose, centre, tip, sensor, arm, as far as the model has them.
     """
 
     center: Floats = field(default_factory=lambda: np.zeros(3))
     tip: Floats | None = None
     affine: Floats = field(default_factory=lambda: np.zeros(3))
     origin: Floats = field(default_factory=lambda: np.zeros(2))
-    offsets: Floats = field(default_factory=lambda: np.zeros(len(OFFSET_JOINTS)))
-    sag: Floats = field(default_factory=lambda: np.zeros(len(SAG_JOINTS)))
+    arm_errors: ArmErrors = field(default_factory=ArmErrors.none)
     wrong_poses: tuple[int, ...] = ()
+    whole: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     def points_F(self, profile: ArrayLike) -> Floats:
         """Profile points (n, 2) m, corrected by the sensor's model, in F (n, 3)."""
         return np.asarray(
             corrected(np.asarray(profile, float), self.affine, self.origin) @ self.rotation.T + self.translation
         )
+
+    def flange(self, arm: DhArm, q: Floats) -> FlangePoses:
+        """Flange poses of the arm (as it is drawn) with the errors that were found, at joints (n, 6) rad."""
+        return arm.with_errors(q, self.arm_errors, arm.loads(q))
 
 
 def sphere_joint(
@@ -93,8 +98,7 @@ def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None 
         estimate = sphere_joint(data.without(k), model, sigmas, init=whole)
         poses, p = data.poses, data.profiles[k]
         if data.arm is not None and data.q is not None:
-            loads = data.arm.loads(data.q)
-            poses = data.arm.poses(data.q, estimate.offsets, estimate.sag, loads)
+            poses = estimate.flange(data.arm, data.q)
         at = estimate.points_F(p[np.isfinite(p).all(axis=1)]) @ poses.rotation[k].T + poses.translation[k]
         distance = np.linalg.norm(at - estimate.center, axis=1) - data.radius_m
         errors.append(np.sqrt(np.mean(distance**2)))
@@ -135,7 +139,7 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     R = np.asarray(Rotation.from_rotvec(x[:3]).as_matrix() @ R0)
     problem.linearise_about(R)
     x = np.concatenate([np.zeros(3), x[3:]])
-    pose, c, tip, affine, offsets, sag = problem.layout.unpack(x)
+    pose, c, tip, affine, arm = problem.layout.unpack(x)
     problem.share_robot_error(x)
     J, r = problem.derivatives(x), problem.residual(x)
     unit = np.linalg.norm(J, axis=0)
@@ -161,10 +165,12 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     per_pose = np.array([np.mean(distance[problem.of == k]) for k in range(len(problem.count))])
     spread = max(1.4826 * float(np.median(np.abs(per_pose))), 0.2 * problem.sigmas.robot_m)
     wrong = tuple(int(k) for k in np.flatnonzero(np.abs(per_pose) > WRONG_POSE * spread))
+    whole = np.asarray(np.linalg.inv(H))
     return SphereEstimate(
         rotation=R,
         translation=np.asarray(pose[3:]),
-        covariance=np.asarray(np.linalg.inv(H)[:6, :6]),
+        covariance=whole[:6, :6],
+        whole=whole,
         residuals=np.asarray(distance),
         inliers=np.abs(r[:m]) < 5.0,
         rms_m=float(np.sqrt(np.mean(distance**2))),
@@ -174,7 +180,6 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
         tip=None if problem.data.tip is None else problem.data.tip + tip,
         affine=np.asarray(affine),
         origin=problem.origin,
-        offsets=np.asarray(offsets),
-        sag=np.asarray(sag),
+        arm_errors=ArmErrors.of(arm),
         wrong_poses=wrong,
     )

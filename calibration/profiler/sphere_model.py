@@ -14,11 +14,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
+from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, OFFSET_JOINTS, SAG_JOINTS, ArmErrors, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, left_jacobian
 
 POINTS_PER_POSE = 120
-STEP_RAD = 1e-6
 ROBUST: dict[str, Any] = {"loss": "soft_l1", "f_scale": 3.0, "max_nfev": 60}
 
 
@@ -32,7 +31,19 @@ class SphereSigmas:
     affine: float = 0.03
     joint_rad: float = np.radians(0.05)
     sag_rad_m: float = np.radians(0.1)
+    length_m: float = (
+        0.2e-3  # of the arm's own lengths, and its twists below: an arm that was built well and not measured
+    )
+    twist_rad: float = np.radians(0.02)
     tip_m: float = 10e-3
+
+    @property
+    def arm(self) -> Floats:
+        """Of the arm's errors (24,), in their order."""
+        table = np.tile([self.length_m, self.twist_rad, self.length_m], 6)
+        return np.concatenate(
+            [np.full(len(OFFSET_JOINTS), self.joint_rad), np.full(len(SAG_JOINTS), self.sag_rad_m), table]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,30 +90,24 @@ class Layout:
     affine: bool
     joints: bool
 
-    def unpack(self, x: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-        """(w and t (6,), centre (3,), tip change (3,), affine (3,), offsets (4,), sag (2,))."""
+    def unpack(self, x: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """(w and t (6,), centre (3,), tip change (3,), affine (3,), the arm's errors (24,))."""
         k, parts = 9, []
-        for size, used in (
-            (3, self.tip),
-            (3, self.affine),
-            (len(OFFSET_JOINTS), self.joints),
-            (len(SAG_JOINTS), self.joints),
-        ):
+        for size, used in ((3, self.tip), (3, self.affine), (ARM_ERRORS, self.joints)):
             parts.append(x[k : k + size] if used else np.zeros(size))
             k += size if used else 0
-        return x[:6], x[6:9], parts[0], parts[1], parts[2], parts[3]
+        return x[:6], x[6:9], parts[0], parts[1], parts[2]
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return 9 + 3 * self.tip + 3 * self.affine + (len(OFFSET_JOINTS) + len(SAG_JOINTS)) * self.joints
+        return 9 + 3 * self.tip + 3 * self.affine + ARM_ERRORS * self.joints
 
     def sigmas(self, s: SphereSigmas) -> Floats:
         """Of the priors; infinite where there is none."""
         known: list[float] = [np.inf] * 9
         known += [s.tip_m] * 3 * self.tip + [s.affine] * 3 * self.affine
-        known += ([s.joint_rad] * len(OFFSET_JOINTS) + [s.sag_rad_m] * len(SAG_JOINTS)) * self.joints
-        return np.array(known)
+        return np.concatenate([known, s.arm]) if self.joints else np.array(known)
 
 
 class Problem:
@@ -145,22 +150,22 @@ class Problem:
         """Whiten from now on with the robot's error at each scan, linearised at x."""
         self._whiten = self._robot_error(x)
 
-    def _poses(self, offsets: Floats, sag: Floats) -> tuple[FlangePoses, FlangePoses | None]:
+    def _poses(self, values: Floats) -> tuple[FlangePoses, FlangePoses | None]:
         data = self.data
         if not self.layout.joints:
             return data.poses, data.touches
         assert data.arm is not None
         assert data.q is not None
         assert self._loads is not None
-        touches = None
+        errors, touches = ArmErrors.of(values), None
         if data.touch_q is not None and self._touch_loads is not None:
-            touches = data.arm.poses(data.touch_q, offsets, sag, self._touch_loads)
-        return data.arm.poses(data.q, offsets, sag, self._loads), touches
+            touches = data.arm.with_errors(data.touch_q, errors, self._touch_loads)
+        return data.arm.with_errors(data.q, errors, self._loads), touches
 
     def off(self, x: Floats) -> tuple[Floats, Floats, FlangePoses]:
         """Vectors (m, 3) from the centre to all profile points, and to the tip at all touches (k, 3)."""
-        pose, c, tip, affine, offsets, sag = self.layout.unpack(x)
-        poses, touches = self._poses(offsets, sag)
+        pose, c, tip, affine, arm = self.layout.unpack(x)
+        poses, touches = self._poses(arm)
         R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
         p_F = corrected(self.p, affine, self.origin) @ R.T + pose[3:]
         at = np.einsum("nij,nj->ni", poses.rotation[self.of], p_F) + poses.translation[self.of] - c
@@ -190,9 +195,9 @@ class Problem:
         return np.asarray(out)
 
     def derivatives(self, x: Floats) -> Floats:
-        """Jacobian of `residual`; that of the joints by differences of poses."""
-        pose, _, tip, affine, offsets, sag = self.layout.unpack(x)
-        poses, touches = self._poses(offsets, sag)
+        """Jacobian of `residual`."""
+        pose, c, _, affine, arm = self.layout.unpack(x)
+        poses, touches = self._poses(arm)
         at, felt, _ = self.off(x)
         R = Rotation.from_rotvec(pose[:3]).as_matrix() @ self._R0
         turned = corrected(self.p, affine, self.origin) @ R.T
@@ -213,22 +218,17 @@ class Problem:
             )
             touch.append(np.zeros((m, 3)))
         if self.layout.joints:
-            p_F = turned + pose[3:]
-            both = np.concatenate([offsets, sag])
-            for k, h in enumerate([STEP_RAD] * len(OFFSET_JOINTS) + [STEP_RAD] * len(SAG_JOINTS)):
-                moved = both + h * np.eye(len(both))[k]
-                near, near_touch = self._poses(moved[: len(OFFSET_JOINTS)], moved[len(OFFSET_JOINTS) :])
-                dR, dp = (near.rotation - poses.rotation) / h, (near.translation - poses.translation) / h
-                by = np.einsum("nij,nj->ni", dR[self.of], p_F) + dp[self.of]
-                scan.append(np.einsum("ni,ni->n", n_B, by)[:, None])
-                if near_touch is None or touches is None or self.data.tip is None:
+            assert self.data.arm is not None
+            errors = ArmErrors.of(arm)
+            for q, loads, p_B, normal, of, columns in (
+                (self.data.q, self._loads, at + c, n_B, self.of, scan),
+                (self.data.touch_q, self._touch_loads, felt + c, m_B, np.arange(m), touch),
+            ):
+                if q is None or loads is None or not len(p_B):
                     continue
-                by = (
-                    (near_touch.rotation - touches.rotation) @ (self.data.tip + tip)
-                    + near_touch.translation
-                    - touches.translation
-                )
-                touch.append(np.einsum("ni,ni->n", m_B, by / h)[:, None])
+                w, v = self.data.arm.twists(q, errors, loads)
+                by = np.einsum("nki,ni->nk", w[of], np.cross(p_B, normal)) + np.einsum("nki,ni->nk", v[of], normal)
+                columns.append(by)
         top = self._whitened(np.hstack(scan) / self.sigmas.sensor_m)
         bottom = np.hstack(touch) / self.sigmas.touch_m if m else np.empty((0, self.layout.size))
         prior = np.diag(1.0 / self.layout.sigmas(self.sigmas))[9:]

@@ -13,6 +13,7 @@ POINTS = 7  # of each profile
 ITERATIONS = 80
 KEPT = 3
 SAME_RAD = 0.02
+WORSE = 3.0  # times the best one's mean distance: what explains the sphere so badly is not polished
 
 
 def sphere_starts(
@@ -52,6 +53,8 @@ def sphere_starts(
             break
     chosen: list[int] = []
     for k in np.argsort(cost):
+        if cost[k] > WORSE * cost.min() + 1e-9:
+            break
         angles = [np.arccos(np.clip(0.5 * (np.trace(R[k].T @ R[j]) - 1.0), -1.0, 1.0)) for j in chosen]
         if all(angle > SAME_RAD for angle in angles):
             chosen.append(int(k))

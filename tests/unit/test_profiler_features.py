@@ -123,7 +123,7 @@ def calibrated(w: int) -> tuple[SphereData, SphereEstimate]:
 def flange(w: int, q: np.ndarray) -> FlangePoses:
     data, e = calibrated(w)
     assert data.arm is not None
-    return data.arm.poses(q, e.offsets, e.sag, data.arm.loads(q))
+    return e.flange(data.arm, q)
 
 
 @needs_data

@@ -228,9 +228,7 @@ def published_error_mm(w: int, points_F: np.ndarray, tip: np.ndarray, arm: Spher
     if arm is not None:
         table = published_data(w).arm
         assert table is not None
-        view, touch = (
-            table.poses(q, arm.offsets, arm.sag, table.loads(q)) for q in (d["test_q_view"][w], d["test_q_touch"][w])
-        )
+        view, touch = (arm.flange(table, q) for q in (d["test_q_view"][w], d["test_q_touch"][w]))
     sensed = np.einsum("nij,nj->ni", view.rotation, points_F) + view.translation
     return float(np.linalg.norm(sensed - touch.rotation @ tip - touch.translation, axis=1).mean() / MM)
 

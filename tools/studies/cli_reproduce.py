@@ -9,6 +9,7 @@ import typer
 
 from weldcal.tools import console
 from weldcal.tools.studies.cli_flange import flange
+from weldcal.tools.studies.cli_profiler_seeds import profiler_seeds
 from weldcal.tools.studies.cli_tablet import reproduce_tablet
 
 reproduce = typer.Typer(help="Figures against their targets.", no_args_is_help=True)
@@ -21,6 +22,7 @@ def _group() -> None:
 
 
 reproduce.command("flange")(flange)
+reproduce.command("profiler-seeds")(profiler_seeds)
 
 
 @reproduce.command("weld")

@@ -16,7 +16,6 @@ LENGTH_M, SWING_M, DEPTH_M = 0.300, 0.025, 0.060
 HALF_M = DEPTH_M * np.tan(np.radians(22.5))
 STATIONS = 25
 TOP_M, HIP_M = 0.040, 0.050
-PLACE = np.array([-0.75, -0.03, 0.15])
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,8 @@ def _seen(
 def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
     """25 stations along the groove, the laser line across it; 2 % spikes and 3 % gaps in the profiles."""
     rng = np.random.default_rng([seed, 73])
-    turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+    place = world.cell.groove
+    turn = Rotation.from_euler("z", world.cell.groove_turn_deg, degrees=True).as_matrix()
     u = np.linspace(0.008, LENGTH_M - 0.008, STATIONS)
     w = 2.0 * np.pi / LENGTH_M
     yaw = np.arctan(SWING_M * w * np.cos(w * u))
@@ -89,11 +89,11 @@ def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
     down = np.tile([0.0, 0.0, -1.0], (STATIONS, 1))
     R_PS = np.stack([across, np.cross(down, across), down], axis=2)
     R_PS = R_PS @ Rotation.from_euler("ZYX", rng.uniform(-3, 3, (STATIONS, 3)), degrees=True).as_matrix()
-    on = np.column_stack([_seam(u, 0.0), np.zeros(STATIONS)]) @ turn.T + PLACE
+    on = np.column_stack([_seam(u, 0.0), np.zeros(STATIONS)]) @ turn.T + place
     p_S = np.column_stack([rng.uniform(-0.003, 0.003, STATIONS), np.zeros(STATIONS), np.full(STATIONS, 0.195)])
     q = world.joints(*world.viewing(turn @ R_PS, p_S, on))
     X = world.repeated(q, rng)
-    clean = _seen(world, groove_mesh(), turn, PLACE, X, _perfect(0.088, 440))
+    clean = _seen(world, groove_mesh(), turn, place, X, _perfect(0.088, 440))
     p = world.measured(clean, rng)
     spikes = rng.random(p.shape[:2]) < 0.02
     p[spikes, 1] += rng.uniform(-0.015, 0.015, int(spikes.sum()))
@@ -101,7 +101,7 @@ def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
     fine = np.linspace(-0.05, LENGTH_M + 0.05, 40001)
     features, touched = np.empty((STATIONS, 3, 2)), np.empty((STATIONS, 3, 3))
     for j, (beside, z) in enumerate(((-HALF_M, 0.0), (0.0, -DEPTH_M), (HALF_M, 0.0))):
-        line = np.column_stack([_seam(fine, beside), np.full(len(fine), z)]) @ turn.T + PLACE
+        line = np.column_stack([_seam(fine, beside), np.full(len(fine), z)]) @ turn.T + place
         for k in range(STATIONS):
             one = FlangePoses(X.rotation[[k] * len(fine)], X.translation[[k] * len(fine)])
             y = (((line - one.translation[0]) @ one.rotation[0]) - world.translation) @ world.rotation
@@ -123,9 +123,9 @@ def scan_boss(world: SphereWorld, seed: int, profiles: int = 90) -> tuple[Floats
     """Joints (n, 6) and raw profiles (n, m, 2) m of the boss, the line at 45 deg to its sides."""
     rng = np.random.default_rng([seed, 74])
     turn = Rotation.from_euler("z", 12.0, degrees=True).as_matrix()
-    place = world.center + np.array([0.0, 0.0, -0.03])
+    place = world.cell.boss
     down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    R = down @ Rotation.from_euler("ZYX", [57.0, -2.0, 3.0], degrees=True).as_matrix()
+    R = down @ Rotation.from_euler("ZYX", [world.cell.boss_yaw_deg, -2.0, 3.0], degrees=True).as_matrix()
     along = R[:, 1] * [1.0, 1.0, 0.0]
     at = place + np.linspace(-0.08, 0.08, profiles)[:, None] * along
     q = world.joints(*world.viewing(np.tile(R, (profiles, 1, 1)), np.tile([0.0, 0.0, 0.205], (profiles, 1)), at))

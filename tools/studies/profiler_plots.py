@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -9,6 +12,9 @@ from matplotlib.figure import Figure
 from weldcal.tools.report.plots_weld import OURS, PLANNED, svg
 from weldcal.tools.studies.profiler_edge import COUNTS, EdgeRow
 from weldcal.tools.studies.profiler_sphere import METHODS, WorldResult
+
+if TYPE_CHECKING:
+    from weldcal.tools.studies.profiler_seeds import Line
 
 PAPER = PLANNED
 _COLOURS = {METHODS[0]: "black", METHODS[1]: PAPER, METHODS[2]: "#6aa5c9", METHODS[3]: OURS}
@@ -128,4 +134,26 @@ def boss(result: WorldResult) -> bytes:
     axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
     axes.set_box_aspect((1, 1, 0.45))
     axes.view_init(elev=38, azim=-60)
+    return svg(picture)
+
+
+def over_seeds(lines: Sequence[Line]) -> bytes:
+    """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
+    picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
+    axes = picture.add_subplot()
+    for k, line in enumerate(lines):
+        axes.plot(line.values / line.target, np.full(len(line.values), k), "o", ms=4, mew=0, alpha=0.5, color=OURS,
+                  label="one seed" if k == 0 else None)  # fmt: skip
+        low, high = np.nanmin(line.bounds) / line.target, np.nanmax(line.bounds) / line.target
+        axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
+                  label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
+        if line.fixed is not None:
+            axes.plot(line.fixed.value / line.target, k, "D", ms=5, mfc="none", mec=PAPER, mew=1.4,
+                      label="the fixed files" if k == 0 else None)  # fmt: skip
+    axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
+    axes.set_yticks(range(len(lines)), [f"{line.what}, {line.target:g} {line.unit}" for line in lines], fontsize=8)
+    axes.invert_yaxis()
+    _tidy(axes, "reached over target", "")
+    axes.set_xlim(left=0.0)
+    picture.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=8)
     return svg(picture)

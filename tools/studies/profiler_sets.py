@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.profiler.edge_model import EdgeState, predicted
@@ -14,7 +15,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 
 MM = 1e-3
-ROTATIONS, TRANSLATIONS = 25, 10
+ROTATIONS, TRANSLATIONS, FREE = 25, 10, 40
 BALL_M = 0.020
 
 
@@ -39,7 +40,8 @@ SETS = ("xy_paper", "tilt_paper", "xy_nominal", "tilt_nominal")
 
 @dataclass(frozen=True, eq=False)
 class EdgeTrial:
-    """25 rotations of 10 translations each, the truth, and the profiles of a ball (60, m, 2) that the result is tried on."""
+    """25 rotations of 10 translations each, the truth, and the profiles of a ball (60, m, 2) that the result is tried on; `wrong`: which
+    points (n,) are, where some are."""
 
     poses: FlangePoses
     points: Floats
@@ -47,6 +49,7 @@ class EdgeTrial:
     noise: EdgeNoise
     ball_poses: FlangePoses | None = None
     ball: Floats | None = None
+    wrong: NDArray[np.bool_] | None = None
 
 
 def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
@@ -59,38 +62,87 @@ def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
     for path in files:
         if not path.is_file():
             raise InputError(f"There is no {path.name} in '{folder}': leave --data away to make trials from seeds.")
-    level = name.split("_")[1]
+    kind, level = name.split("_")
+    of = {"free": f"free40_{level}", "outlier": f"outlier10_{level}"}.get(kind, f"grid_{name}")
     with np.load(files[0]) as d, np.load(files[1]) as b:
         truth = EdgeState(d["truth_Rs"], d["truth_Ts"] * MM, d["truth_p0"] * MM, d["truth_e"])
-        R, t, p = d[f"grid_{name}_Rb"], d[f"grid_{name}_Tb"] * MM, d[f"grid_{name}_ps"] * MM
+        R, t, p = d[f"{of}_Rb"], d[f"{of}_Tb"] * MM, d[f"{of}_ps"] * MM
+        wrong = d[f"{of}_outlier"] if kind == "outlier" else None
         ball_R, ball_t, ball = b[f"{level}_Rb"], b[f"{level}_Tb"] * MM, b[f"{level}_prof"].astype(float) * MM
     for k in range(len(R)):
         j = k % len(ball)
-        yield EdgeTrial(FlangePoses(R[k], t[k]), p[k], truth, NOISE[level], FlangePoses(ball_R[j], ball_t[j]), ball[j])
+        yield EdgeTrial(
+            FlangePoses(R[k], t[k]), p[k], truth, NOISE[level], FlangePoses(ball_R[j], ball_t[j]), ball[j],
+            None if wrong is None else wrong[k],
+        )  # fmt: skip
 
 
 def made_edge_trials(name: str, count: int, seed: int) -> Iterator[EdgeTrial]:
-    """Made from seeds: another scanner pose, another edge and other poses in every trial."""
-    arc, level = name.split("_")
+    """Made from seeds, as the fixed files were: the scanner's pose and the edge are theirs, poses and noise are not.
+
+    Besides `SETS`: free_paper, free_nominal (40 poses, all different), outlier_nominal (every tenth point is 1 to 8 mm off).
+    """
+    kind, level = name.split("_")
+    make = {"free": _free, "outlier": _outlier}.get(kind, _arcs)
     for k in range(count):
-        yield _made(arc, NOISE[level], np.random.default_rng([seed, k, SETS.index(name)]))
+        rng = np.random.default_rng([seed, k, *name.encode()])
+        yield make(kind, NOISE[level], rng)
 
 
-def _made(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
-    slope = rng.uniform(-0.2, 0.2)
-    e = np.array([np.cos(a := rng.uniform(0, np.pi)), np.sin(a), slope])
-    truth = EdgeState(
-        Rotation.from_euler(
-            "ZYX", rng.uniform(-1, 1, 3) * [90.0, 20.0, 20.0] + [0.0, 0.0, 180.0], degrees=True
-        ).as_matrix(),
-        np.array([0.06, -0.03, 0.14]) + rng.uniform(-0.02, 0.02, 3),
-        np.array([1.0, 0.2, 0.3]) + rng.uniform(-0.1, 0.1, 3),
+def _truth() -> EdgeState:
+    """Of the fixed files."""
+    e = np.array([np.cos(np.radians(31.0)), np.sin(np.radians(31.0)), 0.12])
+    return EdgeState(
+        Rotation.from_euler("ZYX", [37.0, -12.0, 168.0], degrees=True).as_matrix(),
+        np.array([0.062, -0.028, 0.141]),
+        np.array([1.05, 0.18, 0.32]),
         e / np.linalg.norm(e),
     )
+
+
+def _above(e: Floats) -> Floats:
+    """Orientation (3, 3) of a scanner that looks down on an edge across its laser line."""
     down = np.array([0.0, 0.0, -1.0])
-    x = np.cross(truth.direction, down)
+    x = np.cross(e, down)
     x /= np.linalg.norm(x)
-    above = np.column_stack([x, np.cross(down, x), down])
+    return np.column_stack([x, np.cross(down, x), down])
+
+
+def _free(_kind: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
+    """40 poses all different, over the whole field of view."""
+    truth = _truth()
+    R: list[Floats] = []
+    t: list[Floats] = []
+    while len(R) < FREE:
+        turn = Rotation.from_euler("ZYX", rng.uniform(-1, 1, 3) * [62.0, 35.0, 35.0], degrees=True).as_matrix()
+        R_BF = _above(truth.direction) @ turn @ truth.rotation.T
+        if abs(truth.direction @ R_BF @ truth.rotation[:, 1]) < 0.45:
+            continue
+        p_S = np.array([rng.uniform(-0.018, 0.018), 0.0, rng.uniform(0.060, 0.092)])
+        R.append(R_BF)
+        at = truth.point + rng.uniform(-0.07, 0.07) * truth.direction
+        t.append(at - R_BF @ (truth.rotation @ p_S + truth.translation))
+    return _observed(FlangePoses(np.array(R), np.array(t)), truth, noise, rng)
+
+
+def _outlier(_kind: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
+    """Tilted arcs, one point in ten off by 1 to 8 mm."""
+    trial = _arcs("tilt", noise, rng)
+    wrong = rng.random(len(trial.points)) < 0.1
+    trial.points[wrong, 0] += rng.choice([-1.0, 1.0], wrong.sum()) * rng.uniform(1e-3, 8e-3, wrong.sum())
+    return replace(trial, wrong=wrong)
+
+
+def _observed(poses: FlangePoses, truth: EdgeState, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
+    points = _noisy(predicted(truth, poses)[0], noise, rng)
+    told = FlangePoses(poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape))
+    return EdgeTrial(told, points, truth, noise)
+
+
+def _arcs(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
+    """25 orientations of an arc of ten positions each."""
+    truth = _truth()
+    above = _above(truth.direction)
     R: list[Floats] = []
     t: list[Floats] = []
     while len(R) < ROTATIONS:
@@ -98,9 +150,10 @@ def _made(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
         R_BF = above @ turn @ truth.rotation.T
         middle = np.array([rng.uniform(-0.004, 0.004), 0.0, rng.uniform(0.072, 0.080)])
         at = truth.point + rng.uniform(-0.008, 0.008) * truth.direction
-        angle = rng.uniform(0, 2 * np.pi) + np.radians(np.linspace(-120.0, 120.0, TRANSLATIONS))
+        begin = rng.uniform(0, 2 * np.pi)
+        angle = begin + np.radians(np.linspace(-120.0, 120.0, TRANSLATIONS))
         circle = 0.014 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(TRANSLATIONS)])
-        circle -= circle[TRANSLATIONS // 2]
+        circle -= 0.014 * np.array([np.cos(begin), np.sin(begin), 0.0])
         if arc == "tilt":
             circle = circle @ Rotation.from_euler("xy", rng.uniform(-30.0, 30.0, 2), degrees=True).as_matrix().T
         p_BF = at - R_BF @ (truth.rotation @ middle + truth.translation) + circle
@@ -111,10 +164,9 @@ def _made(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
             R.append(X.rotation)
             t.append(X.translation)
     poses = FlangePoses(np.concatenate(R), np.concatenate(t))
-    points = _noisy(predicted(truth, poses)[0], noise, rng)
-    told = FlangePoses(poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape))
+    trial = _observed(poses, truth, noise, rng)
     ball_poses, ball = _ball(truth, noise, rng)
-    return EdgeTrial(told, points, truth, noise, ball_poses, ball)
+    return replace(trial, ball_poses=ball_poses, ball=ball)
 
 
 def _noisy(p: Floats, noise: EdgeNoise, rng: np.random.Generator) -> Floats:

@@ -65,11 +65,12 @@ class WorldResult:
 
 
 def made_worlds(count: int, seed: int, grooves: int, bosses: int) -> Iterator[WorldData]:
-    """Made from seeds."""
+    """Made from seeds, as the fixed files were; no two seeds share a world."""
     for k in range(count):
-        world = SphereWorld.made(seed + k)
-        groove = scan_groove(world, seed + k) if k < grooves else None
-        yield WorldData(sphere_trial(world, seed + k), groove, scan_boss(world, seed + k) if k < bosses else None)
+        one = 1000 * seed + k
+        world = SphereWorld.like_the_files(one)
+        groove = scan_groove(world, one) if k < grooves else None
+        yield WorldData(sphere_trial(world, one), groove, scan_boss(world, one) if k < bosses else None)
 
 
 def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
@@ -116,11 +117,19 @@ def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
     linear = sphere_linear(R, t, centers, world.trial.translated)
     felt = fit_touch_sphere(data.touches.rotation, data.touches.translation, data.tip, data.radius_m)
     best = compensate(linear, R, t, centers, felt.center)
-    affine = sphere_joint(data, "affine", world.sigmas)
-    joints = sphere_joint(data, "affine+joints", world.sigmas, init=affine)
     return {
         METHODS[0]: ProfilerRecord(METHODS[0], linear.rotation, linear.translation, tip=data.tip),
         METHODS[1]: ProfilerRecord(METHODS[1], best.rotation, best.translation, tip=data.tip),
+        **joint_records(world),
+    }
+
+
+def joint_records(world: WorldData) -> dict[str, ProfilerRecord]:
+    """The joint methods on one world's scans and touches."""
+    data = world.trial.data
+    affine = sphere_joint(data, "affine", world.sigmas)
+    joints = sphere_joint(data, "affine+joints", world.sigmas, init=affine)
+    return {
         METHODS[2]: ProfilerRecord.of(METHODS[2], affine, {}, ""),
         METHODS[3]: ProfilerRecord.of(METHODS[3], joints, {}, "", data.arm),
     }
@@ -128,28 +137,31 @@ def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
 
 def measure(k: int, world: WorldData) -> list[WorldResult]:
     """All methods on one world."""
-    data, tests = world.trial.data, world.trial.tests
-    assert data.arm is not None
-    assert tests is not None
     features = None
     if world.groove is not None:
         features = np.array([groove_features(p).points for p in world.groove.profiles])
-    results = []
-    for method, record in calibrations(world).items():
-        off = _off(record, data.arm, tests.q_view, tests.seen, tests.q_touch)
-        points = np.array([off[tests.point == j].mean() for j in range(3)])
-        seam = each = None
-        if world.groove is not None and features is not None:
-            each = np.column_stack(
-                [_off(record, data.arm, world.groove.q, features[:, j], world.groove.q_touch[:, j]) for j in range(3)]
-            )
-            seam = each.mean(axis=0)
-        boss = cloud = None
-        if world.boss is not None:
-            cloud = _cloud(record, data.arm, *world.boss)
-            boss = fit_frustum(cloud)
-        results.append(WorldResult(k, method, points, seam, each, boss, cloud))
-    return results
+    return [measured(k, method, record, world, features) for method, record in calibrations(world).items()]
+
+
+def measured(
+    k: int, method: str, record: ProfilerRecord, world: WorldData, features: Floats | None, *, boss: bool = True
+) -> WorldResult:
+    """Points, seam and boss of one world by one calibration; features (n, 3, 2) m as found in the groove's profiles."""
+    arm, tests = world.trial.data.arm, world.trial.tests
+    assert arm is not None
+    assert tests is not None
+    off = _off(record, arm, tests.q_view, tests.seen, tests.q_touch)
+    points = np.array([off[tests.point == j].mean() for j in range(3)])
+    seam = each = found = cloud = None
+    if world.groove is not None and features is not None:
+        each = np.column_stack(
+            [_off(record, arm, world.groove.q, features[:, j], world.groove.q_touch[:, j]) for j in range(3)]
+        )
+        seam = each.mean(axis=0)
+    if world.boss is not None and boss:
+        cloud = cloud_of(record, arm, *world.boss)
+        found = fit_frustum(cloud)
+    return WorldResult(k, method, points, seam, each, found, cloud)
 
 
 def _flange(record: ProfilerRecord, arm: DhArm, q: Floats) -> FlangePoses:
@@ -165,7 +177,8 @@ def _off(record: ProfilerRecord, arm: DhArm, q: Floats, seen: Floats, q_touch: F
     return np.asarray(np.linalg.norm(sensed - touch.rotation @ record.tip - touch.translation, axis=1) / MM)
 
 
-def _cloud(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) -> Floats:
+def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) -> Floats:
+    """A boss's profiles (n, m, 2) m brought together in B by a calibration, (k, 3) m."""
     X = _flange(record, arm, q)
     parts = [record.points_F(without_spikes(p)) @ X.rotation[k].T + X.translation[k] for k, p in enumerate(profiles)]
     return np.vstack(parts)

@@ -1,6 +1,7 @@
 """Worlds in which a profiler is calibrated by a sphere: an arm that is not its drawing, a sensor that is not flat, a bent torch.
 
-Everything random follows from the seed. The arm is a UR10e; the sag has the form that the calibration's model also has.
+Everything random follows from the seed. Two cells: the one that the fixed files were made in, from which files of other seeds
+come, and a UR10e with another scanner pose in every world. The sag has the form that the calibration's model also has.
 """
 
 from __future__ import annotations
@@ -16,18 +17,19 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere_model import SphereData
 from weldcal.models.arms.kinematics import load_arm
 
-HOME = np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0])  # the tool points downwards
 RADIUS_M = 0.020
 SAMPLES = 120
 REACH_RAD = np.radians(70.0)  # of the arc that is seen, from its top
+ABOUT = np.array([0.0, 0.2])  # the middle of the sensor's field
 
 
 @dataclass(frozen=True)
 class WorldErrors:
-    """One sigma of each cause (m, rad): lengths and angles of the arm, sag per metre of lever, sensor, tip, repeatability."""
+    """One sigma of each cause (m, rad): lengths, joints and twists of the arm, sag per metre of lever, sensor, tip, repeatability."""
 
     length_m: float = 0.125e-3
     angle_rad: float = np.radians(0.0125)
+    twist_rad: float = np.radians(0.0125)
     sag_rad_m: float = np.radians(0.02)
     affine: float = 0.008
     tip_m: float = 3.5e-3
@@ -35,7 +37,42 @@ class WorldErrors:
     noise_m: float = 0.05e-3
 
 
-CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, sag_rad_m=0.0, affine=0.0, tip_m=0.0)
+CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, affine=0.0, tip_m=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where
+    the groove's and the boss's frames lie, the groove turned about z."""
+
+    arm: DhArm
+    home: Floats
+    center: Floats
+    groove: Floats
+    groove_turn_deg: float
+    boss: Floats
+    boss_yaw_deg: float
+
+
+def files_cell() -> Cell:
+    """Of the fixed files: an arm of 1.4 m reach with a torch of 342 mm."""
+    rows = np.array(
+        [[180, -90, 400, 0], [600, 0, 0, -90], [120, -90, 0, 0], [0, 90, 620, 0], [0, -90, 0, 0], [0, 0, 115, 0]], float
+    ) * [1e-3, np.radians(1.0), 1e-3, np.radians(1.0)]  # fmt: skip
+    center = np.array([0.93, 0.06, 0.26])
+    return Cell(
+        DhArm(rows), np.array([0.0, 0.35, 0.25, 0.0, 0.95, 0.0]), center, np.array([0.78, 0.06, 0.23]), 0.0,
+        center - [0.0, 0.0, 0.03], 45.0,
+    )  # fmt: skip
+
+
+def ur10e_cell() -> Cell:
+    """A UR10e."""
+    center = np.array([-0.75, 0.12, 0.18])
+    home = np.radians([0.0, -110.0, 120.0, -100.0, -90.0, 0.0])
+    return Cell(
+        DhArm.of(load_arm("ur10e")), home, center, np.array([-0.75, -0.03, 0.15]), 90.0, center - [0.0, 0.0, 0.03], 57.0
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +89,7 @@ class SphereTests:
 class SphereWorld:
     """One robot with one profiler and one torch: `nominal` is what is believed, the rest is how it is."""
 
-    nominal: DhArm
+    cell: Cell
     real: DhArm
     sag: Floats
     rotation: Floats
@@ -61,23 +98,45 @@ class SphereWorld:
     tip_believed: Floats
     sensor: Floats
     offset: Floats
+    bend: Floats
     errors: WorldErrors
-    center: Floats
+
+    @staticmethod
+    def like_the_files(seed: int) -> SphereWorld:
+        """Of another seed than the fixed files, and else as they were made: only the arm's table, the tip and signs vary."""
+        e = WorldErrors(angle_rad=np.radians(0.015), twist_rad=np.radians(0.01))
+        rng = np.random.default_rng([seed, 75])
+        cell = files_cell()
+        tip = np.array([-0.012, 0.004, 0.342])
+        bent = np.array([[0.008, 0.012], [0.004, 0.014]]) * rng.choice([-1, 1], (2, 2))
+        return SphereWorld(
+            cell=cell,
+            real=_wrong(cell.arm, e, rng),
+            sag=0.3 * np.array([18e-6 * 30.5, 27e-6 * 19.0]) * 9.81,  # rad/Nm of joints 2 and 3 times kg beyond them
+            rotation=Rotation.from_euler("ZYX", [88.0, -14.0, 176.0], degrees=True).as_matrix(),
+            translation=np.array([0.035, -0.068, 0.165]),
+            tip=tip,
+            tip_believed=tip + 3.54e-3 * rng.standard_normal(3),
+            sensor=np.eye(2) + bent,
+            offset=np.array([0.5e-3, -0.8e-3]),
+            bend=np.array([0.02, -0.03]),
+            errors=e,
+        )
 
     @staticmethod
     def made(seed: int, errors: WorldErrors | None = None) -> SphereWorld:
-        """The world of a seed."""
+        """A UR10e's world of a seed, the scanner somewhere else in each."""
         e = errors or WorldErrors()
         rng = np.random.default_rng([seed, 71])
-        arm = DhArm.of(load_arm("ur10e"))
-        wrong = rng.standard_normal((6, 4)) * [e.length_m, e.angle_rad, e.length_m, e.angle_rad]
+        cell = ur10e_cell()
+        real = _wrong(cell.arm, e, rng)
         R = Rotation.from_euler("ZYX", rng.uniform(-1, 1, 3) * [60.0, 15.0, 15.0], degrees=True).as_matrix()
         t = np.array([0.035, -0.068, -0.02]) + rng.uniform(-0.02, 0.02, 3)
         tip = np.array([-0.012, 0.004, 0.19])
         sensor = np.eye(2) + e.affine * rng.uniform(-1.5, 1.5, (2, 2))
         return SphereWorld(
-            nominal=arm,
-            real=DhArm(arm.rows + wrong),
+            cell=cell,
+            real=real,
             sag=e.sag_rad_m * np.abs(rng.standard_normal(2)),
             rotation=R,
             translation=t,
@@ -85,9 +144,19 @@ class SphereWorld:
             tip_believed=tip + e.tip_m * rng.standard_normal(3),
             sensor=sensor,
             offset=e.affine * np.array([0.06, -0.1]),
+            bend=np.zeros(2),
             errors=e,
-            center=np.array([-0.75, 0.12, 0.18]),
         )
+
+    @property
+    def nominal(self) -> DhArm:
+        """The arm as it is drawn."""
+        return self.cell.arm
+
+    @property
+    def center(self) -> Floats:
+        """The sphere's (3,) m in B."""
+        return self.cell.center
 
     def poses(self, q: Floats) -> FlangePoses:
         """Where the flange really is."""
@@ -104,13 +173,13 @@ class SphereWorld:
 
     def measured(self, p: Floats, rng: np.random.Generator) -> Floats:
         """Profile points (..., 2) as the sensor reports them."""
-        about = np.array([0.0, 0.2])
-        bent = (p - about) @ self.sensor.T + about + self.offset
+        u = p - ABOUT
+        bent = u @ self.sensor.T + ABOUT + self.offset + self.bend * u**2
         return np.asarray(bent + self.errors.noise_m * rng.standard_normal(p.shape))
 
     def joints(self, R_BF: Floats, p_BF: Floats) -> Floats:
-        """Joints (n, 6) that the controller finds for flange poses, by Newton's method from HOME."""
-        q = np.tile(HOME, (len(p_BF), 1))
+        """Joints (n, 6) that the controller finds for flange poses, by Newton's method from the cell's home."""
+        q = np.tile(self.cell.home, (len(p_BF), 1))
         for _ in range(60):
             X = self.nominal.frames(q)
             dp = p_BF - X[:, 6, :3, 3]
@@ -144,6 +213,11 @@ class SphereWorld:
             p = p + targets - (X.rotation @ self.tip + X.translation)
             q = self.joints(R_BF, p)
         return q
+
+
+def _wrong(arm: DhArm, e: WorldErrors, rng: np.random.Generator) -> DhArm:
+    """The arm as it was built."""
+    return DhArm(arm.rows + rng.standard_normal((6, 4)) * [e.length_m, e.twist_rad, e.length_m, e.angle_rad])
 
 
 def looking_down(rng: np.random.Generator, n: int, tilt_deg: float, yaw_deg: float) -> Floats:
@@ -183,9 +257,9 @@ def sphere_trial(
     )
     p_S = np.column_stack(
         [
-            rng.uniform(-0.014, 0.014, n),
-            np.concatenate([rng.uniform(0.005, 0.016, translations), rng.uniform(0.006, 0.014, free) * rng.choice([-1, 1], free)]),
-            rng.uniform(0.196, 0.228, n),
+            np.concatenate([rng.uniform(-0.016, 0.016, translations), rng.uniform(-0.012, 0.012, free)]),
+            np.concatenate([rng.uniform(0.0055, 0.0165, translations), rng.uniform(0.006, 0.014, free) * rng.choice([-1, 1], free)]),
+            np.concatenate([rng.uniform(0.198, 0.226, translations), rng.uniform(0.195, 0.230, free)]),
         ]
     )  # fmt: skip
     q = world.joints(*world.viewing(R_BS, p_S, np.tile(world.center, (n, 1))))
