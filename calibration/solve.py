@@ -98,7 +98,9 @@ class _Solution:
     pivot: Array
     var_p: float
     var_n: float
+    information_p: Array  # what the positions alone bring of it
     redundancy: float = 1e6  # of the positions
+    redundancy_n: float = 1e6  # of the normals
 
 
 def estimate_eye_on_base(
@@ -255,7 +257,7 @@ def _reweighted(data: _Data, start: RigidTransform) -> tuple[_Solution, Flags]:
     dof = max(3 * h - 6, 1) / (3 * h)
     sigma = max(_scale_from_trimmed(e, h) / np.sqrt(dof), _POSITION_FLOOR_M) * _loose(3 * h - 6)
     keep = _gate(data, start, sigma**2) if n > 4 else np.ones(n, dtype=bool)
-    solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2)
+    solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2, np.eye(6))
     seen: set[bytes] = set()
     for _ in range(12):
         solution = _fit(data, keep, solution)
@@ -288,7 +290,7 @@ def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _S
     pivot = d.b.mean(axis=0)
     R, p = start.X_BC.rotation().matrix(), start.X_BC.translation()
     var_p, var_n = start.var_p, start.var_n
-    N, redundancy_p = np.eye(6), 1.0
+    N, N_p, redundancy_p, redundancy_n = np.eye(6), np.eye(6), 1.0, 1.0
     for step_number in range(iterations):
         q = d.c @ R.T + p
         e_p = q - d.b
@@ -328,7 +330,7 @@ def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _S
         var_p, var_n = new_p, new_n
         if step_number > 2 and settled and float(np.linalg.norm(step)) < 1e-10:
             break
-    return _Solution(RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n, redundancy_p)
+    return _Solution(RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n, N_p, redundancy_p, redundancy_n)
 
 
 def _component(variance: float, ratio: float, floor: float) -> float:
@@ -350,14 +352,25 @@ def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldO
 
 
 def _covariance_at_camera(solution: _Solution) -> Array:
-    """Move the tangent from the pivot to the camera origin, and widen it for a spread that was itself estimated.
-
-    The ratio of the 95 % quantiles of F (6, redundancy) and chi-square (6): with it, the Gaussian 95 % region of X_BC
-    holds the truth in 95 of 100 calibrations also where poses are few.
-    """
-    wider = float(6.0 * f_distribution.ppf(0.95, 6, solution.redundancy) / chi2.ppf(0.95, 6))
-    covariance = wider * np.linalg.pinv(solution.information)
+    """Move the tangent from the pivot to the camera origin, and widen it for spreads that were themselves estimated."""
     T = np.eye(6)
     T[3:, :3] = -skew(np.asarray(solution.X_BC.translation()) - solution.pivot)
-    out = T @ covariance @ T.T
+    out = T @ _widened(solution) @ T.T
     return np.asarray(0.5 * (out + out.T))
+
+
+def _widened(solution: _Solution) -> Array:
+    """Covariance about the pivot, such that its Gaussian 95 % region holds the truth in 95 of 100 calibrations of few poses.
+
+    Two things that a plain inverse leaves out: the weights between positions and normals are estimates too (Kenward and
+    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the ratio
+    of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
+    """
+    inverse = np.linalg.pinv(solution.information)
+    N_p = solution.information_p
+    N_n = solution.information - N_p
+    excess = np.zeros((6, 6))
+    for part, redundancy in ((N_p, solution.redundancy), (N_n, solution.redundancy_n)):
+        excess += 2.0 / redundancy * (inverse @ (part - part @ inverse @ part) @ inverse)
+    wider = float(6.0 * f_distribution.ppf(0.95, 6, solution.redundancy) / chi2.ppf(0.95, 6))
+    return np.asarray(wider * (inverse + 2.0 * excess))
