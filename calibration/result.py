@@ -17,6 +17,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.rigid import rotation_vector
+from weldcal.calibration.scanner_model import correction_from_document
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -53,7 +54,7 @@ class IcpRecord:
 @dataclass(frozen=True)
 class CalibrationResult:
     """All that calibration.yaml holds. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
-    origin."""
+    origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -71,6 +72,7 @@ class CalibrationResult:
     seed: int = 0
     data_hashes: dict[str, str] = field(default_factory=dict)
     scanner_correction: dict[str, Any] | None = None
+    joint_covariance: Array | None = None
     software: str = ""
 
 
@@ -123,6 +125,12 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
             "matrix": [[float(v) for v in row] for row in result.covariance],
         },
         "scanner_correction": result.scanner_correction,
+        "joint_covariance": None
+        if result.joint_covariance is None
+        else {
+            "order": "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2, bend_per_m3",
+            "matrix": [[float(v) for v in row] for row in result.joint_covariance],
+        },
         "held_out_mm": result.held_out_mm,
         "tilt_deg": result.tilt_deg,
         "sigma_position_mm": result.sigma_position_mm,
@@ -176,6 +184,7 @@ def load_result(path: Path) -> CalibrationResult:
         seed=int(d.get("seed", 0)),
         data_hashes=dict(d.get("data_sha256") or {}),
         scanner_correction=d.get("scanner_correction"),
+        joint_covariance=np.array(d["joint_covariance"]["matrix"], dtype=float) if d.get("joint_covariance") else None,
         software=str(d.get("software", "")),
     )
 
@@ -211,10 +220,11 @@ def correction_note(result: CalibrationResult) -> str | None:
     c = result.scanner_correction
     if c is None:
         return None
-    gx, gy = c["gradient_per_m"]
+    correction = correction_from_document(c)
+    assert correction is not None
     return (
         "X_BC belongs to corrected scanner points: multiply every point (x, y, z), in metres, by "
-        f"{c['scale']:.7f} {gx:+.7f} x {gy:+.7f} y before it is used; without that, calibrate with --no-scanner-correction."
+        f"{correction.formula} before it is used; without that, calibrate with --no-scanner-correction."
     )
 
 

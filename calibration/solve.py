@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.special import gammaincinv
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.observability import check_diversity, unobservable_sentences
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
+
+__all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -38,41 +39,6 @@ class SolveConfig:
     min_poses: int = 4
     allow_coplanar: bool = False
     leave_one_out: bool = True
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Errors of each pose under a calibration that never saw it: position at the flange centre (n,) m, tilt (n,) rad.
-
-    ``tilt_rad`` is NaN where no normal was seen. Poses refused as outliers keep their (large) error.
-    """
-
-    position_m: Array
-    tilt_rad: Array
-
-
-@dataclass(frozen=True)
-class CalibrationEstimate:
-    """Pose of the camera in the base and what is known of it.
-
-    ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
-    base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
-    ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
-    observations; the covariance is widened so that its Gaussian 95 % region does hold the truth that often, though the
-    spread was estimated from few residuals. ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot and
-    scanner together beyond the noise of the fits, estimated from the residuals.
-    """
-
-    X_BC: RigidTransform
-    covariance: Array
-    inliers: Flags
-    position_residuals_m: Array
-    tilt_residuals_rad: Array
-    held_out: HeldOut
-    sigma_position_m: float
-    sigma_normal_rad: float
-    unobservable: tuple[str, ...]
-    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -160,13 +126,6 @@ def estimate_eye_on_base(
         unobservable=unobservable_sentences([o.X_BR for o in used], sigma_p, bool(data.has.any())),
         warnings=tuple(warnings),
     )
-
-
-def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
-    """Covariance (3, 3) m^2, in B, of the base position of a scanned point that is seen at ``p_BQ`` (3,) m."""
-    lever = -skew(np.asarray(p_BQ, dtype=float) - estimate.X_BC.translation())
-    J = np.hstack([lever, np.eye(3)])
-    return np.asarray(J @ estimate.covariance @ J.T)
 
 
 def _arrays(observations: tuple[Observation, ...], use_normals: bool) -> _Data:
@@ -372,5 +331,4 @@ def _widened(solution: _Solution) -> Array:
     excess = np.zeros((6, 6))
     for part, redundancy in ((N_p, solution.redundancy), (N_n, solution.redundancy_n)):
         excess += 2.0 / redundancy * (inverse @ (part - part @ inverse @ part) @ inverse)
-    wider = float(6.0 * f_distribution.ppf(0.95, 6, solution.redundancy) / chi2.ppf(0.95, 6))
-    return np.asarray(wider * (inverse + 2.0 * excess))
+    return np.asarray(few_residuals(solution.redundancy) * (inverse + 2.0 * excess))

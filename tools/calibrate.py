@@ -190,7 +190,7 @@ def calibrate_dataset(
             seed=seed,
             solve=None
             if scanner is None or scanner.accepted is None
-            else lambda poses: calibrate_corrected(poses, seen.patterns, seed=seed),
+            else lambda poses: calibrate_corrected(poses, seen.patterns, seed=seed, order=scanner.accepted.order),
         )
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
@@ -224,6 +224,7 @@ def calibrate_dataset(
         seed=seed,
         data_hashes=data.hashes,
         scanner_correction=correction,
+        joint_covariance=estimate.joint,
         software=software_version(),
     )
     report = CalibrationReport(
