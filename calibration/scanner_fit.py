@@ -156,9 +156,9 @@ def from_motion(
     T = np.eye(6 + terms)
     T[3:6, :3] = -skew(p - pivot)
     X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-    joint = np.asarray(T @ inverse @ T.T)
+    joint: Array = np.asarray(T @ inverse @ T.T, dtype=np.float64)
     return CorrectionEstimate(
-        correction_of(change[:terms], field), inverse[6:, 6:], X_BC, joint, redundancy, float(sigma_p), float(sigma_n)
+        correction_of(change[:terms], field), joint[6:, 6:], X_BC, joint, redundancy, float(sigma_p), float(sigma_n)
     )
 
 

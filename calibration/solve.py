@@ -25,12 +25,15 @@ _HUBER = 2.0
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
 _NORMAL_FLOOR_RAD = 1e-6
+USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
+"""What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 
 
 @dataclass(frozen=True)
 class SolveConfig:
     """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
-    agree)."""
+    agree). ``usual_weight`` is how many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts
+    for beside the residuals themselves: three poses have too few of them."""
 
     seed: int = 0
     max_outliers: float = 0.40
@@ -39,6 +42,7 @@ class SolveConfig:
     min_poses: int = 4
     allow_coplanar: bool = False
     leave_one_out: bool = True
+    usual_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def estimate_eye_on_base(
     data = _arrays(observations, config.use_normals)
     check_diversity(data.b, data.has, min_poses=config.min_poses, allow_coplanar=config.allow_coplanar)
     start = _robust_start(data, config)
-    solution, inliers = _reweighted(data, start)
+    solution, inliers = _reweighted(data, start, config.usual_weight)
     n = len(data.b)
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
@@ -107,7 +111,7 @@ def estimate_eye_on_base(
     residual, tilt = _residuals(data, solution.X_BC)
     held_out = HeldOut(residual.copy(), tilt.copy())
     if config.leave_one_out:
-        held_out = _leave_one_out(data, inliers, solution, held_out)
+        held_out = _leave_one_out(data, inliers, solution, held_out, config.usual_weight)
     warnings = []
     if not inliers.all():
         names = ", ".join(o.id for o, keep in zip(observations, inliers, strict=True) if not keep)
@@ -207,7 +211,7 @@ def _scale_from_trimmed(e: Array, h: int) -> float:
     return float(np.partition(e, h - 1)[h - 1] / np.sqrt(2.0 * gammaincinv(1.5, q)))
 
 
-def _reweighted(data: _Data, start: RigidTransform) -> tuple[_Solution, Flags]:
+def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple[_Solution, Flags]:
     """Alternate gating and weighted fits until the set of inliers repeats."""
     n = len(data.b)
     e, _ = _residuals(data, start)
@@ -219,7 +223,7 @@ def _reweighted(data: _Data, start: RigidTransform) -> tuple[_Solution, Flags]:
     solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2, np.eye(6))
     seen: set[bytes] = set()
     for _ in range(12):
-        solution = _fit(data, keep, solution)
+        solution = _fit(data, keep, solution, usual)
         seen.add(keep.tobytes())
         if n <= 4:
             break
@@ -243,7 +247,7 @@ def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:
     return np.asarray(d2 < _GATE**2)
 
 
-def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _Solution:
+def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0, iterations: int = 40) -> _Solution:
     """Weighted Gauss-Newton on the kept poses, variance components updated between steps."""
     d = data.pick(keep)
     pivot = d.b.mean(axis=0)
@@ -279,17 +283,18 @@ def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _S
         inverse = np.linalg.pinv(N)
         redundancy_p = max(3.0 * len(q) - float(np.trace(inverse @ N_p)), 0.3)
         redundancy_n = max(2.0 * len(s) - float(np.trace(inverse @ N_n)), 0.3)
-        new_p = _component(var_p, (w_p * maha**2 * 3.0).sum() / redundancy_p, _POSITION_FLOOR_M)
-        new_n = (
-            _component(var_n, (w_n / k_n * maha_n**2 * 2.0).sum() / redundancy_n, _NORMAL_FLOOR_RAD)
-            if len(s)
-            else var_n
-        )
+        square_p, square_n = float((w_p * maha**2).sum()) * 3.0, float((w_n / k_n * maha_n**2).sum()) * 2.0
+        ratio_p = (square_p + usual * USUAL_SPREAD_M**2 / var_p) / (redundancy_p + usual)
+        ratio_n = (square_n + usual * USUAL_TILT_RAD**2 / var_n) / (redundancy_n + usual)
+        new_p = _component(var_p, ratio_p, _POSITION_FLOOR_M)
+        new_n = _component(var_n, ratio_n, _NORMAL_FLOOR_RAD) if len(s) else var_n
         settled = abs(new_p / var_p - 1.0) + abs(new_n / var_n - 1.0) < 1e-4
         var_p, var_n = new_p, new_n
         if step_number > 2 and settled and float(np.linalg.norm(step)) < 1e-10:
             break
-    return _Solution(RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n, N_p, redundancy_p, redundancy_n)
+    return _Solution(
+        RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n, N_p, redundancy_p + usual, redundancy_n + usual
+    )
 
 
 def _component(variance: float, ratio: float, floor: float) -> float:
@@ -297,14 +302,14 @@ def _component(variance: float, ratio: float, floor: float) -> float:
     return max(variance * float(np.clip(ratio, 0.1, 100.0)), floor**2)
 
 
-def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut) -> HeldOut:
+def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut, usual: float) -> HeldOut:
     position, tilt = full.position_m.copy(), full.tilt_rad.copy()
-    if int(inliers.sum()) < 4:
+    if int(inliers.sum()) < (3 if data.has.all() else 4):
         return HeldOut(np.full_like(position, np.nan), np.full_like(tilt, np.nan))
     for i in np.nonzero(inliers)[0]:
         keep = inliers.copy()
         keep[i] = False
-        without = _fit(data, keep, solution)
+        without = _fit(data, keep, solution, usual)
         e, t = _residuals(data.pick(np.arange(len(inliers)) == i), without.X_BC)
         position[i], tilt[i] = float(e[0]), float(t[0])
     return HeldOut(position, tilt)
