@@ -56,11 +56,12 @@ class SpeedJointServo(LeafSystem):
         self._config = config
         self._seed = seed
         offset = self._offset(q_start, 0)
+        own = [*offset, 0.0] if config.repeatability_mm else []
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._arm_state = self.DeclareVectorInputPort("arm_state", 12)
-        # q_ref, v_ref, q, v, sample time, fault, joint offset of this stop, number of it
+        # q_ref, v_ref, q, v, sample time, fault; of an arm that repeats imperfectly: joint offset of this stop, its number
         state = self.DeclareDiscreteState(
-            np.concatenate([q_start, np.zeros(6), q_start - offset, np.zeros(6), [0.0, 0.0], offset, [0.0]])
+            np.concatenate([q_start, np.zeros(6), q_start - offset, np.zeros(6), [0.0, 0.0], own])
         )
         ticket = {self.discrete_state_ticket(state)}
         self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
@@ -86,12 +87,13 @@ class SpeedJointServo(LeafSystem):
         step = self._arm.acceleration_limit * dt
         v_ref = old[6:12] + np.clip(wanted - old[6:12], -step, step)
         q_ref = np.clip(old[:6] + dt * v_ref, self._arm.position_lower, self._arm.position_upper)
-        offset, stop = old[26:32], old[32]
-        if self._config.repeatability_mm and not old[6:12].any() and v_ref.any():
-            stop += 1.0
-            offset = self._offset(measured[:6], int(stop))
-        measured[:6] -= offset
-        discrete.set_value(np.concatenate([q_ref, v_ref, measured, [context.get_time(), fault], offset, [stop]]))
+        own = old[26:].copy()
+        if own.size:
+            if not old[6:12].any() and v_ref.any():  # it sets off
+                own[6] += 1.0
+                own[:6] = self._offset(measured[:6], int(own[6]))
+            measured[:6] -= own[:6]
+        discrete.set_value(np.concatenate([q_ref, v_ref, measured, [context.get_time(), fault], own]))
 
     def _offset(self, q: np.ndarray, stop: int) -> np.ndarray:
         """Joint offsets (6,) rad that displace the flange by the repeatability (rms), whatever the arm's pose."""

@@ -12,7 +12,9 @@ import open3d as o3d
 import pytest
 
 from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.observation import Observation
 from weldcal.calibration.result import load_result
+from weldcal.calibration.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.calibrate import CalibrationReport, calibrate_dataset
@@ -38,12 +40,12 @@ def test_every_aubo_cloud_is_used_and_held_out_errors_beat_the_paper(aubo: Calib
     assert d["refused"] == []
     # the paper's method: 0.63 to 0.73 mm on these scans; good centres, rigid: 0.22 to 0.23 (median), 0.30 (mean); with
     # the scanner corrected: 0.16 to 0.20 and 0.17 to 0.20
-    assert d["held_out_mm"]["median"] < 0.20
-    assert d["held_out_mm"]["mean"] < 0.205
-    assert d["held_out_mm"]["p95"] < 0.34
+    assert d["held_out_mm"]["median"] < 0.19
+    assert d["held_out_mm"]["mean"] < 0.20
+    assert d["held_out_mm"]["p95"] < 0.33
     assert d["k_fold_mm"]["median"] < 0.21
-    # normals scatter by 0.07 deg per axis between scans
-    assert d["tilt_deg"]["median"] < 0.10
+    # normals scatter by 0.07 deg per axis between scans; where the image's bends are corrected, 0.05
+    assert d["tilt_deg"]["median"] < 0.065
     assert any("constant bias of the flange centre" in s for s in d["unobservable"])
 
 
@@ -161,6 +163,11 @@ def _empty_of_four(folder: Path) -> None:
     next(iter(sorted((folder / "clouds").iterdir()))).write_bytes(b"")
 
 
+def _first_pairs(folder: Path, n: int) -> None:
+    lines = (folder / "pairs.csv").read_text().splitlines()
+    (folder / "pairs.csv").write_text("\n".join(lines[: n + 1]) + "\n")
+
+
 def _coplanar(folder: Path) -> None:
     lines = (folder / "pairs.csv").read_text().splitlines()
     rows = [line.split(",") for line in lines[1:]]
@@ -179,7 +186,9 @@ def _coplanar(folder: Path) -> None:
         (AUBO, _nan_pose, "nan in column x of 'pose04'"),
         (AUBO, _empty_of_four, r"pose02: The cloud pose02\.pcd is empty"),
         (AUBO, _some_nan, r"pose04: 5 of the \d+ points of pose04\.pcd are NaN"),
-        (AUBO, lambda f: _keep(f, 3), "3 poses; a calibration needs at least 4"),
+        (AUBO, lambda f: _keep(f, 1), "One scan leaves a rotation open: .* with --axis-turn DEGREES"),
+        (UR10E, lambda f: _first_pairs(f, 2), "Two centres leave a rotation open"),
+        (UR10E, lambda f: _first_pairs(f, 3), "The 3 flange centres lie on one line"),
         (UR10E, _coplanar, "lie in one plane"),
     ],
     ids=[
@@ -189,7 +198,9 @@ def _coplanar(folder: Path) -> None:
         "NaN in a pose",
         "empty cloud",
         "some NaN points",
-        "three poses",
+        "one pose",
+        "two pairs",
+        "three pairs in a row",
         "four coplanar",
     ],
 )
@@ -222,3 +233,35 @@ def test_one_bad_cloud_among_good_ones_is_refused_by_name(tmp_path: Path) -> Non
     assert d["n_used"] == 5
     assert d["refused"][0]["id"] == "pose04"
     assert d["refused"][0]["reason"].endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("n", "turn", "limit_mm"), [(1, True, 0.7), (2, False, 0.6), (3, False, 0.45)], ids=["one", "two", "three"]
+)
+def test_one_to_three_scans_calibrate_and_say_what_their_figures_rest_on(
+    aubo: CalibrationReport, tmp_path: Path, n: int, turn: bool, limit_mm: float
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(AUBO, folder, copy_function=shutil.copyfile)
+    for path in [folder, *folder.rglob("*")]:
+        path.chmod(0o755)
+    _keep(folder, n)
+    known = aubo.result.axis_turn_deg
+    assert (
+        known is not None
+    )  # the drilled pattern of this arm is turned by a degree or so: 0.85 to 0.91 in other people's hands
+    assert known[0] == pytest.approx(0.88, abs=0.1)
+    report = calibrate_dataset(folder, tmp_path / "out", axis_turn_deg=known[0] if turn else None)
+    assert f"From {'one scan' if n == 1 else f'{n} scans'} only" in report.result.warnings[0]
+    assert np.isfinite(report.result.held_out_mm["median"]) == (n == 3)
+    assert load_result(tmp_path / "out").covariance.shape == (6, 6)
+    # other people's fits of this set: 0.44 mm from one scan, 0.24 to 0.33 from two and three, medians over draws; this is one draw
+    seen = {o.id for o in report.observations}
+    rest = [o for o in _as_seen(aubo) if o.id not in seen]
+    assert 1e3 * float(np.median(position_errors(report.result.X_BC, rest))) < limit_mm
+
+
+def _as_seen(aubo: CalibrationReport) -> list[Observation]:
+    """The sightings of all scans without a correction of the scanner."""
+    X_BR = {o.id: o.X_BR for o in aubo.observations}
+    return [Observation(id, X_BR[id], fit.center_C) for id, fit in aubo.fits.items()]
