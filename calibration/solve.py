@@ -20,7 +20,7 @@ __all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_bas
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_GATE = 8.0  # in sigma per axis: only gross outliers go; what a scanner's distortion does at the rim of its field stays
+_GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
 _HUBER = 2.0
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
