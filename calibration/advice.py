@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 _TURN_DEG = 15.0  # orientations that differ by less hardly tell a bias of the centre from a shift of the camera
 _FLAT = 0.25  # of the widest spread of positions: less in a direction leaves the rotation about the others weak
 _WEAK_FACTOR = 1.5  # of the error in the middle: a corner that is worse is worth a pose
+_FEW = 4
 _LITTLE = 0.1  # gain by one more pose, as a share of the error, that is not worth a scan
 
 
@@ -36,7 +37,9 @@ def sampling_advice(
     spread = np.linalg.svd(p - middle, full_matrices=False)
     width = spread[1] / np.sqrt(len(used))
     out = []
-    for k in (1, 2):
+    if len(used) < _FEW:
+        out.append(f"Add poses, to {_FEW} at least, whose flange centres do not lie in one plane.")
+    for k in (1, 2) if len(used) >= _FEW else ():
         if width[k] < _FLAT * width[0]:
             out.append(
                 f"Spread the poses along {_direction(spread[2][k])} of the robot's base: they vary by only "
@@ -49,7 +52,8 @@ def sampling_advice(
             "constant error of the flange centre or of the tool's offset cannot be seen."
         )
     sigma = sigma_at(estimate, middle)
-    corners = middle + 1.5 * np.vstack([spread[2] * width[:, None], -spread[2] * width[:, None]])
+    reach = spread[2][: len(width)] * width[:, None]
+    corners = middle + 1.5 * np.vstack([reach, -reach])
     errors = np.array([sigma_at(estimate, c) for c in corners])
     worst = int(np.argmax(errors))
     if errors[worst] > _WEAK_FACTOR * sigma:

@@ -1,19 +1,31 @@
-"""The scanner's pose from one, two or three scans: whole flange poses, where the flange's rotation about its axis is known."""
+"""The scanner's pose from one, two or three scans: with normals, or whole poses where the turn of the holes is known."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.estimate import CalibrationEstimate, HeldOut
 from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.observability import unobservable_sentences
 from weldcal.calibration.observation import Observation
+from weldcal.calibration.rigid import skew
+from weldcal.calibration.solve import USUAL_SPREAD_M, USUAL_TILT_RAD, SolveConfig, estimate_eye_on_base
+from weldcal.calibration.validation import position_errors, tilt_errors
 
 Array = NDArray[np.float64]
+
+ENOUGH = 4
+"""Poses from which on a calibration needs no such help."""
+
+_TURN_KNOWN_RAD = float(np.radians(0.1))  # as well as a calibration from many poses states it, and as a person would
+_HOLE_CIRCLE_M = 0.025
+_USUAL_WEIGHT = 4.0  # residuals' worth of what is usual of robot and scanner
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,3 +77,89 @@ def axis_turn(
         raise TooFewPoses("No scan shows the flange's holes well enough to tell its rotation about the axis.")
     middle = float(np.median(turns))
     return middle, float(np.std(turns, ddof=1)) if len(turns) > 1 else float("nan")
+
+
+def calibrate_from_few(
+    observations: Sequence[Observation],
+    patterns: Mapping[str, HolePattern],
+    axis_turn_rad: float | None = None,
+    *,
+    seed: int = 0,
+) -> CalibrationEstimate:
+    """X_BC from one to three sightings, with a covariance that rests on what is usual of robot and scanner where the data are
+    too few to say.
+
+    With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three pairs, or two
+    scans with face normals. Held-out errors are those of each pose under the others, NaN where the others are too few. Raises
+    TooFewPoses, RepeatedPoses, CoplanarPoses or InconsistentPoses.
+    """
+    n = len(observations)
+    if axis_turn_rad is not None:
+        return _from_whole_poses(observations, patterns, axis_turn_rad)
+    normals = all(o.n_C is not None for o in observations)
+    need = 2 if normals else 3
+    if n < need:
+        there = "One scan leaves" if n == 1 else "Two centres leave"
+        raise TooFewPoses(
+            f"{there} a rotation open: take {ENOUGH} poses or more, whose flange centres do not lie in one plane, or state how far the "
+            "hole pattern is turned about the flange's axis with --axis-turn DEGREES (a calibration from many scans reports it)."
+        )
+    config = SolveConfig(seed=seed, min_poses=need, allow_coplanar=True, usual_weight=_USUAL_WEIGHT)
+    return _said(
+        estimate_eye_on_base(observations if isinstance(observations, tuple) else list(observations), config), n
+    )
+
+
+def _from_whole_poses(
+    observations: Sequence[Observation], patterns: Mapping[str, HolePattern], turn_rad: float
+) -> CalibrationEstimate:
+    seen = [o for o in observations if o.id in patterns]
+    X = estimate_from_whole_poses(observations, patterns, turn_rad).X_BC
+    n = len(seen)
+    information = np.zeros((3, 3))
+    for o in seen:
+        R = o.X_BR.rotation().matrix()
+        sigma = np.array([USUAL_TILT_RAD, USUAL_TILT_RAD, max(patterns[o.id].rms_m / _HOLE_CIRCLE_M, USUAL_TILT_RAD)])
+        information += R @ np.diag(1.0 / sigma**2) @ R.T
+    axis = np.mean([o.n_B for o in seen], axis=0)
+    # the turn is stated once for all scans: its error does not average out
+    rotation = np.linalg.inv(information) + _TURN_KNOWN_RAD**2 * np.outer(axis, axis)
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3], covariance[3:, 3:] = rotation, USUAL_SPREAD_M**2 / n * np.eye(3)
+    T = np.eye(6)
+    T[3:, :3] = -skew(np.asarray(X.translation()) - np.mean([o.p_BR for o in seen], axis=0))
+    held_out = np.full((2, len(observations)), np.nan)
+    for k, o in enumerate(observations):
+        rest = [other for other in seen if other is not o]
+        if rest:
+            without = estimate_from_whole_poses(rest, patterns, turn_rad).X_BC
+            held_out[:, k] = position_errors(without, [o])[0], tilt_errors(without, [o])[0]
+    estimate = CalibrationEstimate(
+        X_BC=X,
+        covariance=T @ covariance @ T.T,
+        inliers=np.array([o.id in patterns for o in observations]),
+        position_residuals_m=position_errors(X, observations),
+        tilt_residuals_rad=tilt_errors(X, observations),
+        held_out=HeldOut(held_out[0], held_out[1]),
+        sigma_position_m=USUAL_SPREAD_M,
+        sigma_normal_rad=USUAL_TILT_RAD,
+        unobservable=unobservable_sentences([o.X_BR for o in seen], USUAL_SPREAD_M, True),
+        warnings=(),
+    )
+    return _said(estimate, n)
+
+
+def _said(estimate: CalibrationEstimate, n: int) -> CalibrationEstimate:
+    """With the sentence that says what the figures rest on."""
+    scans = "one scan" if n == 1 else f"{n} scans"
+    held = estimate.held_out.position_m
+    judged = (
+        "nothing could be held out"
+        if not np.isfinite(held).any()
+        else f"the held-out errors are those of {n - 1} of them"
+    )
+    text = (
+        f"From {scans} only: the uncertainty rests on what is usual of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "
+        f"{np.degrees(USUAL_TILT_RAD):.2f} degrees an axis), {judged}; a calibration from {ENOUGH} poses and more can judge itself."
+    )
+    return replace(estimate, warnings=(*estimate.warnings, text))

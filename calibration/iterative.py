@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,6 +53,27 @@ def axes_cost(axes: tuple[int, ...], work_radius_m: float) -> Cost:
         return float(np.linalg.norm(scaled[list(axes)]))
 
     return cost
+
+
+COST_AXES = ("roll", "pitch", "yaw", "x", "y", "z")
+COSTS = ("translation", "translation_and_rotation", "work_radius")
+
+
+def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST_AXES) -> Cost:
+    """The cost a scenario asks for: the translation; section 4.2's norm over the chosen ``axes`` of COST_AXES at the work radius
+    (``work_radius``); or a bound on the error at that radius (``translation_and_rotation``). Raises InputError."""
+    if name not in COSTS:
+        raise InputError(f"calibration.cost must be {', '.join(COSTS[:-1])} or {COSTS[-1]}, not '{name}'.")
+    if not work_radius_m >= 0.0:
+        raise InputError(f"calibration.work_radius_mm must not be negative, and it is {1e3 * work_radius_m:g}.")
+    unknown = [axis for axis in axes if axis not in COST_AXES]
+    if unknown or not axes:
+        raise InputError(
+            f"calibration.cost_axes must be some of {', '.join(COST_AXES)}, not {', '.join(unknown) or 'none'}."
+        )
+    if name == "work_radius":
+        return axes_cost(tuple(COST_AXES.index(axis) for axis in axes), work_radius_m)
+    return translation_cost if name == "translation" else translation_and_rotation_cost(work_radius_m)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,8 @@ def check_diversity(
 ) -> None:
     """Refuse sets of flange centres (n, 3) m that do not fix a calibration by the paper's rule (four, not coplanar).
 
-    ``min_poses`` and ``allow_coplanar`` relax the rule where face normals are used too (at least two poses, then).
+    ``min_poses`` and ``allow_coplanar`` relax the rule: with face normals two poses are enough, without three that do not lie on
+    one line.
     Raises TooFewPoses, RepeatedPoses (fewer than ``min_poses`` distinct places, 2 mm apart) and CoplanarPoses (rms
     distance from the best plane under 2 mm or under 1 % of the extent). Source: paper, after Eq. (12).
     """
@@ -42,7 +43,7 @@ def check_diversity(
             f"The {n} poses repeat only {len(distinct)} place{'s' if len(distinct) > 1 else ''} (within 2 mm); scan "
             f"the flange at {min_poses} or more different places."
         )
-    if allow_coplanar or n < 3:
+    if n < 3 or (allow_coplanar and bool(has_normal.all())):
         return
     spread = np.linalg.svd(p_B - p_B.mean(axis=0), compute_uv=False) / np.sqrt(n)
     limit = max(MIN_DEPTH_M, MIN_DEPTH_SHARE * float(spread[0]))
@@ -50,7 +51,7 @@ def check_diversity(
         raise CoplanarPoses(
             f"The {n} flange centres lie on one line; move the flange sideways and towards the scanner between scans."
         )
-    if spread[2] < limit:
+    if spread[2] < limit and not allow_coplanar:
         raise CoplanarPoses(
             f"The {n} flange centres lie in one plane (within {1e3 * spread[2]:.1f} mm rms); move the flange towards "
             "and away from it between scans."

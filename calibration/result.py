@@ -17,6 +17,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.rigid import rotation_vector
+from weldcal.calibration.scanner_model import correction_from_document
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -53,7 +54,8 @@ class IcpRecord:
 @dataclass(frozen=True)
 class CalibrationResult:
     """All that calibration.yaml holds. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
-    origin."""
+    origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one;
+    ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -71,6 +73,8 @@ class CalibrationResult:
     seed: int = 0
     data_hashes: dict[str, str] = field(default_factory=dict)
     scanner_correction: dict[str, Any] | None = None
+    joint_covariance: Array | None = None
+    axis_turn_deg: tuple[float, float] | None = None
     software: str = ""
 
 
@@ -123,7 +127,14 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
             "matrix": [[float(v) for v in row] for row in result.covariance],
         },
         "scanner_correction": result.scanner_correction,
-        "held_out_mm": result.held_out_mm,
+        "joint_covariance": None
+        if result.joint_covariance is None
+        else {
+            "order": "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2, bend_per_m3",
+            "matrix": [[float(v) for v in row] for row in result.joint_covariance],
+        },
+        "axis_turn_deg": None if result.axis_turn_deg is None else list(result.axis_turn_deg),
+        "held_out_mm": {k: v if np.isfinite(v) else None for k, v in result.held_out_mm.items()},
         "tilt_deg": result.tilt_deg,
         "sigma_position_mm": result.sigma_position_mm,
         "sigma_normal_deg": result.sigma_normal_deg,
@@ -162,7 +173,7 @@ def load_result(path: Path) -> CalibrationResult:
     return CalibrationResult(
         X_BC=RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3]),
         covariance=covariance,
-        held_out_mm=dict(d.get("held_out_mm") or {}),
+        held_out_mm={k: float("nan") if v is None else v for k, v in (d.get("held_out_mm") or {}).items()},
         tilt_deg=dict(d.get("tilt_deg") or {}),
         poses=tuple(PoseRecord(**r) for r in d.get("poses") or []),
         icp=tuple(_icp_record(r) for r in d.get("icp") or []),
@@ -176,6 +187,8 @@ def load_result(path: Path) -> CalibrationResult:
         seed=int(d.get("seed", 0)),
         data_hashes=dict(d.get("data_sha256") or {}),
         scanner_correction=d.get("scanner_correction"),
+        joint_covariance=np.array(d["joint_covariance"]["matrix"], dtype=float) if d.get("joint_covariance") else None,
+        axis_turn_deg=_two(d.get("axis_turn_deg")),
         software=str(d.get("software", "")),
     )
 
@@ -211,10 +224,11 @@ def correction_note(result: CalibrationResult) -> str | None:
     c = result.scanner_correction
     if c is None:
         return None
-    gx, gy = c["gradient_per_m"]
+    correction = correction_from_document(c)
+    assert correction is not None
     return (
         "X_BC belongs to corrected scanner points: multiply every point (x, y, z), in metres, by "
-        f"{c['scale']:.7f} {gx:+.7f} x {gy:+.7f} y before it is used; without that, calibrate with --no-scanner-correction."
+        f"{correction.formula} before it is used; without that, calibrate with --no-scanner-correction."
     )
 
 
@@ -256,6 +270,10 @@ def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
 def _wxyz(X: RigidTransform) -> tuple[float, float, float, float]:
     q: Quaternion = X.rotation().ToQuaternion()
     return float(q.w()), float(q.x()), float(q.y()), float(q.z())
+
+
+def _two(values: list[float] | None) -> tuple[float, float] | None:
+    return None if values is None else (float(values[0]), float(values[1]))
 
 
 def _icp_record(fields: dict[str, Any]) -> IcpRecord:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,38 +14,95 @@ from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
 
+EXPONENTS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+"""Powers of x and y of each term of the factor, in order."""
+TERMS = {1: 3, 2: 6, 3: 10}
+"""How many terms a correction of that order has."""
+
 _LARGEST = 0.05  # a factor farther from 1 is no property of a scanner that measures
 
 
 @dataclass(frozen=True)
 class ScannerCorrection:
-    """p_C corrected = p_C (scale + gx x + gy y), with x and y (m) of the point as it was measured, camera frame.
+    """p_C corrected = p_C (scale + gx x + gy y + bends), with x and y (m) of the point as it was measured, camera frame.
 
-    ``gradient_per_m`` is (gx, gy) in 1/m. Raises InputError for numbers that are not finite or a scale that is off by
-    more than 5 %.
+    ``gradient_per_m`` is (gx, gy) in 1/m. ``bend`` is empty, or the factors of x^2, x y, y^2 (1/m^2), or those and of x^3, x^2 y,
+    x y^2, y^3 (1/m^3): what a lens that is not quite known does. Bends hold within ``field_m`` (smallest and largest x, then y, m), where
+    they were seen; beyond, they stay as at its edge, because a polynomial is no forecast. Raises InputError for numbers that are
+    not finite or a scale that is off by more than 5 %.
     """
 
     scale: float = 1.0
     gradient_per_m: tuple[float, float] = (0.0, 0.0)
+    bend: tuple[float, ...] = ()
+    field_m: tuple[float, float, float, float] | None = None
 
     def __post_init__(self) -> None:
-        values = np.array([self.scale, *self.gradient_per_m])
-        if not np.isfinite(values).all() or abs(self.scale - 1.0) > _LARGEST:
+        values = np.array([self.scale, *self.gradient_per_m, *self.bend, *(self.field_m or ())])
+        if not np.isfinite(values).all() or abs(self.scale - 1.0) > _LARGEST or len(self.values) not in TERMS.values():
             raise InputError("The scanner correction is not usable: its scale must lie within 5 % of 1.")
+
+    @property
+    def values(self) -> Array:
+        """Factors (K,) of the terms, K = 3, 6 or 10."""
+        return np.array([self.scale, *self.gradient_per_m, *self.bend])
+
+    @property
+    def order(self) -> int:
+        """1, 2 or 3: the highest power of its terms."""
+        return next(order for order, size in TERMS.items() if size == len(self.values))
+
+    def factor(self, p_C: Array) -> Array:
+        """The factor (...) of points (..., 3): the sum of the terms, weighted by ``values``."""
+        out = np.zeros(np.shape(p_C)[:-1])
+        for term, value in zip(self._each(np.asarray(p_C, dtype=float)), self.values, strict=True):
+            out += value * term
+        return out
+
+    def terms(self, p_C: Array) -> Array:
+        """The terms (..., K) at points (..., 3)."""
+        return np.stack(list(self._each(np.asarray(p_C, dtype=float))), axis=-1)
+
+    def _each(self, p: Array) -> Iterator[Array]:
+        near = self._within(p) if self.bend else p
+        for i, j in EXPONENTS[: len(self.values)]:
+            at = p if i + j < 2 else near
+            yield at[..., 0] ** i * at[..., 1] ** j + 0.0 * p[..., 2]
+
+    def slopes(self, p_C: Array) -> Array:
+        """Derivatives (..., K, 2) of the terms by x and y."""
+        p = np.asarray(p_C, dtype=float)
+        near = self._within(p)
+        inside = (near == p[..., :2]).astype(float)
+        out = np.zeros((*p.shape[:-1], len(self.values), 2))
+        for k, (i, j) in enumerate(EXPONENTS[: len(self.values)]):
+            x, y = (p if i + j < 2 else near)[..., 0], (p if i + j < 2 else near)[..., 1]
+            moves = inside if i + j > 1 else np.ones_like(inside)
+            if i:
+                out[..., k, 0] = i * x ** (i - 1) * y**j * moves[..., 0]
+            if j:
+                out[..., k, 1] = j * x**i * y ** (j - 1) * moves[..., 1]
+        return out
+
+    def _within(self, p: Array) -> Array:
+        """x and y (..., 2), brought back to the edge of the field where they lie beyond it."""
+        if self.field_m is None:
+            return np.asarray(p[..., :2])
+        x0, x1, y0, y1 = self.field_m
+        return np.stack([np.clip(p[..., 0], x0, x1), np.clip(p[..., 1], y0, y1)], axis=-1)
 
     def points(self, p_C: Array) -> Array:
         """Corrected points (..., 3) m; NaN stays NaN."""
         p = np.asarray(p_C, dtype=float)
-        gx, gy = self.gradient_per_m
-        return np.asarray(p * (self.scale + gx * p[..., :1] + gy * p[..., 1:2]))
+        return np.asarray(p * self.factor(p)[..., None])
 
     def jacobian(self, p_C: Array) -> Array:
         """Derivative (..., 3, 3) of the corrected by the measured point."""
         p = np.asarray(p_C, dtype=float)
-        gx, gy = self.gradient_per_m
-        factor = self.scale + gx * p[..., 0] + gy * p[..., 1]
-        slope = np.array([gx, gy, 0.0])
-        return np.asarray(factor[..., None, None] * np.eye(3) + p[..., :, None] * slope)
+        factor = self.factor(p)
+        slope = np.zeros(p.shape)
+        slope[..., :2] = np.einsum("...ki,k->...i", self.slopes(p), self.values)
+        return np.asarray(factor[..., None, None] * np.eye(3) + p[..., :, None] * slope[..., None, :])
 
     def normals(self, p_C: Array, n_C: Array) -> Array:
         """Unit normals (..., 3) of the corrected surface at measured points (..., 3) with measured normals (..., 3)."""
@@ -60,8 +118,26 @@ class ScannerCorrection:
         )
 
     def document(self) -> dict[str, Any]:
-        """As calibration.yaml and the JSON object hold it."""
-        return {"scale": float(self.scale), "gradient_per_m": [float(v) for v in self.gradient_per_m]}
+        """As calibration.yaml and the JSON object hold it; bends only where there are any."""
+        out: dict[str, Any] = {"scale": float(self.scale), "gradient_per_m": [float(v) for v in self.gradient_per_m]}
+        if self.bend:
+            out["bend_per_m2"] = [float(v) for v in self.bend[:3]]
+            out["bend_per_m3"] = [float(v) for v in self.bend[3:]]
+            out["field_m"] = None if self.field_m is None else [float(v) for v in self.field_m]
+        return out
+
+    @property
+    def formula(self) -> str:
+        """The factor as one who has only a pocket calculator needs it."""
+        names = ("", "x", "y", "x^2", "x y", "y^2", "x^3", "x^2 y", "x y^2", "y^3")
+        text = " ".join(f"{v:+.7f} {n}".strip() for v, n in zip(self.values, names, strict=False)).lstrip("+")
+        if self.field_m is None or not self.bend:
+            return text
+        x0, x1, y0, y1 = self.field_m
+        return (
+            f"{text} (in all terms but the first three, x between {x0:.3f} and {x1:.3f}, y between {y0:.3f} and {y1:.3f}: "
+            "beyond, the value at the edge)"
+        )
 
 
 def correction_from_document(document: dict[str, Any] | None) -> ScannerCorrection | None:
@@ -70,7 +146,10 @@ def correction_from_document(document: dict[str, Any] | None) -> ScannerCorrecti
         return None
     try:
         gx, gy = (float(v) for v in document["gradient_per_m"])
-        return ScannerCorrection(float(document["scale"]), (gx, gy))
+        bend = tuple(float(v) for key in ("bend_per_m2", "bend_per_m3") for v in document.get(key) or ())
+        field = document.get("field_m")
+        x0, x1, y0, y1 = (0.0,) * 4 if field is None else (float(v) for v in field)
+        return ScannerCorrection(float(document["scale"]), (gx, gy), bend, None if field is None else (x0, x1, y0, y1))
     except (KeyError, TypeError, ValueError) as e:
         raise InputError(
             "The scanner correction in the result cannot be read; it holds scale and gradient_per_m [gx, gy]."

@@ -8,28 +8,32 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.special import gammaincinv
-from scipy.stats import chi2
-from scipy.stats import f as f_distribution
 
 from weldcal.calibration.errors import InconsistentPoses
+from weldcal.calibration.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.observability import check_diversity, unobservable_sentences
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
 
+__all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
+
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-_GATE = 8.0  # in sigma per axis: only gross outliers go; what a scanner's distortion does at the rim of its field stays
+_GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
 _HUBER = 2.0
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
 _NORMAL_FLOOR_RAD = 1e-6
+USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
+"""What robot and scanner together are off, an axis, where too few scans show it: as on the recorded arms."""
 
 
 @dataclass(frozen=True)
 class SolveConfig:
     """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
-    agree)."""
+    agree). ``usual_weight`` is how many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts
+    for beside the residuals themselves: three poses have too few of them."""
 
     seed: int = 0
     max_outliers: float = 0.40
@@ -38,41 +42,7 @@ class SolveConfig:
     min_poses: int = 4
     allow_coplanar: bool = False
     leave_one_out: bool = True
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Errors of each pose under a calibration that never saw it: position at the flange centre (n,) m, tilt (n,) rad.
-
-    ``tilt_rad`` is NaN where no normal was seen. Poses refused as outliers keep their (large) error.
-    """
-
-    position_m: Array
-    tilt_rad: Array
-
-
-@dataclass(frozen=True)
-class CalibrationEstimate:
-    """Pose of the camera in the base and what is known of it.
-
-    ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
-    base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
-    ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
-    observations; the covariance is widened so that its Gaussian 95 % region does hold the truth that often, though the
-    spread was estimated from few residuals. ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot and
-    scanner together beyond the noise of the fits, estimated from the residuals.
-    """
-
-    X_BC: RigidTransform
-    covariance: Array
-    inliers: Flags
-    position_residuals_m: Array
-    tilt_residuals_rad: Array
-    held_out: HeldOut
-    sigma_position_m: float
-    sigma_normal_rad: float
-    unobservable: tuple[str, ...]
-    warnings: tuple[str, ...]
+    usual_weight: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +68,9 @@ class _Solution:
     pivot: Array
     var_p: float
     var_n: float
+    information_p: Array  # what the positions alone bring of it
     redundancy: float = 1e6  # of the positions
+    redundancy_n: float = 1e6  # of the normals
 
 
 def estimate_eye_on_base(
@@ -118,7 +90,7 @@ def estimate_eye_on_base(
     data = _arrays(observations, config.use_normals)
     check_diversity(data.b, data.has, min_poses=config.min_poses, allow_coplanar=config.allow_coplanar)
     start = _robust_start(data, config)
-    solution, inliers = _reweighted(data, start)
+    solution, inliers = _reweighted(data, start, config.usual_weight)
     n = len(data.b)
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
@@ -139,7 +111,7 @@ def estimate_eye_on_base(
     residual, tilt = _residuals(data, solution.X_BC)
     held_out = HeldOut(residual.copy(), tilt.copy())
     if config.leave_one_out:
-        held_out = _leave_one_out(data, inliers, solution, held_out)
+        held_out = _leave_one_out(data, inliers, solution, held_out, config.usual_weight)
     warnings = []
     if not inliers.all():
         names = ", ".join(o.id for o, keep in zip(observations, inliers, strict=True) if not keep)
@@ -158,13 +130,6 @@ def estimate_eye_on_base(
         unobservable=unobservable_sentences([o.X_BR for o in used], sigma_p, bool(data.has.any())),
         warnings=tuple(warnings),
     )
-
-
-def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
-    """Covariance (3, 3) m^2, in B, of the base position of a scanned point that is seen at ``p_BQ`` (3,) m."""
-    lever = -skew(np.asarray(p_BQ, dtype=float) - estimate.X_BC.translation())
-    J = np.hstack([lever, np.eye(3)])
-    return np.asarray(J @ estimate.covariance @ J.T)
 
 
 def _arrays(observations: tuple[Observation, ...], use_normals: bool) -> _Data:
@@ -246,7 +211,7 @@ def _scale_from_trimmed(e: Array, h: int) -> float:
     return float(np.partition(e, h - 1)[h - 1] / np.sqrt(2.0 * gammaincinv(1.5, q)))
 
 
-def _reweighted(data: _Data, start: RigidTransform) -> tuple[_Solution, Flags]:
+def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple[_Solution, Flags]:
     """Alternate gating and weighted fits until the set of inliers repeats."""
     n = len(data.b)
     e, _ = _residuals(data, start)
@@ -255,10 +220,10 @@ def _reweighted(data: _Data, start: RigidTransform) -> tuple[_Solution, Flags]:
     dof = max(3 * h - 6, 1) / (3 * h)
     sigma = max(_scale_from_trimmed(e, h) / np.sqrt(dof), _POSITION_FLOOR_M) * _loose(3 * h - 6)
     keep = _gate(data, start, sigma**2) if n > 4 else np.ones(n, dtype=bool)
-    solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2)
+    solution = _Solution(start, np.eye(6), data.b.mean(axis=0), sigma**2, 1e-3**2, np.eye(6))
     seen: set[bytes] = set()
     for _ in range(12):
-        solution = _fit(data, keep, solution)
+        solution = _fit(data, keep, solution, usual)
         seen.add(keep.tobytes())
         if n <= 4:
             break
@@ -282,13 +247,13 @@ def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:
     return np.asarray(d2 < _GATE**2)
 
 
-def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _Solution:
+def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0, iterations: int = 40) -> _Solution:
     """Weighted Gauss-Newton on the kept poses, variance components updated between steps."""
     d = data.pick(keep)
     pivot = d.b.mean(axis=0)
     R, p = start.X_BC.rotation().matrix(), start.X_BC.translation()
     var_p, var_n = start.var_p, start.var_n
-    N, redundancy_p = np.eye(6), 1.0
+    N, N_p, redundancy_p, redundancy_n = np.eye(6), np.eye(6), 1.0, 1.0
     for step_number in range(iterations):
         q = d.c @ R.T + p
         e_p = q - d.b
@@ -318,17 +283,18 @@ def _fit(data: _Data, keep: Flags, start: _Solution, iterations: int = 40) -> _S
         inverse = np.linalg.pinv(N)
         redundancy_p = max(3.0 * len(q) - float(np.trace(inverse @ N_p)), 0.3)
         redundancy_n = max(2.0 * len(s) - float(np.trace(inverse @ N_n)), 0.3)
-        new_p = _component(var_p, (w_p * maha**2 * 3.0).sum() / redundancy_p, _POSITION_FLOOR_M)
-        new_n = (
-            _component(var_n, (w_n / k_n * maha_n**2 * 2.0).sum() / redundancy_n, _NORMAL_FLOOR_RAD)
-            if len(s)
-            else var_n
-        )
+        square_p, square_n = float((w_p * maha**2).sum()) * 3.0, float((w_n / k_n * maha_n**2).sum()) * 2.0
+        ratio_p = (square_p + usual * USUAL_SPREAD_M**2 / var_p) / (redundancy_p + usual)
+        ratio_n = (square_n + usual * USUAL_TILT_RAD**2 / var_n) / (redundancy_n + usual)
+        new_p = _component(var_p, ratio_p, _POSITION_FLOOR_M)
+        new_n = _component(var_n, ratio_n, _NORMAL_FLOOR_RAD) if len(s) else var_n
         settled = abs(new_p / var_p - 1.0) + abs(new_n / var_n - 1.0) < 1e-4
         var_p, var_n = new_p, new_n
         if step_number > 2 and settled and float(np.linalg.norm(step)) < 1e-10:
             break
-    return _Solution(RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n, redundancy_p)
+    return _Solution(
+        RigidTransform(RotationMatrix(R), p), N, pivot, var_p, var_n, N_p, redundancy_p + usual, redundancy_n + usual
+    )
 
 
 def _component(variance: float, ratio: float, floor: float) -> float:
@@ -336,28 +302,38 @@ def _component(variance: float, ratio: float, floor: float) -> float:
     return max(variance * float(np.clip(ratio, 0.1, 100.0)), floor**2)
 
 
-def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut) -> HeldOut:
+def _leave_one_out(data: _Data, inliers: Flags, solution: _Solution, full: HeldOut, usual: float) -> HeldOut:
     position, tilt = full.position_m.copy(), full.tilt_rad.copy()
-    if int(inliers.sum()) < 4:
+    if int(inliers.sum()) < (3 if data.has.all() else 4):
         return HeldOut(np.full_like(position, np.nan), np.full_like(tilt, np.nan))
     for i in np.nonzero(inliers)[0]:
         keep = inliers.copy()
         keep[i] = False
-        without = _fit(data, keep, solution)
+        without = _fit(data, keep, solution, usual)
         e, t = _residuals(data.pick(np.arange(len(inliers)) == i), without.X_BC)
         position[i], tilt[i] = float(e[0]), float(t[0])
     return HeldOut(position, tilt)
 
 
 def _covariance_at_camera(solution: _Solution) -> Array:
-    """Move the tangent from the pivot to the camera origin, and widen it for a spread that was itself estimated.
-
-    The ratio of the 95 % quantiles of F (6, redundancy) and chi-square (6): with it, the Gaussian 95 % region of X_BC
-    holds the truth in 95 of 100 calibrations also where poses are few.
-    """
-    wider = float(6.0 * f_distribution.ppf(0.95, 6, solution.redundancy) / chi2.ppf(0.95, 6))
-    covariance = wider * np.linalg.pinv(solution.information)
+    """Move the tangent from the pivot to the camera origin, and widen it for spreads that were themselves estimated."""
     T = np.eye(6)
     T[3:, :3] = -skew(np.asarray(solution.X_BC.translation()) - solution.pivot)
-    out = T @ covariance @ T.T
+    out = T @ _widened(solution) @ T.T
     return np.asarray(0.5 * (out + out.T))
+
+
+def _widened(solution: _Solution) -> Array:
+    """Covariance about the pivot, such that its Gaussian 95 % region holds the truth in 95 of 100 calibrations of few poses.
+
+    Two things that a plain inverse leaves out: the weights between positions and normals are estimates too (Kenward and
+    Roger 1997, their adjusted covariance, each variance known to 2 / redundancy of itself), and so is the scale (the ratio
+    of the 95 % quantiles of F (6, redundancy) and chi-square (6)).
+    """
+    inverse = np.linalg.pinv(solution.information)
+    N_p = solution.information_p
+    N_n = solution.information - N_p
+    excess = np.zeros((6, 6))
+    for part, redundancy in ((N_p, solution.redundancy), (N_n, solution.redundancy_n)):
+        excess += 2.0 / redundancy * (inverse @ (part - part @ inverse @ part) @ inverse)
+    return np.asarray(few_residuals(solution.redundancy) * (inverse + 2.0 * excess))

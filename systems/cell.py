@@ -309,6 +309,8 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
         maximum_scans=c.maximum_scans,
         p_BWork=work_point(scenario),
         cost=c.cost,
+        work_radius_m=c.work_radius_mm * 1e-3,
+        cost_axes=tuple(c.cost_axes),
     )
 
 

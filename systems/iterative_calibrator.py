@@ -11,13 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
-from weldcal.calibration.iterative import (
-    Algorithm1State,
-    algorithm1_start,
-    algorithm1_step,
-    translation_and_rotation_cost,
-    translation_cost,
-)
+from weldcal.calibration.iterative import COST_AXES, Algorithm1State, algorithm1_start, algorithm1_step, named_cost
 from weldcal.calibration.observation import Observation, observation_from_fit
 from weldcal.calibration.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.verification import make_verification
@@ -27,18 +21,19 @@ from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
 from weldcal.systems.pose_recorder import PoseHistory
 
-WORK_RADIUS_M = 0.2  # of the cost metric that adds the rotation's displacement at this distance
-
 
 @dc.dataclass(frozen=True)
 class CalibratorConfig:
-    """When the live calibration may stop (m), and where its error counts: the work point p_BWork (3,) in B."""
+    """When the live calibration may stop (m), and where its error counts: the work point p_BWork (3,) in B; what Algorithm 1 takes
+    for its cost (section 4.2: work radius, m, and axes)."""
 
     required_error_m: float
     minimum_scans: int
     maximum_scans: int
     p_BWork: NDArray[np.float64]
     cost: str = "translation"
+    work_radius_m: float = 0.2
+    cost_axes: tuple[str, ...] = COST_AXES
 
 
 class IterativeCalibrator(LeafSystem):
@@ -156,6 +151,6 @@ def _algorithm_1(
     """One step of the published algorithm, where its verification cloud was seen."""
     if status.verification_cloud is None:
         return None
-    cost = translation_cost if config.cost == "translation" else translation_and_rotation_cost(WORK_RADIUS_M)
+    cost = named_cost(config.cost, config.work_radius_m, config.cost_axes)
     state = status.algorithm_1 or algorithm1_start(config.required_error_m, config.maximum_scans)
     return algorithm1_step(state, observation, status.verification_cloud, cost)

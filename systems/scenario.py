@@ -8,6 +8,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.calibration.iterative import COST_AXES, named_cost
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
@@ -60,7 +61,9 @@ class CalibrationConfig:
     maximum_scans: int = 10  # k_max, verification scans not counted
     verification_scans: int = 1
     verification_limit_mm: float = 0.5  # a larger error at the unseen pose holds the job
-    cost: str = "translation"  # cost metric of Algorithm 1: translation, or translation_and_rotation
+    cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
+    work_radius_mm: float = 200.0  # section 4.2: how far from the flange centre a rotation counts
+    cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: those that matter
     table_z_m: float = 0.0
     clearance_m: float = 0.05
     work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # where there is no workpiece
@@ -234,8 +237,7 @@ def check_scenario(scenario: Scenario) -> None:
     calibration = scenario.calibration
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
-    if calibration.cost not in ("translation", "translation_and_rotation"):
-        raise InputError(f"calibration.cost must be translation or translation_and_rotation, not '{calibration.cost}'.")
+    named_cost(calibration.cost, 1e-3 * calibration.work_radius_mm, calibration.cost_axes)
     if scenario.tool not in ("welding", "pen", "none"):
         raise InputError(f"tool must be welding, pen or none, not '{scenario.tool}'.")
     if (calibration.feature == "tool_ring") != (scenario.tool == "welding"):

@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.advice import sampling_advice
-from weldcal.calibration.dataset import Dataset, load_dataset
+from weldcal.calibration.dataset import load_dataset
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.holes import HolePattern
 from weldcal.calibration.observability import turn_deg
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.result import (
     CalibrationResult,
-    IcpRecord,
     PoseRecord,
     export_all,
     matrix4,
@@ -34,24 +35,13 @@ from weldcal.calibration.self_calibration import SelfCalibration, apply_self_cal
 from weldcal.calibration.sightings import see_flanges
 from weldcal.calibration.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import (
-    Algorithm1Run,
     Convergence,
     convergence,
     k_fold,
-    position_errors,
-    run_algorithm1,
-)
-from weldcal.calibration.verification import (
-    CentreVerification,
-    Sight,
-    Verification,
-    Verifier,
-    icp_error,
-    make_verification,
-    sight,
 )
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.flanges import get_flange
+from weldcal.tools.algorithm1_beside import Algorithm1Outcome, compare_algorithm1, summary_of
 from weldcal.tools.report.plots_calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
 
@@ -59,35 +49,6 @@ Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 Progress = Callable[[str, float], None]
 """Told what is being done and which fraction of the whole is behind us (0 to 1)."""
-
-
-@dataclass(frozen=True)
-class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its own figure beside the truth on poses outside its pool, and the figure's blind
-    spots.
-
-    ``verification``: id of the pose held out for it. ``figure_mm`` is what Algorithm 1 reports; ``true_mm`` the errors
-    at the flange on poses it did not use; ``unseen`` the components of a true error of which less than half enters the
-    figure.
-    """
-
-    verification: str
-    metric: str
-    figure_mm: float
-    true_mm: dict[str, float]
-    at_verification_mm: float
-    unseen: tuple[str, ...]
-    shares: tuple[float, ...]
-    run: Algorithm1Run
-
-    @property
-    def sentence(self) -> str:
-        """One sentence for the terminal."""
-        blind = f" ({self.metric}); it cannot see: {'; '.join(self.unseen)}" if self.unseen else f" ({self.metric})"
-        return (
-            f"Algorithm 1 reports {self.figure_mm:.3f} mm at its verification pose {self.verification}{blind}. "
-            f"Its true error on poses it did not use: {self.true_mm['median']:.3f} mm median."
-        )
 
 
 @dataclass(frozen=True)
@@ -127,6 +88,7 @@ class CalibrationReport:
             "unobservable": list(r.unobservable),
             "seconds": self.seconds,
             "k_fold_mm": self.k_fold_mm,
+            "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
             "advice": list(self.advice),
             "algorithm1": None
             if a is None
@@ -151,12 +113,14 @@ def calibrate_dataset(
     progress: Progress | None = None,
     centres: bool = False,
     correct_scanner: bool = True,
+    axis_turn_deg: float | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
     ``robot`` and ``flange`` override dataset.yaml. ``progress`` is told (stage, fraction). ``centres`` also writes
     centres.csv (camera frame, metres, uncorrected). Without ``correct_scanner`` the scanner is taken as it is. Nothing
-    is written unless the calibration succeeded. Raises InputError (one sentence) for bad data; a cloud that cannot be
+    is written unless the calibration succeeded. ``axis_turn_deg``, how far the hole pattern is turned about the flange's axis, makes one
+    to three scans enough that show the holes; from four on it is not needed. Raises InputError (one sentence) for bad data; a cloud that cannot be
     used is refused by name and reported, as long as enough remain.
     """
     started = time.monotonic()
@@ -167,12 +131,20 @@ def calibrate_dataset(
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
-    _enough(observations, refused, data)
+    _enough(observations, refused)
     tell("solving", 0.7)
-    estimate = estimate_eye_on_base(observations, SolveConfig(seed=seed))
+    few = len(observations) < ENOUGH
+    estimate = (
+        calibrate_from_few(
+            observations, seen.patterns, None if axis_turn_deg is None else float(np.radians(axis_turn_deg)), seed=seed
+        )
+        if few
+        else estimate_eye_on_base(observations, SolveConfig(seed=seed))
+    )
     tell("judging the scanner", 0.72)
+    rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
-        observations, estimate, seen.patterns, seed=seed, wanted=correct_scanner
+        observations, rigid, seen.patterns, seed=seed, wanted=correct_scanner and not few
     )
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
     errors = dict(zip((o.id for o in observations), estimate.position_residuals_m, strict=True))
@@ -181,6 +153,7 @@ def calibrate_dataset(
         for i in outliers
     ]
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
+    accepted = None if scanner is None else scanner.accepted
     tell("cross-validating", 0.75)
     folds = (
         k_fold(
@@ -189,14 +162,16 @@ def calibrate_dataset(
             repeats=5,
             seed=seed,
             solve=None
-            if scanner is None or scanner.accepted is None
-            else lambda poses: calibrate_corrected(poses, seen.patterns, seed=seed),
+            if accepted is None
+            else lambda poses: calibrate_corrected(
+                poses, seen.patterns, seed=seed, order=accepted.order, start=estimate.X_BC
+            ),
         )
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
     )
     tell("Algorithm 1 for comparison", 0.8)
-    algorithm1, verifier, icp = _algorithm1(observations, inliers, clouds, fits, standard, seed)
+    algorithm1, verifier, icp = compare_algorithm1(observations, inliers, clouds, fits, standard, seed)
     curve = convergence(inliers, verifier, orders=8, seed=seed)
     warnings = list(estimate.warnings)
     if turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
@@ -206,11 +181,11 @@ def calibrate_dataset(
         )
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
-    correction = None if scanner is None or scanner.accepted is None else scanner.accepted.document()
+    correction = None if accepted is None else accepted.document()
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
-        held_out_mm=_summary(1e3 * estimate.held_out.position_m[estimate.inliers]),
+        held_out_mm=summary_of(1e3 * estimate.held_out.position_m[estimate.inliers]),
         tilt_deg=_tilts(estimate),
         poses=_pose_records(observations, estimate, refused),
         icp=icp,
@@ -224,6 +199,8 @@ def calibrate_dataset(
         seed=seed,
         data_hashes=data.hashes,
         scanner_correction=correction,
+        joint_covariance=estimate.joint,
+        axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
         software=software_version(),
     )
     report = CalibrationReport(
@@ -236,7 +213,7 @@ def calibrate_dataset(
         outliers,
         algorithm1,
         curve,
-        _summary(1e3 * folds[np.isfinite(folds)]),
+        summary_of(1e3 * folds[np.isfinite(folds)]),
         time.monotonic() - started,
         Path(out),
         sampling_advice(estimate, corrected),
@@ -254,102 +231,34 @@ def calibrate_dataset(
     return report
 
 
-def _enough(observations: list[Observation], refused: list[tuple[str, str]], data: Dataset) -> None:
-    if observations and len(observations) >= 4:
-        return
+def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:
+    """At least one usable scan, and four where some of more were refused: then more can be taken, and should be."""
     n = len(observations)
     if n == 0:
         same = len({r for _, r in refused}) == 1 and len(refused) > 1
         which = "every cloud" if same else f"the first, {refused[0][0]}"
         raise InputError(f"None of the {len(refused)} clouds can be used; for {which}: {refused[0][1]}")
-    if refused:
+    if n < ENOUGH and refused:
         names = "; ".join(f"{i}: {t}" for i, t in refused[:3])
         raise TooFewPoses(
-            f"Only {n} usable poses remain of {n + len(refused)}, at least 4 are needed; refused were {names}"
+            f"Only {n} usable poses remain of {n + len(refused)}, at least {ENOUGH} are needed; refused were {names}"
         )
-    raise TooFewPoses(
-        f"The dataset has {n} poses; a calibration needs at least 4 whose flange centres do not lie in one plane."
-    )
 
 
-def _algorithm1(
-    observations: list[Observation],
-    inliers: list[Observation],
-    clouds: dict[str, Array],
-    fits: dict[str, FlangeFit],
-    standard: FlangeStandard,
-    seed: int,
-) -> tuple[Algorithm1Outcome | None, Verifier | None, tuple[IcpRecord, ...]]:
-    """Algorithm 1 with one pose held out for verification: the one nearest the middle, where the arm will
-    mostly work."""
-    if len(inliers) < 6:
-        return None, None, ()
-    middle = np.median([o.p_BR for o in inliers], axis=0)
-    held = min(inliers, key=lambda o: (float(np.linalg.norm(o.p_BR - middle)), o.id))
-    pool = [o for o in observations if o.id != held.id]
-    good = [o for o in inliers if o.id != held.id]
-    ours = estimate_eye_on_base(good, SolveConfig(seed=seed, leave_one_out=False)).X_BC
-    icp: list[IcpRecord] = []
-    shares: Sight | None = None
-    verifier: Verifier
-    if clouds:
-        as_published = make_verification(clouds[held.id], held.X_BR, standard, max_points=1500, seed=seed)
-        verifier = as_published
-        metric = "point-to-point ICP of the verification cloud against the flange's model"
-        shares = sight(ours, as_published)
-        for v in (as_published, replace(as_published, method="point_to_plane")):
-            icp.append(_icp_record(held, ours, v))
-        unseen = shares.unseen
-    else:
-        verifier = CentreVerification(held)
-        metric = "distance of the verification pair's centre, in place of the ICP, as there are no clouds"
-        unseen = ("every rotation (one centre has none)", "the error at any other pose")
-    run = run_algorithm1(pool, verifier)
-    if run is None:
-        return None, verifier, tuple(icp)
-    true = run.true_errors[[o.id in {g.id for g in good} for o in pool if o.id not in run.pool]]
-    outcome = Algorithm1Outcome(
-        held.id,
-        metric,
-        1e3 * run.cost,
-        _summary(1e3 * true),
-        1e3 * float(position_errors(run.X_BC, [held])[0]),
-        unseen,
-        tuple(float(s) for s in shares.share) if shares is not None else (),
-        run,
-    )
-    return outcome, verifier, tuple(icp)
-
-
-def _icp_record(held: Observation, X_BC: RigidTransform, verification: Verification) -> IcpRecord:
-    """The published figure for our own calibration, made without the verification pose."""
-    error = icp_error(X_BC, verification)
-    return IcpRecord(
-        id=held.id,
-        method=verification.method,
-        rotation_deg=tuple(float(v) for v in np.degrees(error.value[:3])),
-        translation_mm=tuple(float(v) for v in 1e3 * error.value[3:]),
-        translation_norm_mm=float(1e3 * np.linalg.norm(error.value[3:])),
-        unseen=sight(X_BC, verification).unseen,
-        true_error_mm=float(1e3 * position_errors(X_BC, [held])[0]),
-    )
-
-
-def _summary(values: Array) -> dict[str, float]:
-    v = np.asarray(values, dtype=float)
-    v = v[np.isfinite(v)]
-    if len(v) == 0:
-        return {"median": float("nan"), "mean": float("nan"), "p95": float("nan"), "max": float("nan")}
-    return {
-        "median": float(np.median(v)),
-        "mean": float(v.mean()),
-        "p95": float(np.percentile(v, 95)),
-        "max": float(v.max()),
-    }
+def _axis_turn(
+    inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
+) -> tuple[float, float] | None:
+    """How far the hole pattern is turned about the flange's axis, and the spread of that over the scans (deg); None where fewer
+    than four show it. With it, one scan is enough the next time; it is that of scans as they are, which one scan is taken for, too."""
+    seen = [o for o in inliers if o.id in patterns]
+    if len(seen) < ENOUGH:
+        return None
+    turn, spread = axis_turn(seen, patterns, X_BC)
+    return float(np.degrees(turn)), float(np.degrees(spread))
 
 
 def _tilts(estimate: CalibrationEstimate) -> dict[str, float | None]:
-    s = _summary(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
+    s = summary_of(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
     return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
 
 
@@ -366,7 +275,7 @@ def _pose_records(
                 bool(estimate.inliers[k]),
                 reasons.pop(o.id, ""),
                 float(1e3 * estimate.position_residuals_m[k]),
-                float(1e3 * estimate.held_out.position_m[k]),
+                float(1e3 * estimate.held_out.position_m[k]) if np.isfinite(estimate.held_out.position_m[k]) else None,
                 tilt if np.isfinite(tilt) else None,
                 held_tilt if np.isfinite(held_tilt) else None,
             )

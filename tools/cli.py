@@ -191,6 +191,14 @@ def calibrate(
         typer.Option("--centres", help="Also write centres.csv: the flange centre found in each scan of a dataset."),
     ] = False,
     scanner_correction: CorrectionOption = True,
+    axis_turn: Annotated[
+        float | None,
+        typer.Option(
+            "--axis-turn",
+            metavar="DEG",
+            help="How far the flange's holes are turned about its axis: one to three scans are enough then.",
+        ),
+    ] = None,
     dry_run: DryRunOption = False,
     pace: PaceOption = None,
     speed_factor: SpeedFactorOption = None,
@@ -216,6 +224,7 @@ def calibrate(
                 progress=progress,
                 centres=centres,
                 correct_scanner=scanner_correction,
+                axis_turn_deg=axis_turn,
             )
             summary = report.summary()
             if report.algorithm1 is not None:

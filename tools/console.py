@@ -94,14 +94,13 @@ def _short(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {True: "yes", False: "no", None: ""}[value]
     if isinstance(value, float):
-        return f"{value:.3g}"
+        return f"{value:.3g}" if not math.isnan(value) else ""
     if isinstance(value, str | int):
         return str(value)
     if isinstance(value, Mapping):
         numbers = {name: item for name, item in value.items() if isinstance(item, int | float)}
-        return (
-            ", ".join(f"{name} {_short(item)}" for name, item in numbers.items()) if len(numbers) == len(value) else ""
-        )
+        known = len(numbers) == len(value) and not any(isinstance(v, float) and math.isnan(v) for v in numbers.values())
+        return ", ".join(f"{name} {_short(item)}" for name, item in numbers.items()) if known else ""
     if isinstance(value, list | tuple) and all(isinstance(item, str) for item in value):
         return "; ".join(value)
     return ""

@@ -8,9 +8,12 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
+from weldcal.models.errors import InputError
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
+
+_LARGEST_MM = 1.0  # an arm that misses by more is broken, not unrepeatable
 
 
 @dc.dataclass
@@ -19,6 +22,8 @@ class SimulatedUr:
 
     control_period_s: float = 0.002  # 500 Hz, as the real controller
     following_error_rad: float = 0.05  # beyond this the controller stops the arm
+    # rms distance of the flange from where the controller says it stands, drawn anew for each stop; 0: it says the truth
+    repeatability_mm: float = 0.0
 
 
 class SpeedJointServo(LeafSystem):
@@ -40,17 +45,24 @@ class SpeedJointServo(LeafSystem):
 
     Velocity (6) rad/s in, arm state (12) rad, rad/s in. Outputs depend on the discrete state only: no feedthrough, one tick
     of latency. Speeds and accelerations beyond the arm's are clamped as the controller clamps them; a reference that leaves
-    the arm by more than the following error latches a fault and the reference freezes.
+    the arm by more than the following error latches a fault and the reference freezes. With a repeatability, what is measured
+    differs from where the arm is by a small joint offset that holds for as long as the arm stands and is drawn anew, from
+    ``seed`` and the number of the stop, when it sets off.
     """
 
-    def __init__(self, arm: ArmModel, config: SimulatedUr, q_start: np.ndarray) -> None:
+    def __init__(self, arm: ArmModel, config: SimulatedUr, q_start: np.ndarray, seed: int = 0) -> None:
         super().__init__()
         self._arm = arm
         self._config = config
+        self._seed = seed
+        offset = self._offset(q_start, 0)
+        own = [*offset, 0.0] if config.repeatability_mm else []
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._arm_state = self.DeclareVectorInputPort("arm_state", 12)
-        # q_ref, v_ref, q, v, sample time, fault
-        state = self.DeclareDiscreteState(np.concatenate([q_start, np.zeros(6), q_start, np.zeros(6), [0.0, 0.0]]))
+        # q_ref, v_ref, q, v, sample time, fault; of an arm that repeats imperfectly: joint offset of this stop, its number
+        state = self.DeclareDiscreteState(
+            np.concatenate([q_start, np.zeros(6), q_start - offset, np.zeros(6), [0.0, 0.0], own])
+        )
         ticket = {self.discrete_state_ticket(state)}
         self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
         self.DeclareVectorOutputPort("position_measured", 6, self._position, ticket)
@@ -63,7 +75,7 @@ class SpeedJointServo(LeafSystem):
     def _sample(self, context: Context, discrete: DiscreteValues) -> None:
         dt = self._config.control_period_s
         old = context.get_discrete_state_vector().value()
-        measured = self._arm_state.Eval(context)
+        measured = self._arm_state.Eval(context).copy()
         command = self._command.Eval(context)
         fault = old[25]
         if (
@@ -75,7 +87,21 @@ class SpeedJointServo(LeafSystem):
         step = self._arm.acceleration_limit * dt
         v_ref = old[6:12] + np.clip(wanted - old[6:12], -step, step)
         q_ref = np.clip(old[:6] + dt * v_ref, self._arm.position_lower, self._arm.position_upper)
-        discrete.set_value(np.concatenate([q_ref, v_ref, measured, [context.get_time(), fault]]))
+        own = old[26:].copy()
+        if own.size:
+            if not old[6:12].any() and v_ref.any():  # it sets off
+                own[6] += 1.0
+                own[:6] = self._offset(measured[:6], int(own[6]))
+            measured[:6] -= own[:6]
+        discrete.set_value(np.concatenate([q_ref, v_ref, measured, [context.get_time(), fault], own]))
+
+    def _offset(self, q: np.ndarray, stop: int) -> np.ndarray:
+        """Joint offsets (6,) rad that displace the flange by the repeatability (rms), whatever the arm's pose."""
+        if not self._config.repeatability_mm:
+            return np.zeros(6)
+        lever = float(np.linalg.norm(jacobian(self._arm, q)[3:]))
+        sigma = 1e-3 * self._config.repeatability_mm / lever
+        return np.asarray(sigma * np.random.default_rng([self._seed, stop]).standard_normal(6))
 
     def _desired(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[:12])
@@ -104,8 +130,14 @@ class SpeedJointServo(LeafSystem):
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
     """Add the servo and wire it to the arm of the simulated world."""
+    if not 0.0 <= config.repeatability_mm <= _LARGEST_MM:
+        raise InputError(
+            f"robot.repeatability_mm must be from 0 to {_LARGEST_MM:g}, and it is {config.repeatability_mm:g}."
+        )
     world = build.simulated_world()
-    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start))
+    # the others' random numbers stay what they are where the arm needs none
+    seed = int(build.rng.integers(2**32)) if config.repeatability_mm else 0
+    servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed))
     servo.set_name("ur10e_servo")
     build.builder.Connect(world.plant.get_state_output_port(world.arm), servo.GetInputPort("arm_state"))
     build.builder.Connect(servo.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import shutil
 from collections.abc import Callable
@@ -11,8 +12,12 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from weldcal.calibration.dataset import load_dataset
 from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.observation import Observation
 from weldcal.calibration.result import load_result
+from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.calibrate import CalibrationReport, calibrate_dataset
@@ -38,12 +43,12 @@ def test_every_aubo_cloud_is_used_and_held_out_errors_beat_the_paper(aubo: Calib
     assert d["refused"] == []
     # the paper's method: 0.63 to 0.73 mm on these scans; good centres, rigid: 0.22 to 0.23 (median), 0.30 (mean); with
     # the scanner corrected: 0.16 to 0.20 and 0.17 to 0.20
-    assert d["held_out_mm"]["median"] < 0.20
-    assert d["held_out_mm"]["mean"] < 0.205
-    assert d["held_out_mm"]["p95"] < 0.34
+    assert d["held_out_mm"]["median"] < 0.19
+    assert d["held_out_mm"]["mean"] < 0.20
+    assert d["held_out_mm"]["p95"] < 0.33
     assert d["k_fold_mm"]["median"] < 0.21
-    # normals scatter by 0.07 deg per axis between scans
-    assert d["tilt_deg"]["median"] < 0.10
+    # normals scatter by 0.07 deg per axis between scans; where the image's bends are corrected, 0.05
+    assert d["tilt_deg"]["median"] < 0.065
     assert any("constant bias of the flange centre" in s for s in d["unobservable"])
 
 
@@ -161,6 +166,11 @@ def _empty_of_four(folder: Path) -> None:
     next(iter(sorted((folder / "clouds").iterdir()))).write_bytes(b"")
 
 
+def _first_pairs(folder: Path, n: int) -> None:
+    lines = (folder / "pairs.csv").read_text().splitlines()
+    (folder / "pairs.csv").write_text("\n".join(lines[: n + 1]) + "\n")
+
+
 def _coplanar(folder: Path) -> None:
     lines = (folder / "pairs.csv").read_text().splitlines()
     rows = [line.split(",") for line in lines[1:]]
@@ -179,7 +189,9 @@ def _coplanar(folder: Path) -> None:
         (AUBO, _nan_pose, "nan in column x of 'pose04'"),
         (AUBO, _empty_of_four, r"pose02: The cloud pose02\.pcd is empty"),
         (AUBO, _some_nan, r"pose04: 5 of the \d+ points of pose04\.pcd are NaN"),
-        (AUBO, lambda f: _keep(f, 3), "3 poses; a calibration needs at least 4"),
+        (AUBO, lambda f: _keep(f, 1), "One scan leaves a rotation open: .* with --axis-turn DEGREES"),
+        (UR10E, lambda f: _first_pairs(f, 2), "Two centres leave a rotation open"),
+        (UR10E, lambda f: _first_pairs(f, 3), "The 3 flange centres lie on one line"),
         (UR10E, _coplanar, "lie in one plane"),
     ],
     ids=[
@@ -189,7 +201,9 @@ def _coplanar(folder: Path) -> None:
         "NaN in a pose",
         "empty cloud",
         "some NaN points",
-        "three poses",
+        "one pose",
+        "two pairs",
+        "three pairs in a row",
         "four coplanar",
     ],
 )
@@ -222,3 +236,78 @@ def test_one_bad_cloud_among_good_ones_is_refused_by_name(tmp_path: Path) -> Non
     assert d["n_used"] == 5
     assert d["refused"][0]["id"] == "pose04"
     assert d["refused"][0]["reason"].endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("n", "turn", "limit_mm"), [(1, True, 0.7), (2, False, 0.6), (3, False, 0.45)], ids=["one", "two", "three"]
+)
+def test_one_to_three_scans_calibrate_and_say_what_their_figures_rest_on(
+    aubo: CalibrationReport, tmp_path: Path, n: int, turn: bool, limit_mm: float
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(AUBO, folder, copy_function=shutil.copyfile)
+    for path in [folder, *folder.rglob("*")]:
+        path.chmod(0o755)
+    _keep(folder, n)
+    known = aubo.result.axis_turn_deg
+    assert (
+        known is not None
+    )  # the drilled pattern of this arm is turned by a degree or so: 0.85 to 0.91 in other people's hands
+    assert known[0] == pytest.approx(0.88, abs=0.1)
+    report = calibrate_dataset(folder, tmp_path / "out", axis_turn_deg=known[0] if turn else None)
+    assert f"From {'one scan' if n == 1 else f'{n} scans'} only" in report.result.warnings[0]
+    assert np.isfinite(report.result.held_out_mm["median"]) == (n == 3)
+    assert load_result(tmp_path / "out").covariance.shape == (6, 6)
+    # other people's fits of this set: 0.44 mm from one scan, 0.24 to 0.33 from two and three, medians over draws; this is one draw
+    seen = {o.id for o in report.observations}
+    rest = [o for o in _as_seen(aubo) if o.id not in seen]
+    assert 1e3 * float(np.median(position_errors(report.result.X_BC, rest))) < limit_mm
+
+
+def _as_seen(aubo: CalibrationReport) -> list[Observation]:
+    """The sightings of all scans without a correction of the scanner."""
+    X_BR = {o.id: o.X_BR for o in aubo.observations}
+    return [Observation(id, X_BR[id], fit.center_C) for id, fit in aubo.fits.items()]
+
+
+def _list_of_pairs(folder: Path, seed: int, n: int, gross: dict[int, float], *, unit: str, turned: bool) -> None:
+    """Pairs of the UR10e as another program might write them: drawn anew, columns in another order, rows ``gross`` off by so much (m)."""
+    rng = np.random.default_rng(seed)
+    with (UR10E / "pairs.csv").open() as stream:
+        rows = [row for row in csv.DictReader(stream) if row["id"] != "34"]  # the one gross outlier of the set itself
+    columns = ["id", *(f"{frame}_{axis}" for frame in ("camera", "base") for axis in "zyx")]
+    columns += ["base_qz", "base_qy", "base_qx", "base_qw"] if turned else []
+    factor = 1e3 if unit == "mm" else 1.0
+    lines = [",".join(columns)]
+    for k, i in enumerate(rng.permutation(len(rows))[:n]):
+        wrong = rng.standard_normal(3)
+        wrong *= gross.get(k, 0.0) / np.linalg.norm(wrong)
+        values = {name: rows[i][name] for name in columns} | {"id": f"pair{k}"}
+        for axis, off in zip("xyz", wrong, strict=True):
+            values[f"camera_{axis}"] = repr(float(factor * (float(rows[i][f"camera_{axis}"]) + off)))
+            values[f"base_{axis}"] = repr(factor * float(rows[i][f"base_{axis}"]))
+        lines.append(",".join(values[name] for name in columns))
+    folder.mkdir()
+    (folder / "pairs.csv").write_text("\n".join(lines) + "\n")
+    header = (UR10E / "dataset.yaml").read_text().replace("{clouds: m, poses: m}", f"{{clouds: {unit}, poses: {unit}}}")
+    (folder / "dataset.yaml").write_text(header)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_gross_outlier_of_a_list_is_named_and_none_else(
+    ur10e: CalibrationReport, tmp_path: Path, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    n = (45, 40, 43)[seed]
+    # a third of the list wrong by a centimetre to a decimetre; or four in a sequence, three of them by 3 mm and more
+    many = {int(k): float(rng.uniform(0.01, 0.1)) for k in rng.permutation(n)[: int(0.35 * n)]}
+    gross = {20: 0.037, 21: 0.0045, 22: 0.0047, 23: 0.0045} if seed == 2 else many
+    _list_of_pairs(tmp_path / "list", seed, n, gross, unit=("mm", "m", "mm")[seed], turned=seed == 1)
+    data = load_dataset(tmp_path / "list")
+    found = estimate_eye_on_base(
+        [Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs], SolveConfig(leave_one_out=False)
+    )
+    assert {p.id for p, keep in zip(data.pairs, found.inliers, strict=True) if not keep} == {f"pair{k}" for k in gross}
+    # other people's robust fits of such lists: 0.30 to 0.35 mm from the one of all good pairs; a plain fit 12 to 20 mm
+    apart = [np.linalg.norm(found.X_BC @ o.p_CR - ur10e.result.X_BC @ o.p_CR) for o in ur10e.observations]
+    assert 1e3 * float(np.median(apart)) < 0.35

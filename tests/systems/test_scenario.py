@@ -28,6 +28,7 @@ tool: pen
 robot: !SimulatedUr
   control_period_s: 0.004
   following_error_rad: 0.1
+  repeatability_mm: 0.05
 scanner: !RenderedScanner
   preset: azure_kinect
   width: 320
@@ -90,7 +91,9 @@ calibration:
   maximum_scans: 9
   verification_scans: 2
   verification_limit_mm: 0.4
-  cost: translation_and_rotation
+  cost: work_radius
+  work_radius_mm: 300.0
+  cost_axes: [x, y]
   table_z_m: -0.01
   clearance_m: 0.04
   work_point_m: [0.5, 0.1, 0.0]
@@ -273,6 +276,8 @@ def test_a_number_that_no_cell_can_work_with_is_named(overrides: str, named: str
         ("home_deg: [0.0, 1.0]", "home_deg"),
         ("calibration: {feature: elbow}", "calibration.feature.*'elbow'"),
         ("calibration: {cost: money}", "calibration.cost.*'money'"),
+        ("calibration: {cost_axes: [x, w]}", "calibration.cost_axes must be some of roll, .* not w"),
+        ("calibration: {work_radius_mm: -1.0}", "calibration.work_radius_mm must not be negative"),
         ("tool: gripper", "tool must be.*'gripper'"),
         ("calibration: {minimum_scans: 3}", "calibration.minimum_scans must be at least 4"),
     ],

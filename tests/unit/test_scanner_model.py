@@ -11,6 +11,8 @@ from weldcal.calibration.scanner_model import ScannerCorrection, correction_from
 from weldcal.models.errors import InputError
 
 CORRECTION = ScannerCorrection(1.002, (0.015, -0.02))
+FIELD = (-0.15, 0.15, -0.25, 0.15)
+BENT = ScannerCorrection(1.002, (0.015, -0.02), (0.1, -0.2, 0.3, 1.0, 2.0, -3.0, 4.0), FIELD)
 
 
 def test_a_point_is_scaled_by_the_factor_of_its_place_in_the_image() -> None:
@@ -20,11 +22,25 @@ def test_a_point_is_scaled_by_the_factor_of_its_place_in_the_image() -> None:
     assert np.isnan(CORRECTION.points(np.full(3, np.nan))).all()
 
 
-def test_the_jacobian_is_the_slope_of_the_correction() -> None:
-    p, h = np.array([0.1, -0.2, 0.5]), 1e-6
-    slope = [(CORRECTION.points(p + d) - CORRECTION.points(p - d)) / (2 * h) for d in h * np.eye(3)]
-    # the correction is quadratic: central differences are exact but for rounding, 1e-16 / 1e-6
-    assert np.allclose(CORRECTION.jacobian(p), np.transpose(slope), atol=1e-9)
+@pytest.mark.parametrize("place", [(0.1, -0.2, 0.5), (0.3, -0.2, 0.5)], ids=["in the field", "beyond it"])
+@pytest.mark.parametrize("correction", [CORRECTION, BENT], ids=["scale", "bends"])
+def test_the_jacobian_is_the_slope_of_the_correction(
+    correction: ScannerCorrection, place: tuple[float, float, float]
+) -> None:
+    p, h = np.array(place), 1e-6
+    slope = [(correction.points(p + d) - correction.points(p - d)) / (2 * h) for d in h * np.eye(3)]
+    # central differences are exact but for h^2 times a fourth derivative below 10, and rounding, 1e-16 / 1e-6
+    assert np.allclose(correction.jacobian(p), np.transpose(slope), atol=1e-9)
+
+
+def test_a_bend_is_the_sum_of_its_powers_and_stays_as_at_the_edge_beyond_its_field() -> None:
+    bend = ScannerCorrection(1.0, (0.0, 0.0), (0.1, -0.2, 0.3, 1.0, 2.0, -3.0, 4.0), FIELD)
+    x, y = 0.1, -0.2
+    factor = 1.0 + 0.1 * x**2 - 0.2 * x * y + 0.3 * y**2 + x**3 + 2 * x**2 * y - 3 * x * y**2 + 4 * y**3
+    assert np.allclose(bend.points(np.array([x, y, 0.5])), factor * np.array([x, y, 0.5]), atol=1e-15)
+    edge, far = (float(bend.factor(np.array([x, 0.0, 0.5]))) for x in (0.15, 0.4))
+    assert far == edge
+    assert edge != 1.0
 
 
 def test_the_normal_stays_upright_on_the_corrected_face() -> None:
@@ -50,6 +66,8 @@ def test_a_sighting_is_corrected_whole() -> None:
 
 def test_it_is_written_and_read_back() -> None:
     assert correction_from_document(CORRECTION.document()) == CORRECTION
+    assert "bend_per_m2" not in CORRECTION.document()
+    assert correction_from_document(BENT.document()) == BENT
     assert correction_from_document(None) is None
 
 

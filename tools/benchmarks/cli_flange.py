@@ -1,4 +1,4 @@
-"""weldcal benchmark flange, flange-frames and flange-honesty: speed, certainty and honesty of the flange calibration."""
+"""weldcal benchmark flange, flange-frames, flange-honesty and flange-live: speed, certainty, honesty, the live target."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ OutOption = Annotated[
 
 
 def mount(benchmarks: typer.Typer) -> None:
-    """Adds the three commands."""
+    """Adds the four commands."""
     benchmarks.command("flange")(speed)
     benchmarks.command("flange-frames")(frames)
     benchmarks.command("flange-honesty")(honesty)
+    benchmarks.command("flange-live")(live)
 
 
 def speed(
@@ -110,6 +111,55 @@ def honesty(
         for s in studies
     }
     _finish("benchmark flange-honesty", {"state": "done", "studies": [vars(s) for s in studies]}, lines, out, json)
+
+
+def live(
+    seeds: Annotated[
+        int, typer.Option("--seeds", metavar="N", min=1, help="Calibrations, each in a world of its own.")
+    ] = 10,
+    scans: Annotated[int, typer.Option("--scans", metavar="N", min=4, max=8, help="Scans of each.")] = 8,
+    repeatability: Annotated[
+        float, typer.Option("--repeatability", metavar="MM", min=0.0, help="Of the arm: rms distance of the flange.")
+    ] = 0.05,
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """How near the live calibration of the simulated station comes to the truth, beside the least that any could."""
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-live") as progress:
+        import numpy as np
+
+        from weldcal.tools.studies.live_target import TARGET_M, TARGET_RAD, study_live
+
+        rows = study_live(seeds, first=seed, scans=scans, repeatability_mm=repeatability, progress=progress)
+        work = 1e3 * np.array([r.at_work_m for r in rows])
+        turn, turn_least = (np.degrees([getattr(r, k) for r in rows]) for k in ("rotation_rad", "least_rad"))
+        least, expected = (1e3 * np.array([getattr(r, k) for r in rows]) for k in ("least_m", "expected_m"))
+    rms = float(np.sqrt(np.mean(work**2)))
+    summary: dict[str, object] = {
+        "state": "done",
+        "seeds": seeds,
+        "scans": scans,
+        "repeatability_mm": repeatability,
+        "at_work_mm": {"mean": float(work.mean()), "rms": rms, "worst": float(work.max())},
+        "rotation_deg": {"mean": float(turn.mean()), "worst": float(turn.max())},
+        "expected_mm": float(np.sqrt(np.mean(expected**2))),
+        "bound_mm": float(np.sqrt(np.mean(least**2))),
+        "bound_deg": float(np.sqrt(np.mean(turn_least**2))),
+        "target_mm": 1e3 * TARGET_M,
+        "target_deg": float(np.degrees(TARGET_RAD)),
+        "within": int(np.sum((work <= 1e3 * TARGET_M) & (turn <= np.degrees(TARGET_RAD)))),
+        "rows": [vars(r) for r in rows],
+    }
+    lines = {
+        "at the work point": f"mean {work.mean():.3f}, rms {rms:.3f}, worst {work.max():.3f} mm (target {1e3 * TARGET_M:.2f}); "
+        f"the estimates expected {summary['expected_mm']:.3f} rms",
+        "rotation": f"mean {turn.mean():.4f}, worst {turn.max():.4f} degrees (target {summary['target_deg']:.2f})",
+        "both within": f"{summary['within']} of {seeds} calibrations, {scans} scans each, arm repeats to {repeatability:g} mm (rms)",
+        "no method below": f"{summary['bound_mm']:.3f} mm and {summary['bound_deg']:.4f} degrees rms (Cramer-Rao, these poses)",
+    }
+    _finish("benchmark flange-live", summary, lines, out, json)
 
 
 def _finish(command: str, summary: dict[str, object], lines: dict[str, str], out: Path | None, json: bool) -> None:

@@ -30,12 +30,17 @@ def error_bars(
     x = np.arange(len(error))
     figure = Figure(figsize=(8.2, 3.2), layout="constrained")
     axes = figure.subplots()
+    keep = keep & np.isfinite(error)
+    if not np.isfinite(error).any():
+        axes.text(0.5, 0.5, "too few scans to hold one back", transform=axes.transAxes, ha="center", color="#555")
+        axes.set_axis_off()
+        return svg(figure, axes)
     axes.bar(x, error, color=[OURS if k else REFUSED for k in keep], width=0.7)
-    median = float(np.median(error[keep])) if keep.any() else float(np.median(error))
+    median = float(np.median(error[keep])) if keep.any() else float(np.nanmedian(error))
     axes.axhline(median, color="#444", linewidth=1, linestyle="--")
     axes.annotate(f"median {median:.2f}", (x[-1] + 0.5, median), fontsize=9, va="bottom", ha="right", bbox=_PLATE)
     # gross outliers would flatten every other bar
-    top = 1.25 * float(np.max(error[keep] if keep.any() else error))
+    top = 1.25 * float(np.nanmax(error[keep] if keep.any() else error))
     if stated is not None:
         axes.axhline(stated[0], color="#a8402f", linewidth=1, linestyle=":")
         axes.annotate(

@@ -33,6 +33,8 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
     return render(
         "calibration.html.j2",
         dataset=dataset,
+        judged=bool(np.isfinite(r.held_out_mm["median"])),
+        fits=bool(report.fits),
         r=r,
         n_used=int(used.sum()),
         n_total=len(report.observations) + len([p for p in r.poses if p.held_out_mm is None]),
@@ -49,6 +51,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
             ),
             ("one sigma, deg", "  ".join(fixed(float(np.degrees(v)), 4) for v in sigma[:3])),
             ("spread of robot and scanner, per axis", f"{r.sigma_position_mm:.3f} mm"),
+            *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
             ("URScript", export_ur_pose(r.X_BC).strip()),
         ],
@@ -62,6 +65,14 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         seconds=report.seconds,
         advice=report.advice,
     )
+
+
+def _axis_turn(turn: tuple[float, float] | None) -> list[tuple[str, str]]:
+    if turn is None:
+        return []
+    return [
+        ("holes turned about the flange's axis", f"{turn[0]:.2f} deg (spread {turn[1]:.2f}); --axis-turn next time")
+    ]
 
 
 def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:

@@ -1,0 +1,87 @@
+"""A calibration and what is known of it: X_BC, its covariance, held-out errors, and what a scanned point owes to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
+
+from weldcal.calibration.rigid import skew
+from weldcal.calibration.scanner_model import ScannerCorrection
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of each pose under a calibration that never saw it: position at the flange centre (n,) m, tilt (n,) rad.
+
+    ``tilt_rad`` is NaN where no normal was seen. Poses refused as outliers keep their (large) error.
+    """
+
+    position_m: Array
+    tilt_rad: Array
+
+
+@dataclass(frozen=True)
+class CalibrationEstimate:
+    """Pose of the camera in the base and what is known of it.
+
+    ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
+    base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
+    ``position_residuals_m`` (n,) and ``tilt_residuals_rad`` (n,; NaN without a normal) are in the order of the
+    observations; the covariance is widened so that its Gaussian 95 % region holds the truth that often with few poses, too.
+    Where the scanner was corrected it contains what that leaves open, and ``joint`` (6 + K, 6 + K) is that of X_BC and the K
+    factors of ``scanner`` together. ``sigma_position_m`` (per axis) and ``sigma_normal_rad`` (per axis) are the spread of robot
+    and scanner together beyond the noise of the fits, estimated from the residuals.
+    """
+
+    X_BC: RigidTransform
+    covariance: Array
+    inliers: Flags
+    position_residuals_m: Array
+    tilt_residuals_rad: Array
+    held_out: HeldOut
+    sigma_position_m: float
+    sigma_normal_rad: float
+    unobservable: tuple[str, ...]
+    warnings: tuple[str, ...]
+    scanner: ScannerCorrection | None = None
+    joint: Array | None = None
+
+
+def point_error_covariance(estimate: CalibrationEstimate, p_BQ: Array) -> Array:
+    """Covariance (3, 3) m^2, in B, of the base position of a scanned point that is seen at ``p_BQ`` (3,) m.
+
+    With a scanner correction, X_BC and correction err together: where both were seen, much of either cancels.
+    """
+    p = np.asarray(p_BQ, dtype=float)
+    J = np.hstack([-skew(p - estimate.X_BC.translation()), np.eye(3)])
+    if estimate.joint is None or estimate.scanner is None:
+        return np.asarray(J @ estimate.covariance @ J.T)
+    c = np.asarray(estimate.X_BC.inverse() @ p)
+    J = np.hstack([J, np.outer(estimate.X_BC.rotation() @ c, estimate.scanner.terms(c))])
+    return np.asarray(J @ estimate.joint @ J.T)
+
+
+def with_scanner(
+    estimate: CalibrationEstimate,
+    scanner: ScannerCorrection,
+    X_BC: RigidTransform,
+    joint: Array | None,
+    redundancy: float,
+) -> CalibrationEstimate:
+    """The estimate with a corrected scanner and the camera's pose that goes with it, their ``joint`` covariance widened for
+    spreads that were estimated with that ``redundancy``."""
+    joint = np.zeros((9, 9)) if joint is None else joint * few_residuals(redundancy)
+    return replace(estimate, X_BC=X_BC, scanner=scanner, joint=joint, covariance=joint[:6, :6])
+
+
+def few_residuals(redundancy: float) -> float:
+    """By how much a region widens whose scale was found from so many spare numbers."""
+    return float(6.0 * f_distribution.ppf(0.95, 6, redundancy) / chi2.ppf(0.95, 6))

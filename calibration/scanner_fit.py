@@ -1,0 +1,238 @@
+"""A scanner's correction from sightings of the flange: what the robot's motion and the hole circles say of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.stats import chi2
+
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.rigid import exp_rotation, skew
+from weldcal.calibration.scanner_model import TERMS, ScannerCorrection
+from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
+
+Array = NDArray[np.float64]
+
+LEAST_PATTERNS = 6
+STARTS = 30  # random starts of an estimate: these sightings are cleared of gross outliers
+_MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
+_USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
+_USUAL_SPREAD_M = 1e-4
+_USUAL_BEND, _EDGE = 1e-3, 0.35  # and by a bend, at the edge of the image: so many depths from its middle
+_LOOSE = np.array([0.03, 0.3, 0.3])  # keeps poses on one spot solvable, and a gradient that no circle shows
+# how far a hole circle may differ from what motion shows: the maker's pitch circle is trusted to 25 micrometres on 50 mm,
+# and a circle sees a distortion of higher order in one place, motion sees it over the whole field
+CIRCLE_OWN = np.array([5e-4, 3e-3, 3e-3])
+_RATIO_SIGMA, _RATIO_DOF = 1e-3, 6.0  # what is expected of a hole circle's size before any is seen, and its weight
+
+
+@dataclass(frozen=True, eq=False)
+class CorrectionEstimate:
+    """A correction and the covariance (K, K) of its factors, in 1 and 1/m and so on.
+
+    ``X_BC`` and ``joint`` (6 + K, 6 + K), where the robot's motion took part, are the camera's pose that goes with it and the
+    covariance of both: rotation on the base side about the camera origin, its displacement, factors. The sigmas are the spread of
+    positions and normals about them (per axis), ``redundancy`` how many spare numbers the former was found from.
+    """
+
+    correction: ScannerCorrection
+    covariance: Array
+    X_BC: RigidTransform | None = None
+    joint: Array | None = None
+    redundancy: float = 1e6
+    sigma_position_m: float = 0.0
+    sigma_normal_rad: float = 0.0
+
+    @property
+    def values(self) -> Array:
+        """The factors (K,)."""
+        return self.correction.values
+
+    @property
+    def sigma(self) -> Array:
+        """One standard deviation of each."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def certainty(self) -> float:
+        """Probability that the correction is not zero by chance."""
+        v = self.values - np.eye(len(self.values))[0]
+        return float(chi2.cdf(v @ np.linalg.solve(self.covariance, v), len(v)))
+
+
+def from_motion(
+    observations: Sequence[Observation],
+    patterns: Mapping[str, HolePattern],
+    *,
+    seed: int = 0,
+    order: int = 1,
+    usual: bool = False,
+    start: RigidTransform | None = None,
+) -> CorrectionEstimate:
+    """Correction and camera pose that together bring sightings (n >= 3) and robot poses to agree; with ``patterns``, the
+    hole circles to their nominal size as well.
+
+    The sightings are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
+    held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton over the 9, 12 or 16 unknowns,
+    reweighted (soft L1 beyond two sigma); each kind of datum counts by its own spread, found from the residuals over its own
+    redundancy. ``start`` is a camera pose near by, as from the same sightings and one more: it saves the search for one. Raises
+    TooFewPoses below three and, without ``start``, what estimate_eye_on_base raises.
+    """
+    if len(observations) < 3:
+        raise TooFewPoses("A scanner correction needs at least three usable poses; add poses.")
+    sigma_p, sigma_n = 1e-4, 1e-3
+    if start is None:
+        config = SolveConfig(seed=seed, leave_one_out=False, hypotheses=STARTS, min_poses=3, allow_coplanar=True)
+        rigid = estimate_eye_on_base(tuple(observations), config)
+        start, sigma_p, sigma_n = rigid.X_BC, max(rigid.sigma_position_m, 1e-6), max(rigid.sigma_normal_rad, 1e-6)
+    c = np.array([o.p_CR for o in observations])
+    b = np.array([o.p_BR for o in observations])
+    has = np.array([o.n_C is not None for o in observations])
+    m = np.array([o.n_C for o in observations if o.n_C is not None]).reshape(-1, 3)
+    z = np.array([o.n_B for o in observations])[has]
+    terms = TERMS[order]
+    field = (
+        *(c[:, 0].min() - _MARGIN_M, c[:, 0].max() + _MARGIN_M),
+        *(c[:, 1].min() - _MARGIN_M, c[:, 1].max() + _MARGIN_M),
+    )
+    shape = correction_of(np.zeros(terms), field)
+    rows, ratio = _circles([patterns[o.id] for o in observations if o.id in patterns], shape)
+    # a scan that shows little of the flange counts for less: its own noise beside a usual spread of robot and scanner
+    own_noise = np.array(
+        [0.0 if o.center_covariance is None else np.trace(o.center_covariance) / 3.0 for o in observations]
+    )
+    vague = np.sqrt(1.0 + own_noise / _USUAL_SPREAD_M**2)[:, None]
+    sigma_r = _ratio_sigma(rows[:, :3], ratio)
+    size = 6 + terms + (3 if len(ratio) else 0)  # with circles: three for what is their own, see CIRCLE_OWN
+    prior = np.zeros(size)
+    prior[6 : 6 + terms] = 1.0 / _expected(terms, float(np.median(c[:, 2])), usual)
+    prior[6 + terms :] = 1.0 / CIRCLE_OWN[: size - 6 - terms]
+    R, p = start.rotation().matrix(), np.asarray(start.translation())
+    pivot = b.mean(axis=0)
+    change = np.zeros(size - 6)  # of the factors, then the circles' own
+    basis = shape.terms(c)
+    redundancy = 1.0
+    information = np.eye(size)
+    for k in range(40):
+        correction = correction_of(change[:terms], field)
+        q = correction.points(c) @ R.T + p
+        e_p = (q - b) / vague
+        J_p = np.zeros((len(b), 3, size))
+        J_p[:, :, :3], J_p[:, :, 3:6] = -skew(q - pivot), np.eye(3)
+        J_p[:, :, 6 : 6 + terms] = (c @ R.T)[:, :, None] * basis[:, None]
+        J_p /= vague[:, :, None]
+        e_n, J_n = _normal_rows(correction, c[has], m, z, R, size)
+        own = change[terms:] if len(ratio) else np.zeros(3)
+        e_r = ratio * (rows @ correction.values) - 1.0 - rows[:, :3] @ own
+        J_r = np.zeros((len(ratio), size))
+        J_r[:, 6 : 6 + terms] = ratio[:, None] * rows
+        J_r[:, 6 + terms :] = -rows[:, : size - 6 - terms]
+        J = np.vstack([J_p.reshape(-1, size) / sigma_p, J_n.reshape(-1, size) / sigma_n, J_r / sigma_r])
+        e = np.concatenate([e_p.ravel() / sigma_p, e_n.ravel() / sigma_n, e_r / sigma_r])
+        w = 1.0 / np.sqrt(1.0 + (e / 2.0) ** 2)
+        information = J.T @ (w[:, None] * J) + np.diag(prior**2)
+        unknown = np.concatenate([np.zeros(6), change])
+        step = -np.linalg.solve(information, J.T @ (w * e) + prior**2 * unknown)
+        dR = exp_rotation(step[:3]).matrix()
+        R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:6]
+        change = change + step[6:]
+        if k in (2, 4, 6, 8):  # robust spreads of what the unknowns leave, each kind by its own redundancy
+            taken = np.einsum("ij,jk,ik->i", J, np.linalg.inv(information), J) * w
+            n_p, n_n = 3 * len(b), 2 * len(m)
+            redundancy = max(n_p - float(taken[:n_p].sum()), 1.0)
+            sigma_p = max(_spread(e_p.ravel(), n_p) * np.sqrt(n_p / redundancy), 1e-6)
+            if n_n:
+                left = max(n_n - float(taken[n_p : n_p + 3 * len(m)].sum()), 1.0)
+                sigma_n = max(_spread(e_n.ravel(), n_n) * np.sqrt(n_n / left), 1e-6)
+        if k > 9 and float(np.linalg.norm(step)) < 1e-9:
+            break
+    inverse = np.linalg.inv(information)[: 6 + terms, : 6 + terms]
+    T = np.eye(6 + terms)
+    T[3:6, :3] = -skew(p - pivot)
+    X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
+    joint: Array = np.asarray(T @ inverse @ T.T, dtype=np.float64)
+    return CorrectionEstimate(
+        correction_of(change[:terms], field), joint[6:, 6:], X_BC, joint, redundancy, float(sigma_p), float(sigma_n)
+    )
+
+
+def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HolePattern]) -> CorrectionEstimate | None:
+    """Correction from the size of the hole circles alone, without the robot; None for fewer than six of them."""
+    A, ratio = _circles([patterns[o.id] for o in observations if o.id in patterns], ScannerCorrection())
+    if len(ratio) < LEAST_PATTERNS:
+        return None
+    # 1 / ratio is the stretch asked for; a weak prior holds a gradient that no circle shows
+    sigma = _ratio_sigma(A, ratio)
+    inverse = np.linalg.inv(A.T @ A / sigma**2 + np.diag(1.0 / _LOOSE**2))
+    v = inverse @ (A.T @ (1.0 / ratio - 1.0)) / sigma**2
+    return CorrectionEstimate(correction_of(v), np.asarray(inverse))
+
+
+def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
+    """The correction whose factors (K,) differ by ``change`` from those of a right scanner."""
+    limited = np.clip(change[0], -0.05, 0.05)
+    bend = tuple(float(v) for v in change[3:])
+    return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)
+
+
+def _expected(terms: int, depth: float, usual: bool) -> Array:
+    """Standard deviations (K,) of the factors before anything is seen; bends by their size at the edge of the image."""
+    edge = _EDGE * depth
+    bends = np.concatenate([np.full(3, _USUAL_BEND / edge**2), np.full(4, _USUAL_BEND / edge**3)])
+    return np.concatenate([_USUAL if usual else _LOOSE, bends])[:terms]
+
+
+def _normal_rows(
+    correction: ScannerCorrection, c: Array, m: Array, z: Array, R: Array, size: int
+) -> tuple[Array, Array]:
+    """Tilts (n, 3) of seen against stated normals, and their derivative (n, 3, size) by rotation and correction.
+
+    A normal turns by the inverse transpose of the correction's derivative; the linear part of that, at the identity, is what a
+    small change of a factor does.
+    """
+    seen = correction.normals(c, m) @ R.T
+    across = np.eye(3) - z[:, :, None] * z[:, None]
+    J = np.zeros((len(z), 3, size))
+    J[:, :, :3] = -skew(seen)
+    slopes = correction.slopes(c)
+    lean = (c * m).sum(axis=1)
+    turned = np.zeros((len(z), slopes.shape[1], 3))
+    turned[:, :, :2] = -lean[:, None, None] * slopes
+    J[:, :, 6 : 6 + slopes.shape[1]] = np.swapaxes(turned @ R.T, 1, 2)
+    return np.einsum("nij,nj->ni", across, seen - z), np.einsum("nij,njk->nik", across, J)
+
+
+def _circles(patterns: Sequence[HolePattern], shape: ScannerCorrection) -> tuple[Array, Array]:
+    """Of k hole circles: derivative (k, K) of their stretch by the factors of ``shape``, and measured over nominal size (k,).
+
+    The stretch of a small circle is half the trace of the correction's derivative in the circle's plane.
+    """
+    c = np.array([p.center_C for p in patterns]).reshape(-1, 3)
+    n = np.array([p.X_CR.rotation().matrix()[:, 2] for p in patterns]).reshape(-1, 3)
+    in_plane = c - (c * n).sum(axis=1, keepdims=True) * n
+    bend = 0.5 * np.einsum("nki,ni->nk", shape.slopes(c), in_plane[:, :2])
+    return shape.terms(c) + bend, np.array([p.ratio for p in patterns])
+
+
+def _ratio_sigma(rows: Array, ratio: Array) -> float:
+    """Spread of the measured sizes of hole circles about the best correction for them alone, and what is expected of
+    it."""
+    square, dof = 0.0, 0
+    if len(ratio) > 3:
+        left = 1.0 / ratio - rows @ np.linalg.lstsq(rows, 1.0 / ratio, rcond=1e-6)[0]
+        square, dof = float((left**2).sum()), len(ratio) - 3
+    return float(np.sqrt((square + _RATIO_DOF * _RATIO_SIGMA**2) / (dof + _RATIO_DOF)))
+
+
+def _spread(e: Array, count: int) -> float:
+    """Standard deviation of residuals, half of it from their middle: a few wild ones do not set it."""
+    if count == 0:
+        return 1.0
+    limit = 4.0 * 1.4826 * float(np.median(np.abs(e)))
+    return float(np.sqrt((np.minimum(np.abs(e), limit) ** 2).sum() / count))
