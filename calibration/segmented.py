@@ -53,7 +53,7 @@ def fit_segmented(points: Array, standard: FlangeStandard, config: FlangeFitConf
     cx, cy, radius = rough
     dx, dy = x - np.float32(cx), y - np.float32(cy)
     rho2 = dx * dx + dy * dy
-    rho2[~thin] = 1e6
+    rho2 += np.float32(1e3) * ~thin
     face_area = np.pi * (radius**2 - standard.face_inner_radius_m**2)
     inner, outer = (standard.face_inner_radius_m + 0.002) ** 2, (radius - 0.002) ** 2
     on_ring = int(np.count_nonzero((rho2 > inner) & (rho2 < outer)))
@@ -170,7 +170,7 @@ def _outline(
         A = np.ones((3, len(edge)))
         A[:2] = edge.T
         square = (A[:2] ** 2).sum(axis=0)
-        for _ in range(2):  # Kasa's circle, reweighted
+        for _ in range(3):  # Kasa's circle, reweighted
             weighted = A * w
             s = np.linalg.solve(weighted @ A.T, weighted @ square)
             c = 0.5 * s[:2]
@@ -181,6 +181,8 @@ def _outline(
         cx, cy = cx + float(c[0]), cy + float(c[1])
         if abs(radius - standard.face_outer_radius_m) > 0.1 * standard.outer_radius_m or scale > 0.002:
             return None
+        if float(np.hypot(*c)) < 0.02 * radius:
+            break  # the directions were right
     return cx, cy, radius
 
 
