@@ -96,11 +96,16 @@ def fit_circle(
 
 
 def refine_circles(
-    edges: Sequence[Array], radii: Sequence[float], *, noise_floor: float, settled: float | None = None
+    edges: Sequence[Array],
+    radii: Sequence[float],
+    *,
+    noise_floor: float,
+    settled: float | None = None,
+    fixed: NDArray[np.bool_] | None = None,
 ) -> list[CircleFit]:
     """Circles about the origin of their points (N_k, 2) [m], as ``fit_circle`` refines them from radii [m] that are
     right to a millimetre or so, all at once: most of a small fit's time is the number of its steps, not their size.
-    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it."""
+    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
     settled = 1e-2 * noise_floor if settled is None else settled
     longest = max(len(e) for e in edges)
     q = np.zeros((len(edges), 2, longest))
@@ -112,6 +117,8 @@ def refine_circles(
     theta = np.column_stack([np.zeros((len(edges), 2)), radii])
     J = np.empty((len(edges), 3, longest))
     J[:, 2] = 1.0
+    if fixed is not None:
+        J[fixed, 2] = 0.0
     for k in range(7):
         d = q - theta[:, :2, None]
         rho = np.sqrt((d * d).sum(axis=1)) + 1e-15
@@ -125,6 +132,8 @@ def refine_circles(
         J[:, :2] = d / rho[:, None]
         weighted = J * w[:, None]
         normal = weighted @ J.transpose(0, 2, 1)
+        if fixed is not None:
+            normal[fixed, 2, 2] = np.maximum(w[fixed].sum(axis=1), 1e-9)
         if k < 2 and not (np.abs(np.linalg.det(normal)) > 1e-9 * normal[:, 2, 2] ** 3).all():
             raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
         try:
@@ -138,7 +147,12 @@ def refine_circles(
     dpsi = np.where(inside > 0.0, inside * (1.0 - 5.0 * t * t), 0.0).sum(axis=1) / n
     variance = (psi * psi).sum(axis=1) / np.maximum(n - 3, 1) / np.maximum(dpsi, 0.2) ** 2
     J *= real[:, None]
-    covariance = variance[:, None, None] * np.linalg.inv(J @ J.transpose(0, 2, 1))
+    information = J @ J.transpose(0, 2, 1)
+    if fixed is not None:
+        information[fixed, 2, 2] = 1.0
+    covariance = variance[:, None, None] * np.linalg.inv(information)
+    if fixed is not None:
+        covariance[fixed, 2, 2] = 0.0
     out = []
     for k in range(len(edges)):
         inliers = inside[k, : n[k]] > 0.0

@@ -161,7 +161,7 @@ def _outline(
         return None
     cx, cy = float(px.mean()), float(py.mean())
     radius = standard.face_outer_radius_m
-    for again in (False, True):
+    for _ in range(2):
         dx, dy = px - cx, py - cy
         edge = _extreme(dx, dy, dx * dx + dy * dy, _ROUGH_SECTORS, True)
         if len(edge) < 0.4 * _ROUGH_SECTORS:
@@ -170,7 +170,7 @@ def _outline(
         A = np.ones((3, len(edge)))
         A[:2] = edge.T
         square = (A[:2] ** 2).sum(axis=0)
-        for _ in range(3):  # Kasa's circle, reweighted
+        for _step in range(3):  # Kasa's circle, reweighted
             weighted = A * w
             s = np.linalg.solve(weighted @ A.T, weighted @ square)
             c = 0.5 * s[:2]
@@ -186,9 +186,7 @@ def _outline(
     return cx, cy, radius
 
 
-def _extreme(
-    dx: Array | Single, dy: Array | Single, rho2: Array | Single, sectors: int, outer: bool
-) -> Array:
+def _extreme(dx: Array | Single, dy: Array | Single, rho2: Array | Single, sectors: int, outer: bool) -> Array:
     """Outermost (or innermost) point (K, 2) of each sector about the origin."""
     sector = ((np.arctan2(dy, dx) + np.pi) * (sectors / (2.0 * np.pi))).astype(np.intp)
     best = np.full(sectors + 1, -np.inf, dtype=rho2.dtype)

@@ -244,9 +244,7 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
     first = np.concatenate([one + v, two])
     second = first + 1
     second[len(one) :] += w - 1
-    points = view.places(
-        np.concatenate([one - v * (w - 1) + 0.5, two - q * w]), np.concatenate([v, q + 0.5])
-    )
+    points = view.places(np.concatenate([one - v * (w - 1) + 0.5, two - q * w]), np.concatenate([v, q + 0.5]))
     on_first = flat[first]
     step = np.empty_like(points)
     step[:, : len(one)], step[:, len(one) :] = along[:, None], down[:, None]
@@ -263,9 +261,10 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
             raise CircleFitError("Too little of an edge was seen.")
         rims.append(d[:, at[:: -(-len(at) // _EDGE_POINTS)]].T)
     rough = refine_circles(rims, radii, noise_floor=0.1 * pitch, settled=0.05 * pitch)
-    if max(abs(f.radius - r) for f, r in zip(rough, radii, strict=True)) > width or float(
-        np.hypot(*(rough[0].center - rough[1].center))
-    ) > 3.0 * pitch + 0.001:
+    if (
+        max(abs(f.radius - r) for f, r in zip(rough, radii, strict=True)) > width
+        or float(np.hypot(*(rough[0].center - rough[1].center))) > 3.0 * pitch + 0.001
+    ):
         raise CircleFitError("The edges do not agree.")
     starts, lowered, clear = [], [], []
     for k, (f, way) in enumerate(zip(rough, (outward, -outward), strict=True)):
