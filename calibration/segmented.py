@@ -21,6 +21,7 @@ _TUKEY, _MAD = 4.685, 1.4826
 _FEW = 1200  # points that find the plane and the outline; all of them then measure
 _TRIPLES = 24
 _ROUGH_SECTORS = 60
+_HALF = 0.5  # of the outer edge; a lesser part is looked at carefully
 _OWN_SHARE = 0.6  # of the points must lie on the one plane, and as many of the rim on the circle: else look carefully
 
 
@@ -83,7 +84,7 @@ def fit_segmented(points: Array, standard: FlangeStandard, config: FlangeFitConf
         standard.face_outer_radius_m - slack < outer_fit.radius < standard.outer_radius_m + slack
         and abs(bore.radius - standard.face_inner_radius_m) < slack + standard.chamfer_m
         and float(np.hypot(*(bore.center - outer_fit.center))) < 0.25 * slack + pitch
-        and seen > config.min_coverage
+        and seen > max(config.min_coverage, _HALF)
         and outer_fit.rms < rough_limit
         and filled < 0.4 * density
         and min(float(f.inliers.mean()) for f in fits) > _OWN_SHARE
