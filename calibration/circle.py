@@ -95,9 +95,18 @@ def fit_circle(
     )
 
 
-def refine_circles(edges: Sequence[Array], radii: Sequence[float], *, noise_floor: float) -> list[CircleFit]:
+def refine_circles(
+    edges: Sequence[Array],
+    radii: Sequence[float],
+    *,
+    noise_floor: float,
+    settled: float | None = None,
+    fixed: NDArray[np.bool_] | None = None,
+) -> list[CircleFit]:
     """Circles about the origin of their points (N_k, 2) [m], as ``fit_circle`` refines them from radii [m] that are
-    right to a millimetre or so, all at once: most of a small fit's time is the number of its steps, not their size."""
+    right to a millimetre or so, all at once: most of a small fit's time is the number of its steps, not their size.
+    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
+    settled = 1e-2 * noise_floor if settled is None else settled
     longest = max(len(e) for e in edges)
     q = np.zeros((len(edges), 2, longest))
     real = np.zeros((len(edges), longest), dtype=bool)
@@ -108,6 +117,8 @@ def refine_circles(edges: Sequence[Array], radii: Sequence[float], *, noise_floo
     theta = np.column_stack([np.zeros((len(edges), 2)), radii])
     J = np.empty((len(edges), 3, longest))
     J[:, 2] = 1.0
+    if fixed is not None:
+        J[fixed, 2] = 0.0
     for k in range(7):
         d = q - theta[:, :2, None]
         rho = np.sqrt((d * d).sum(axis=1)) + 1e-15
@@ -121,17 +132,27 @@ def refine_circles(edges: Sequence[Array], radii: Sequence[float], *, noise_floo
         J[:, :2] = d / rho[:, None]
         weighted = J * w[:, None]
         normal = weighted @ J.transpose(0, 2, 1)
-        if not (np.abs(np.linalg.det(normal)) > 1e-9 * normal[:, 2, 2] ** 3).all():
+        if fixed is not None:
+            normal[fixed, 2, 2] = np.maximum(w[fixed].sum(axis=1), 1e-9)
+        if k < 2 and not (np.abs(np.linalg.det(normal)) > 1e-9 * normal[:, 2, 2] ** 3).all():
             raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
-        step = np.linalg.solve(normal, weighted @ e[:, :, None])[:, :, 0]
+        try:
+            step = np.linalg.solve(normal, weighted @ e[:, :, None])[:, :, 0]
+        except np.linalg.LinAlgError:
+            raise CircleFitError("The points do not fix a circle: they cover too short an arc.") from None
         theta = theta + step
-        if k > 2 and float(np.abs(step).max()) < 1e-2 * noise_floor:
+        if k > 2 and float(np.abs(step).max()) < settled:
             break
     psi = e * w
     dpsi = np.where(inside > 0.0, inside * (1.0 - 5.0 * t * t), 0.0).sum(axis=1) / n
     variance = (psi * psi).sum(axis=1) / np.maximum(n - 3, 1) / np.maximum(dpsi, 0.2) ** 2
     J *= real[:, None]
-    covariance = variance[:, None, None] * np.linalg.inv(J @ J.transpose(0, 2, 1))
+    information = J @ J.transpose(0, 2, 1)
+    if fixed is not None:
+        information[fixed, 2, 2] = 1.0
+    covariance = variance[:, None, None] * np.linalg.inv(information)
+    if fixed is not None:
+        covariance[fixed, 2, 2] = 0.0
     out = []
     for k in range(len(edges)):
         inliers = inside[k, : n[k]] > 0.0
@@ -192,11 +213,13 @@ def fuse(centers: list[Array], covariances: list[Array]) -> tuple[Array, Array]:
     Returns the fused centre (m,) and its covariance (m, m). The inflation is the Birge ratio (reduced chi-square, never
     below one): two rims that are not concentric say how much a centre may be trusted.
     """
-    information = [np.linalg.inv(c) for c in covariances]
-    total = np.linalg.inv(sum(information[1:], information[0]))
-    mean = total @ sum((i @ c for i, c in zip(information[1:], centers[1:], strict=True)), information[0] @ centers[0])
+    information = np.linalg.inv(np.array(covariances))
+    total = np.linalg.inv(information.sum(axis=0))
+    at = np.array(centers)
+    mean = total @ (information @ at[:, :, None]).sum(axis=0)[:, 0]
     dof = (len(centers) - 1) * len(mean)
     if dof == 0:
         return mean, total
-    chi2 = sum(float((c - mean) @ i @ (c - mean)) for c, i in zip(centers, information, strict=True))
+    off = at - mean
+    chi2 = float(np.einsum("ki,kij,kj->", off, information, off))
     return mean, total * max(1.0, chi2 / dof)

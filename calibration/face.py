@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 _CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
 _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so
 _WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
+_ALONE = 0.5  # of the outer edge; less of it counts only beside as much of the bore
 _FILLED = 0.4  # share of the bore's core that must not be face
 _HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it
 _FULL = 0.85  # and must be where the bore's edge itself was not found
@@ -29,12 +30,12 @@ _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulat
 @dataclass(frozen=True)
 class FlangeFitConfig:
     """What counts as a flange. Lengths in m; the defaults suit structured-light scanners and admit time-of-
-    flight ones."""
+    flight ones. Below half of the outer edge, ``min_coverage`` of it is enough only beside as much of a concentric bore."""
 
     seed: int = 0
     hypothesis_tolerance_m: float = 0.0008
     radius_tolerance: float = 0.05
-    min_coverage: float = 0.5
+    min_coverage: float = 0.35
     max_plane_rms_m: float = 0.0015
     max_rim_rms_m: float = 0.0006
     max_guess_tilt_rad: float = 0.8
@@ -80,6 +81,7 @@ class Measured:
     count: int
     core_share: float
     ring_share: float
+    bore_coverage: float = 1.0
 
 
 def thickness(plane: PlaneFit) -> float:
@@ -219,6 +221,9 @@ def _measure(
         coverage=coverage(xy[np.abs(rho - outer.radius) < 2.0 * pitch + 0.0005], outer.center),
         count=count,
         core_share=int((rho < core).sum()) / core**2 / max(density, 1e-9),
+        bore_coverage=0.0
+        if bore is None
+        else coverage(xy[np.abs(rho - bore.radius) < 2.0 * pitch + 0.0005], outer.center),
         ring_share=np.count_nonzero((rho > span[0]) & (rho < span[1]))
         / (span[1] ** 2 - span[0] ** 2)
         / max(full, 1e-9),
@@ -305,6 +310,14 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
             6,
             f"Only {100 * m.coverage:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are needed.",
         )
+    elif m.coverage < _ALONE and (m.bore is None or m.bore_coverage < config.min_coverage):
+        refusal.note(
+            6,
+            f"Only {100 * m.coverage:.0f} % of the flange's edge was seen, and too little of its bore; {100 * _ALONE:.0f} % "
+            "are needed without it.",
+        )
+    elif m.coverage < _ALONE and m.bore is not None and not _concentric(m.outer, m.bore, m.pitch):
+        refusal.note(6, "The part of an edge seen and the bore beside it are not concentric: it is not the flange.")
     elif m.outer.rms > rough:
         refusal.note(
             6,
@@ -323,3 +336,9 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
         quality = m.coverage + (1.0 if m.bore is not None else 0.0) - m.outer.rms / rough
         return Face(m.plane, m.outer, m.bore, m.coverage, m.count, quality)
     return None
+
+
+def _concentric(outer: CircleFit, bore: CircleFit, pitch: float) -> bool:
+    """Do two circles share their centre, within four sigmas and a fraction of a pixel?"""
+    spread = float(np.sqrt(np.trace(outer.covariance[:2, :2]) + np.trace(bore.covariance[:2, :2])))
+    return float(np.hypot(*(outer.center - bore.center))) < 4.0 * spread + 0.3 * pitch

@@ -15,6 +15,7 @@ from weldcal.calibration.plane import local_planes
 from weldcal.calibration.rim import plane_axes
 from weldcal.calibration.scene import Scene, crop, islands
 from weldcal.calibration.segmented import fit_segmented
+from weldcal.calibration.track import fit_tracked
 from weldcal.calibration.window import measure_window
 from weldcal.models.flanges import FlangeStandard
 
@@ -105,6 +106,10 @@ def _organised(
 ) -> FlangeFit | None:
     """A scan with its pixel grid: the whole of it, or the window about a guess."""
     if guess is not None:
+        if guess.normal_C is not None:
+            face = fit_tracked(cloud, guess.center_C, guess.normal_C, standard, config)
+            if face is not None and face.coverage > _GOOD_COVERAGE:
+                return _result(face)
         pitches = typical_pitches(cloud)
         if pitches is None:
             refusal.note(0, "The cloud holds no valid point.")

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.spatial import cKDTree
 
-from weldcal.calibration.circle import fit_circle
+from weldcal.calibration.circle import CircleFit, refine_circles
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.flange_fit import FlangeFit
-from weldcal.calibration.rim import plane_axes, sector_edges
+from weldcal.calibration.frame_search import typical_pitches, window_about
+from weldcal.calibration.rim import plane_axes
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]
 
 _LEAST_HOLES = 4  # of a pattern: three would fit a wrong phase too easily
+_LEAST_EDGES = 17  # of a hole's 24 sectors
+_SECTORS = 24
 _COARSEST = 0.25  # pitch between points over the hole's diameter above which a hole has no edge
 _COUNTERSINK_M = 0.0013  # a hole shows the end of its countersink, so much wider than the thread at most
 _THIN_M = 0.00025  # of the face about its plane: what lies lower is countersink or thread
@@ -28,7 +30,12 @@ _OFF_M = 0.0004  # from its place in the pattern: such a hole is a dent or a gap
 class HolePattern:
     """Holes found in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the standard,
     the circle centre (3,) m they fix, the flange's pose X_CR with the rotation about its axis, and how the pitch circle
-    measures against the standard (1 where the scanner's scale is right)."""
+    measures against the standard (1 where the scanner's scale is right).
+
+    ``off_m`` (k,) is how far each hole lies from its place in the pattern and ``rms_m`` their root mean square.
+    ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation then
+    translation, in the camera's axes; both cover this scan's noise and how well the holes agree.
+    """
 
     holes_C: Array
     angles_rad: Array
@@ -36,6 +43,9 @@ class HolePattern:
     X_CR: RigidTransform
     ratio: float
     rms_m: float
+    turn_sigma: float = float("nan")
+    covariance: Array | None = None
+    off_m: Array | None = None
 
 
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
@@ -49,76 +59,103 @@ def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Hol
     if len(angles) < _LEAST_HOLES:
         return None
     axes = np.column_stack(plane_axes(fit.normal_C))
-    xy = _face(np.asarray(points_C, dtype=float), fit, standard, axes)
-    if len(xy) < 100:
+    xy = _face(points_C, fit, standard, axes)
+    if xy is None or xy.shape[1] < 100:
         return None
-    tree = cKDTree(xy)
-    pitch = float(np.median(np.asarray(tree.query(xy[:: max(1, len(xy) // 200)], k=5)[0])[:, -1]))
+    solid = standard.outer_radius_m**2 - standard.bore_radius_m**2 - sum(r * r for _, _, r in standard.openings())
+    pitch = float(np.sqrt(np.pi * solid / xy.shape[1]))
     if pitch > _COARSEST * standard.hole_m:
         return None
-    phase = _phase(tree, angles, standard)
+    phase = _phase(xy, angles, standard)
     if phase is None:
         return None
     place = 0.5 * standard.pitch_circle_m
     nominal = 0.5 * np.array([standard.hole_m] * standard.n_holes + [standard.pin_m] * (len(angles) - standard.n_holes))
-    z, seen = np.zeros(0, dtype=complex), np.zeros(0, dtype=int)
+    seen, z = np.arange(len(angles)), np.zeros(0, dtype=complex)
+    covariances = np.zeros((0, 2, 2))
     start, gain = 0j, complex(place * np.exp(1j * phase))
+    near = _about(xy, start + gain * np.exp(1j * angles), nominal)
     threads: float | None = None
-    for _ in range(3):
-        found = []
-        for k, a in enumerate(angles):
-            c = start + gain * np.exp(1j * a)
-            hole = _hole(
-                xy, np.array([c.real, c.imag]), float(nominal[k]), pitch, threads if k < standard.n_holes else None
-            )
-            if hole is not None:
-                found.append((k, complex(*hole[0]), hole[1]))
+    for k in range(3):
+        expected = start + gain * np.exp(1j * angles)
+        found = _holes(near, expected, nominal, standard.n_holes, pitch, threads, passes=3 if k == 0 else 2)
         if len(found) < _LEAST_HOLES:
             return None
-        seen, z = np.array([f[0] for f in found]), np.array([f[1] for f in found])
+        seen, z = np.array(list(found)), np.array([complex(*c.center) for c in found.values()])
+        radii, covariances = (
+            np.array([c.radius for c in found.values()]),
+            np.array([c.covariance[:2, :2] for c in found.values()]),
+        )
         start, gain = _similarity(z, angles[seen])
-        off = np.abs(z - start - gain * np.exp(1j * angles[seen]))
-        keep = off < _OFF_M
-        if int(keep.sum()) < _LEAST_HOLES:
-            return None
-        if not keep.all():
-            seen, z, found = seen[keep], z[keep], [f for f, k in zip(found, keep, strict=True) if k]
+        while True:  # the worst goes first: it drags the others off their places
+            off = np.abs(z - start - gain * np.exp(1j * angles[seen]))
+            worst = int(np.argmax(off))
+            if off[worst] < _OFF_M:
+                break
+            if len(seen) == _LEAST_HOLES:
+                return None
+            seen, z, radii, covariances = (np.delete(a, worst, axis=0) for a in (seen, z, radii, covariances))
             start, gain = _similarity(z, angles[seen])
-        threads = float(np.median([f[2] for f in found if f[0] < standard.n_holes]))
-    off = np.abs(z - start - gain * np.exp(1j * angles[seen]))
-    center = fit.center_C + axes @ np.array([start.real, start.imag])
+        threads = float(np.median(radii[seen < standard.n_holes]))
+    off = z - start - gain * np.exp(1j * angles[seen])
+    turn_sigma = _turn_sigma(off, gain, angles[seen], covariances)
+    n = fit.normal_C
     turn = gain / abs(gain)
     x = axes @ np.array([turn.real, turn.imag])
-    R = RotationMatrix.ProjectToRotationMatrix(np.column_stack([x, np.cross(fit.normal_C, x), fit.normal_C]))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = fit.normal_sigma**2 * (np.eye(3) - np.outer(n, n)) + turn_sigma**2 * np.outer(n, n)
+    covariance[3:, 3:] = fit.center_covariance
     return HolePattern(
         holes_C=fit.center_C + np.column_stack([z.real, z.imag]) @ axes.T,
         angles_rad=angles[seen],
-        center_C=center,
-        X_CR=RigidTransform(R, fit.center_C),
+        center_C=fit.center_C + axes @ np.array([start.real, start.imag]),
+        X_CR=RigidTransform(
+            RotationMatrix.ProjectToRotationMatrix(np.column_stack([x, np.cross(n, x), n])), fit.center_C
+        ),
         ratio=float(abs(gain) / place),
-        rms_m=float(np.sqrt(np.mean(off**2))),
+        rms_m=float(np.sqrt(np.mean(np.abs(off) ** 2))),
+        turn_sigma=turn_sigma,
+        covariance=covariance,
+        off_m=np.abs(off),
     )
 
 
-def _face(points: Array, fit: FlangeFit, standard: FlangeStandard, axes: Array) -> Array:
-    """Face points (N, 2) about the fitted centre."""
-    flat = points.reshape(-1, 3)
-    d = flat[np.isfinite(flat).all(axis=1)] - fit.center_C
+def _face(points: Array, fit: FlangeFit, standard: FlangeStandard, axes: Array) -> Array | None:
+    """Face points (2, N) m about the fitted centre."""
+    cloud: Array | None = np.asarray(points)
+    assert cloud is not None
+    reach = standard.outer_radius_m
+    if cloud.ndim == 3:
+        pitches = typical_pitches(cloud)
+        step = 1 if pitches is None else max(1, int(reach / (6.0 * pitches[0])))
+        cloud = window_about(cloud, fit.center_C, 1.1 * reach, step)
+        if cloud is None:
+            return None
+    flat = np.ascontiguousarray(cloud.reshape(-1, 3).T) - np.asarray(fit.center_C)[:, None]
+    x, y, d = np.column_stack([axes, fit.normal_C]).T @ flat
     with np.errstate(invalid="ignore"):
-        thin = np.abs(d @ fit.normal_C) < max(3.0 * fit.plane_rms_m, _THIN_M)
-    xy = d[thin] @ axes
-    return np.asarray(xy[np.hypot(xy[:, 0], xy[:, 1]) < standard.outer_radius_m])
+        rho2 = x * x + y * y
+        on = np.flatnonzero(
+            (np.abs(d) < max(3.0 * fit.plane_rms_m, _THIN_M)) & (rho2 < reach**2) & (rho2 > standard.bore_radius_m**2)
+        )
+    return np.array([x[on], y[on]])
 
 
-def _phase(tree: cKDTree, angles: Array, standard: FlangeStandard) -> float | None:
+def _phase(xy: Array, angles: Array, standard: FlangeStandard) -> float | None:
     """Rotation (rad) of the standard's pattern, in the plane's axes, at which its holes are emptiest; None without one."""
-    turns = np.radians(np.arange(0.0, 360.0, 1.0))
     place, disc = 0.5 * standard.pitch_circle_m, 0.35 * standard.hole_m
-    ring = place * np.column_stack([np.cos(turns), np.sin(turns)])
-    count = np.asarray(tree.query_ball_point(ring, disc, return_length=True), dtype=float)
-    at = (np.arange(360)[None] + np.round(np.degrees(angles)).astype(int)[:, None]) % 360
+    rho = np.sqrt(xy[0] * xy[0] + xy[1] * xy[1])
+    ring = np.flatnonzero(np.abs(rho - place) < disc)
+    rho = rho[ring]
+    at = np.degrees(np.arctan2(xy[1, ring], xy[0, ring])) + 720.0
+    # a point lies in the discs about so much of the pitch circle to either side
+    half = np.degrees(np.arccos(np.clip((rho * rho + place**2 - disc**2) / (2.0 * place * rho), -1.0, 1.0)))
+    enters = np.bincount(np.ceil(at - half).astype(int), minlength=1500)
+    leaves = np.bincount(np.floor(at + half).astype(int) + 1, minlength=1500)
+    count = np.cumsum(enters - leaves)[360:1440].reshape(3, 360).sum(axis=0).astype(float)
+    at_hole = (np.arange(360)[None] + np.round(np.degrees(angles)).astype(int)[:, None]) % 360
     # a plugged hole counts as face, however dense its plug
-    total = np.minimum(count, np.median(count))[at].sum(axis=0)
+    total = np.minimum(count, np.median(count))[at_hole].sum(axis=0)
     best = int(np.argmin(total))
     # a face without holes, or too thin a scan of one, has no phase that stands out
     if total[best] > 0.25 * float(np.median(total)) or float(np.median(count)) < 10.0:
@@ -129,20 +166,68 @@ def _phase(tree: cKDTree, angles: Array, standard: FlangeStandard) -> float | No
     return float(np.radians(best + np.mean((low - best + 180) % 360 - 180)))
 
 
-def _hole(xy: Array, near: Array, nominal: float, pitch: float, radius: float | None) -> tuple[Array, float] | None:
-    """Centre (2,) and radius of one hole near its expected place; None where its rim is not seen all round."""
-    c, r = near, nominal + 0.5 * _COUNTERSINK_M if radius is None else radius
-    try:
-        for _ in range(3):
-            rim = sector_edges(xy, c, pitch, outer=False, band=(0.4 * nominal, nominal + 2.0 * _COUNTERSINK_M))
-            circle = fit_circle(rim, initial=(c, r), noise_floor=0.1 * pitch, radius=radius)
-            c, r = circle.center, circle.radius
-    except CircleFitError:
-        return None
-    wide = 0.8 * nominal < r < nominal + _COUNTERSINK_M
-    if not wide or float(np.linalg.norm(c - near)) > nominal or int(circle.inliers.sum()) < 17:
-        return None
-    return c, r
+def _about(xy: Array, expected: NDArray[np.complex128], nominal: Array) -> list[Array]:
+    """The face points (2, N_k) m about each expected hole."""
+    out = []
+    for c, r in zip(expected, nominal, strict=True):
+        x, y = xy[0] - c.real, xy[1] - c.imag
+        at = np.flatnonzero(x * x + y * y < (2.0 * float(r) + 2.0 * _COUNTERSINK_M) ** 2)
+        out.append(xy[:, at])
+    return out
+
+
+def _holes(
+    near: list[Array],
+    expected: NDArray[np.complex128],
+    nominal: Array,
+    n_threads: int,
+    pitch: float,
+    threads: float | None,
+    *,
+    passes: int,
+) -> dict[int, CircleFit]:
+    """Circles of the holes near their expected places, by their number; those whose rim is not seen all round are left
+    out. ``threads`` is the radius of all threaded ones, where it is known already."""
+    sizes = [a.shape[1] for a in near]
+    hole = np.repeat(np.arange(len(near)), sizes)
+    points = np.concatenate(near, axis=1)
+    least, most = (0.4 * nominal)[hole], (nominal + 2.0 * _COUNTERSINK_M)[hole]
+    center = np.array([expected.real, expected.imag])
+    radius = nominal + 0.5 * _COUNTERSINK_M
+    if threads is not None:
+        radius = np.where(np.arange(len(near)) < n_threads, threads, radius)
+    out: dict[int, CircleFit] = {}
+    for _ in range(passes):
+        d = points - center[:, hole]
+        rho = np.sqrt(d[0] * d[0] + d[1] * d[1])
+        band = np.flatnonzero((rho > least) & (rho < most))
+        x, y, r = d[0, band], d[1, band], rho[band]
+        sector = ((np.arctan2(y, x) + np.pi) * (_SECTORS / (2.0 * np.pi))).astype(np.intp) % _SECTORS
+        cell = hole[band] * _SECTORS + sector
+        first = np.full(len(near) * _SECTORS, np.inf)
+        np.minimum.at(first, cell, r)
+        rim = np.flatnonzero(r == first[cell])
+        of = hole[band][rim]
+        able = [k for k in range(len(near)) if int(np.count_nonzero(of == k)) >= _LEAST_EDGES]
+        if not able:
+            return {}
+        edges = [np.column_stack([x[rim[of == k]], y[rim[of == k]]]) for k in able]
+        fixed = None if threads is None else np.array([k < n_threads for k in able])
+        try:
+            fits = refine_circles(edges, radius[able].tolist(), noise_floor=0.1 * pitch, fixed=fixed)
+        except CircleFitError:
+            return {}
+        out = {}
+        for k, f in zip(able, fits, strict=True):
+            center[:, k] += f.center
+            radius[k] = f.radius
+            wide = 0.8 * nominal[k] < f.radius < nominal[k] + _COUNTERSINK_M
+            stays = float(np.hypot(center[0, k] - expected[k].real, center[1, k] - expected[k].imag)) < nominal[k]
+            if not stays:
+                center[:, k] = expected[k].real, expected[k].imag
+            if wide and stays and f.rms < pitch and int(f.inliers.sum()) >= _LEAST_EDGES:
+                out[k] = CircleFit(center[:, k].copy(), f.radius, f.covariance, f.rms, f.inliers)
+    return out
 
 
 def _similarity(z: NDArray[np.complex128], angles: Array) -> tuple[complex, complex]:
@@ -150,3 +235,22 @@ def _similarity(z: NDArray[np.complex128], angles: Array) -> tuple[complex, comp
     M = np.column_stack([np.ones(len(z)), np.exp(1j * angles)])
     shift, gain = np.linalg.lstsq(M, z, rcond=None)[0]
     return complex(shift), complex(gain)
+
+
+def _turn_sigma(off: NDArray[np.complex128], gain: complex, angles: Array, covariances: Array) -> float:
+    """Spread (rad) of the pattern's rotation: the holes' own covariances (k, 2, 2) through the similarity, inflated where
+    the holes lie farther off their places than those allow (Birge ratio, never below one)."""
+    k = len(off)
+    a = np.exp(1j * angles)
+    J = np.zeros((2 * k, 4))  # shift x, y, gain real, imaginary
+    J[0::2, 0] = J[1::2, 1] = 1.0
+    J[0::2, 2], J[0::2, 3], J[1::2, 2], J[1::2, 3] = a.real, -a.imag, a.imag, a.real
+    S = np.zeros((2 * k, 2 * k))
+    for i, c in enumerate(covariances):
+        S[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = c
+    inverse = np.linalg.pinv(J)
+    e = np.column_stack([off.real, off.imag]).ravel()
+    ratio = float(e @ np.linalg.solve(S, e)) / (2 * k - 4)
+    along = np.array([-gain.imag, gain.real]) / abs(gain) ** 2  # of the gain's change: the turn
+    variance = along @ (inverse @ S @ inverse.T)[2:, 2:] @ along
+    return float(np.sqrt(variance * max(1.0, ratio)))

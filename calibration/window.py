@@ -25,6 +25,7 @@ _FLAT_NOISE = 2.5  # and in multiples of its noise: a ball bends more
 _BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
 _RING_SEEN = 0.6
 _LABELLED = 1.2  # pitches about an edge whose pixels place it; farther ones say nothing that nearer ones do not
+_DOMED = 0.8  # of its rms: a face whose inner half stands so far above or below its outer half is a ball or a dish
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
 
@@ -76,12 +77,12 @@ def measure_window(
     w = _window(z, valid, rays, plane, axes, height)
     cx, cy = (center - plane.point) @ axes
     try:
-        outer, bore, pitch = _edges(w, plane, axes, height, (float(cx), float(cy)), radius, standard)
+        outer, bore, blind, pitch = _edges(w, plane, axes, height, (float(cx), float(cy)), radius, standard)
     except CircleFitError as e:
         refusal.note(4, str(e))
         return None
     rho2 = (w.x - outer.center[0]) ** 2 + (w.y - outer.center[1]) ** 2
-    return _face(w, rho2, plane, outer, bore, pitch, standard, config, refusal, grid, axes)
+    return _face(w, rho2, plane, outer, bore, blind, pitch, standard, config, refusal, grid, axes)
 
 
 def _rays(grid: Array, valid: Mask) -> tuple[Array, Array]:
@@ -150,8 +151,9 @@ def _edges(
     center: tuple[float, float],
     radius: float,
     standard: FlangeStandard,
-) -> tuple[CircleFit, CircleFit | None, float]:
-    """Outer edge, bore (None where it does not show) and the pitch of the pixels on the plane."""
+) -> tuple[CircleFit, CircleFit | None, Mask, float]:
+    """Outer edge, bore (None where it does not show), the directions (sectors,) in which the outer edge is hidden, and the
+    pitch of the pixels on the plane."""
     v, u = w.x.shape[0] // 2, w.x.shape[1] // 2
     pitch = float(
         np.sqrt(
@@ -167,6 +169,7 @@ def _edges(
     radii = [radius, standard.face_inner_radius_m]
     rims: list[Array] = []
     lowered: list[float] = []
+    blind = [np.zeros(72, dtype=bool)] * 2
     offset = np.array(center)
     for k in range(2):  # the second time about the circles found in the first, and clear of the holes
         d = points - offset
@@ -174,8 +177,10 @@ def _edges(
         # the far side of a screw hole and a lone pixel's far side face the wrong way
         outward = (d * off).sum(axis=1)
         rims, lowered = [], []
-        for r, width, way in zip(radii, widths, (outward, -outward), strict=True):
+        for r, width, way, hidden in zip(radii, widths, (outward, -outward), blind, strict=True):
             near = (np.abs(rho - r) < width) & (way > 0.0)
+            if hidden.any():
+                near &= ~hidden[_sector(d[:, 0], d[:, 1], len(hidden))]
             low = lowered_by(beyond[near], height)
             lowered.append(low)
             rims.append(d[near] - low * slide[near])
@@ -190,17 +195,44 @@ def _edges(
             near_bore = seen == 2 and abs(fits[1].radius - radii[1]) < widths[1]
             radii = [fits[0].radius, fits[1].radius if near_bore else radii[1]]
             widths = [min(w, max(c, 1.2 * pitch) + low) for w, c, low in zip(widths, clear, lowered, strict=True)]
+            blind = [_blind(w, offset, radii[k], pitch, clear[k], outer=k == 0) for k in (0, 1)]
     out: list[CircleFit | None] = []
     for k, fit in enumerate(fits):
         start = replace(fit, center=fit.center + offset)
         try:
-            out.append(_labelled(w, axes, start, pitch, lowered[k], clear[k], outer=k == 0))
+            out.append(_labelled(w, axes, start, blind[k], pitch, lowered[k], clear[k], outer=k == 0))
         except CircleFitError:
             if k == 0:
                 raise
             out.append(None)
     assert out[0] is not None
-    return out[0], out[1] if len(out) > 1 else None, pitch
+    return out[0], out[1] if len(out) > 1 else None, blind[0], pitch
+
+
+def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
+    """The one of ``sectors`` (N,) in which each direction lies."""
+    return ((np.arctan2(dy, dx) + np.pi) * (sectors / (2.0 * np.pi))).astype(np.intp) % sectors
+
+
+def _blind(w: _Window, center: Array, radius: float, pitch: float, clear: float, *, outer: bool) -> Mask:
+    """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden, by
+    a cable, a shadow or the image's border, and what looks like an edge there is none."""
+    way = -1.0 if outer else 1.0
+    count = int(np.clip(2.0 * np.pi * radius / (4.0 * pitch), 18, 72))
+    low, high = sorted(radius + way * d for d in (pitch, max(2.5 * pitch, min(5.0 * pitch, clear))))
+    x, y = w.x - center[0], w.y - center[1]
+    rho2 = x * x + y * y
+    at = np.flatnonzero((rho2 > low**2) & (rho2 < high**2))
+    sector = _sector(x.ravel()[at], y.ravel()[at], count)
+    face = w.face.ravel()[at]
+    below = w.known.ravel()[at] & ~face & np.isfinite(w.z.ravel()[at])
+    total = np.bincount(sector, minlength=count)
+    shown, lower = (np.bincount(sector[m], minlength=count) for m in (face, below))
+    typical = float(np.median(total[total > 0])) if len(at) else 1.0
+    hidden = ((shown < 0.5 * total) | (total < 0.4 * typical)) & (lower <= 0.5 * total)
+    # beside a hidden direction a part of the next one often is
+    part = shown < 0.9 * np.maximum(total, typical)
+    return np.asarray(hidden | ((np.roll(hidden, 1) | np.roll(hidden, -1)) & part))
 
 
 def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, Array, Array]:
@@ -224,7 +256,7 @@ def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, 
 
 
 def _labelled(
-    w: _Window, axes: Array, start: CircleFit, pitch: float, lowered: float, clear: float, *, outer: bool
+    w: _Window, axes: Array, start: CircleFit, blind: Mask, pitch: float, lowered: float, clear: float, *, outer: bool
 ) -> CircleFit:
     """The edge from the pixels on either side of it. Raises CircleFitError where they do not fix it."""
     x, y = w.x, w.y
@@ -240,6 +272,9 @@ def _labelled(
         d = xy - start.center
         close = np.abs(np.hypot(d[:, 0], d[:, 1]) - start.radius) < reach
         at, xy = at[close], xy[close]
+    if blind.any():
+        seen = ~blind[_sector(xy[:, 0] - start.center[0], xy[:, 1] - start.center[1], len(blind))]
+        at, xy = at[seen], xy[seen]
     fit = refine_circle(xy, w.face.ravel()[at], start, pitch, outer=outer)
     return replace(fit, covariance=_SHARED * fit.covariance)
 
@@ -250,6 +285,7 @@ def _face(
     plane: PlaneFit,
     outer: CircleFit,
     bore: CircleFit | None,
+    blind: Mask,
     pitch: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
@@ -260,21 +296,20 @@ def _face(
     """The tests, then the plane once more, of all that proved to be the face."""
     low, high = standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch
     ring = (rho2 > low**2) & (rho2 < high**2)
+    core = rho2 < (0.7 * standard.bore_radius_m) ** 2
+    if blind.any():  # what is hidden says nothing of the ring and the bore
+        seen = ~blind[_sector(w.x - outer.center[0], w.y - outer.center[1], len(blind))]
+        ring, core = ring & seen, core & seen
     count = int(np.count_nonzero(ring & w.face))
     on_ring = int(np.count_nonzero(ring & w.known))
-    core = rho2 < (0.7 * standard.bore_radius_m) ** 2
     said = core & (w.known | np.isfinite(w.z))
-    rim = w.face & (rho2 < (outer.radius + 2.0 * pitch + 0.0005) ** 2)
-    rim &= rho2 > (outer.radius - 2.0 * pitch - 0.0005) ** 2
-    at = np.flatnonzero(rim)
-    angle = np.arctan2(w.y.ravel()[at] - outer.center[1], w.x.ravel()[at] - outer.center[0])
-    sector = ((angle + np.pi) * (72 / (2.0 * np.pi))).astype(np.intp) % 72
     measured = Measured(
         plane=plane,
         outer=outer,
         bore=bore,
         pitch=pitch,
-        coverage=float(np.count_nonzero(np.bincount(sector, minlength=72))) / 72.0,
+        coverage=_seen(w, outer, blind, pitch),
+        bore_coverage=0.0 if bore is None else _seen(w, bore, None, pitch),
         count=count,
         # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's floor);
         # a ring of which less than half is seen is no ring
@@ -283,6 +318,9 @@ def _face(
     )
     face = judge(measured, standard, config, refusal)
     if face is None:
+        return None
+    if _domed(w, ring, rho2, plane):
+        refusal.note(6, "The ring found is domed: it is not the flange.")
         return None
     ring &= w.face
     points = grid[ring]
@@ -299,6 +337,27 @@ def _face(
         bore=None if bore is None else replace(bore, center=shift[1]),
         n_points=len(points),
     )
+
+
+def _seen(w: _Window, circle: CircleFit, blind: Mask | None, pitch: float) -> float:
+    """Share (0..1) of the directions about a circle in which the face shows at it."""
+    x, y = w.x - circle.center[0], w.y - circle.center[1]
+    rho2 = x * x + y * y
+    width = 2.0 * pitch + 0.0005
+    at = np.flatnonzero(w.face & (rho2 < (circle.radius + width) ** 2) & (rho2 > (circle.radius - width) ** 2))
+    count = 72 if blind is None else len(blind)
+    shown = np.bincount(_sector(x.ravel()[at], y.ravel()[at], count), minlength=count) > 0
+    if blind is not None:
+        shown &= ~blind
+    return float(np.count_nonzero(shown)) / count
+
+
+def _domed(w: _Window, ring: Mask, rho2: Array, plane: PlaneFit) -> bool:
+    """Does a ring (h, w) bulge, as that part of a ball does which lies near a plane?"""
+    at = np.flatnonzero(ring & w.face)
+    above = w.z.ravel()[at] * w.slope.ravel()[at] - float(plane.normal @ plane.point)
+    inner = rho2.ravel()[at] < np.median(rho2.ravel()[at])
+    return abs(float(above[inner].mean() - above[~inner].mean())) > max(_FLAT_M, _DOMED * plane.rms)
 
 
 def _moved(center: Array, old: PlaneFit, new: PlaneFit, axes: Array) -> Array:

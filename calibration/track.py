@@ -1,0 +1,342 @@
+"""The flange where it was a moment ago: plane and both edges from the few pixels that fix them, or nothing (then search)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.circle import CircleFit, refine_circles
+from weldcal.calibration.edge_labels import refine_pair
+from weldcal.calibration.errors import CircleFitError
+from weldcal.calibration.face import Face, FlangeFitConfig, Measured, Refusal, clear_band, judge, lowered_by, thickness
+from weldcal.calibration.plane import PlaneFit
+from weldcal.calibration.rim import plane_axes
+from weldcal.models.flanges import FlangeStandard
+
+Array = NDArray[np.float64]
+Single = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
+_TUKEY, _MAD = 4.685, 1.4826
+_SLACK_M = 0.003  # that the centre may have moved sideways
+_PLANE_POINTS = 2500
+_BLOCK = 4  # pixels a side; what such a block's middle says of the ring and the bore is enough
+_BEFORE_M = 0.002  # what stands so far before the face hides it and says nothing of its edge
+_LABELLED = 1.2  # pitches about an edge whose pixels place it
+_SHARED = 1.3  # variance of a labelled edge over the expected one, as in the window of a search
+_RING_SEEN = 0.6
+_FLAT_M = 3e-4  # rms of a face from its plane; a rougher one is for the careful way
+_EDGE_POINTS = 240  # crossings that place a circle well enough to look at the pixels about it
+_THREE = np.ones((3, 3), np.uint8)
+_BLOCK_V, _BLOCK_U = (a.ravel() for a in np.mgrid[0:_BLOCK, 0:_BLOCK].astype(np.int32))
+
+
+def fit_tracked(
+    cloud: Array, center: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig
+) -> Face | None:
+    """The face in a scan (H, W, 3) m whose centre (3,) m and outward normal (3,) were so a moment ago, 3 mm away at most.
+
+    None wherever anything is out of the ordinary: not there, partly hidden, no bore, rays that are no pinhole's.
+    """
+    rect = _rectangle(cloud, center, 0.5 * standard.outer_m + _SLACK_M)
+    if rect is None:
+        return None
+    grid = cloud[rect]
+    z = np.ascontiguousarray(grid[..., 2], dtype=np.float32)  # to a twentieth of a micrometre
+    rays = _rays(grid)
+    if rays is None:
+        return None
+    plane = _plane(z, rays, center, normal, standard, config)
+    if plane is None or plane.rms > _FLAT_M:
+        return None
+    height = thickness(plane)
+    view = _View(z, rays, plane, height)
+    try:
+        fits, pitch = _edges(view, view.onto(center), height, standard)
+    except CircleFitError:
+        return None
+    return judge(_measured(view, fits, pitch, standard), standard, config, Refusal())
+
+
+def _sampled(cloud: Array, across: int) -> tuple[Array, Array] | None:
+    """Of some ``across`` x ``across`` pixels those that were measured: (1, u, v) (n, 3) and points (n, 3)."""
+    H, W = cloud.shape[:2]
+    dv, du = max(1, H // across), max(1, W // across)
+    p = cloud[dv // 2 :: dv, du // 2 :: du]
+    A = np.ones((*p.shape[:2], 3))
+    A[..., 1] = np.arange(du // 2, W, du)
+    A[..., 2] = np.arange(dv // 2, H, dv)[:, None]
+    seen = p[..., 2] == p[..., 2]
+    A, p = A[seen], p[seen]
+    return (A, p) if len(p) >= 12 else None
+
+
+def _pinhole(A: Array, p: Array) -> Array | None:
+    """Coefficients (3, 2) of rays (x/z, y/z) = (1, u, v) @ them, least squares."""
+    try:
+        return np.asarray(np.linalg.solve(A.T @ A, A.T @ (p[:, :2] / p[:, 2:])))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _rectangle(cloud: Array, center: Array, reach: float) -> tuple[slice, slice] | None:
+    """The pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels."""
+    some = _sampled(cloud, 12)
+    if some is None or not float(center[2]) > 2.0 * reach:
+        return None
+    c = _pinhole(*some)
+    if c is None:
+        return None
+    det = c[1, 0] * c[2, 1] - c[2, 0] * c[1, 1]
+    if det == 0.0:
+        return None
+    a, b = center[0] / center[2] - c[0, 0], center[1] / center[2] - c[0, 1]
+    at = ((a * c[2, 1] - b * c[2, 0]) / det, (b * c[1, 0] - a * c[1, 1]) / det)
+    # a ball is seen a little wider than its middle's distance says
+    wide = reach / (float(center[2]) - reach)
+    low = [int(np.floor(x - wide / abs(k))) for x, k in zip(at, (c[1, 0], c[2, 1]), strict=True)]
+    high = [int(np.ceil(x + wide / abs(k))) + 1 for x, k in zip(at, (c[1, 0], c[2, 1]), strict=True)]
+    if min(low) < 0 or high[0] > cloud.shape[1] or high[1] > cloud.shape[0]:
+        return None  # cut by the image's border: partly hidden
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _rays(grid: Array) -> Array | None:
+    """Coefficients (3, 3) of the viewing rays (x/z, y/z, 1) = (1, u, v) @ them; None where they are not a pinhole's."""
+    some = _sampled(grid, 10)
+    c = None if some is None else _pinhole(*some)
+    if some is None or c is None:
+        return None
+    # a lens that bends rays by a twentieth of a pixel is for the careful way, which knows quadratics
+    if not float(np.abs(some[0] @ c - some[1][:, :2] / some[1][:, 2:]).max()) < 0.05 * float(np.abs(c[1:]).max()):
+        return None
+    out = np.zeros((3, 3))
+    out[:, :2], out[0, 2] = c, 1.0
+    return out
+
+
+def _plane(
+    z: Single, rays: Array, center: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig
+) -> PlaneFit | None:
+    """The plane of the pixels that lie on the expected ring, from some thousands of them."""
+    ring = np.pi * (standard.face_outer_radius_m**2 - standard.face_inner_radius_m**2)
+    pitch2 = abs(rays[1, 0] * rays[2, 1] - rays[1, 1] * rays[2, 0]) * float(center[2]) ** 2
+    step = max(1, int(np.sqrt(ring / pitch2 / _PLANE_POINTS) + 0.3))
+    part = z[::step, ::step]
+    h, w = part.shape
+    axes = np.empty((3, 3))
+    axes[:, 0], axes[:, 1] = plane_axes(normal)
+    axes[:, 2] = normal
+    # rays in the axes of the expected plane
+    turned, at = (rays @ axes).astype(np.float32), (center @ axes).astype(np.float32)
+    u, v = (np.arange(0, n * step, step, dtype=np.float32) for n in (w, h))
+    x, y, d = (part * ((turned[0, k] + turned[1, k] * u) + (turned[2, k] * v)[:, None]) - at[k] for k in range(3))
+    rho2 = x * x + y * y
+    inner, outer = standard.face_inner_radius_m + 0.001, standard.face_outer_radius_m - 0.001
+    with np.errstate(invalid="ignore"):
+        on = np.flatnonzero((rho2 > inner**2) & (rho2 < outer**2) & (np.abs(d) < 4.0 * config.hypothesis_tolerance_m))
+    if len(on) < config.min_points:
+        return None
+    A = np.ones((3, len(on)))
+    A[1], A[2] = x.ravel()[on], y.ravel()[on]
+    d = d.ravel()[on].astype(np.float64)
+    few = max(1, len(on) // 600)
+    B, b = A[:, ::few], d[::few]
+    fit = np.array([float(np.partition(b, len(b) // 2)[len(b) // 2]), 0.0, 0.0])
+    scale = 2.0 * config.hypothesis_tolerance_m / _TUKEY
+    for k in range(5):  # a part of the points finds the plane; then all of them
+        if k == 3:
+            B, b = A, d
+        e = b - fit @ B
+        if k:
+            size = np.abs(e[:: max(1, len(e) // 600)])
+            scale = max(_MAD * float(np.partition(size, len(size) // 2)[len(size) // 2]), 2e-5)
+        e *= 1.0 / (_TUKEY * scale)
+        weight = np.maximum(1.0 - e * e, 0.0)
+        weight *= weight
+        weighted = B * weight
+        moments = weighted @ B.T
+        if not moments[0, 0] > 0.3 * len(e):
+            return None
+        fit = np.linalg.solve(moments, weighted @ b)
+    e = d - fit @ A
+    good = np.abs(e) < _TUKEY * scale
+    e *= good
+    count = int(np.count_nonzero(good))
+    rms = float(np.sqrt(e @ e / count))
+    shared = _shared(e, good, on, (h, w))
+    new = axes @ np.array([-fit[1], -fit[2], 1.0])
+    new /= float(np.sqrt(new @ new))
+    middle = moments[0] / moments[0, 0]
+    spread = moments / moments[0, 0] - np.outer(middle, middle)
+    sigma = rms * float(np.sqrt(shared / count * 0.5 * (1.0 / spread[1, 1] + 1.0 / spread[2, 2])))
+    point = center + axes @ np.array([middle[1], middle[2], float(fit @ middle)])
+    return PlaneFit(point, new, rms, int(count / shared), sigma)
+
+
+def _shared(e: Array, good: Mask, on: NDArray[np.intp], shape: tuple[int, int]) -> float:
+    """How many readings (N,) with residuals ``e`` at pixels ``on`` tell only as much as one: neighbours share noise."""
+    image = np.zeros((2, shape[0] * shape[1]), dtype=np.float32)
+    image[0, on], image[1, on] = e, good
+    total, number = (cv2.boxFilter(a.reshape(shape), -1, (6, 6), normalize=False)[3::6, 3::6] for a in image)
+    expected = float(e @ e) * float(number.sum()) / max(int(np.count_nonzero(good)), 1)
+    return max(float((total * total).sum()) / max(expected, 1e-30), 1.0)
+
+
+class _View:
+    """Pixels of a window (h, w) about a plane: which lie on it, which say anything, and where their rays meet it."""
+
+    def __init__(self, z: Single, rays: Array, plane: PlaneFit, height: float) -> None:
+        self.plane = plane
+        axes = np.empty((3, 3))
+        axes[:, 0], axes[:, 1] = plane_axes(plane.normal)
+        axes[:, 2] = plane.normal
+        self.axes, self.turned, self.at = axes, rays @ axes, plane.point @ axes
+        self.shape = h, w = z.shape
+        c = self.turned[:, 2].astype(np.float32)
+        self.above = (c[0] + c[1] * np.arange(w, dtype=np.float32)) + (c[2] * np.arange(h, dtype=np.float32))[:, None]
+        self.above *= z
+        self.above -= np.float32(self.at[2])
+        valid = z == z
+        with np.errstate(invalid="ignore"):
+            self.face = np.abs(self.above) < height
+            before = self.above > max(3.0 * height, _BEFORE_M)
+        gap = cv2.copyMakeBorder((~valid).view(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=1)
+        void = cv2.morphologyEx(gap, cv2.MORPH_OPEN, _THREE)[2:-2, 2:-2].view(bool)
+        self.known = (valid | void) & ~before
+
+    def places(self, u: Array, v: Array) -> Array:
+        """Where the rays through pixels (u, v) meet the plane: (2, ...) m in its axes, to ten nanometres."""
+        u, v = u.astype(np.float32, copy=False), v.astype(np.float32, copy=False)
+        t, at = self.turned.astype(np.float32), self.at.astype(np.float32)
+        along = (t[1, 2] * u + t[2, 2] * v) + t[0, 2]
+        np.divide(at[2], along, out=along)
+        out = np.empty((2, *along.shape), dtype=np.float32)
+        for k in (0, 1):
+            np.multiply(along, (t[1, k] * u + t[2, k] * v) + t[0, k], out=out[k])
+            out[k] -= at[k]
+        return out
+
+    def slide(self, xy: Array) -> Array:
+        """How far (2, ...) a place moves per metre that the plane is raised under its ray."""
+        at = self.at[:2].astype(xy.dtype)
+        return np.asarray((xy + (at[:, None] if xy.ndim == 2 else at)) * (1.0 / float(self.at[2])))
+
+    def onto(self, center: Array) -> Array:
+        """A point's place (2,) m along its ray on the plane."""
+        c = center @ self.axes
+        return np.asarray(c[:2] * (self.at[2] / c[2]) - self.at[:2])
+
+
+def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) -> tuple[list[CircleFit], float]:
+    """Outer edge and bore, and the pitch of the pixels on the plane. Raises CircleFitError where either does not show."""
+    h, w = view.shape
+    corner = view.places(0.5 * w + np.array([0.0, 1.0, 0.0]), 0.5 * h + np.array([0.0, 0.0, 1.0]))
+    along, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    pitch = float(np.sqrt(abs(along[0] * down[1] - along[1] * down[0])))
+    face, known, flat = view.face, view.known, view.face.ravel()
+    one = np.flatnonzero((face[:, 1:] != face[:, :-1]) & known[:, 1:] & known[:, :-1])
+    two = np.flatnonzero((face[1:] != face[:-1]) & known[1:] & known[:-1])
+    v, q = one // (w - 1), two // w
+    first = np.concatenate([one + v, two])
+    second = first + 1
+    second[len(one) :] += w - 1
+    points = view.places(np.concatenate([one - v * (w - 1) + 0.5, two - q * w]), np.concatenate([v, q + 0.5]))
+    on_first = flat[first]
+    step = np.empty_like(points)
+    step[:, : len(one)], step[:, len(one) :] = along[:, None], down[:, None]
+    step *= on_first * 2.0 - 1.0
+    d = points - near.astype(np.float32)[:, None]
+    rho = np.sqrt(d[0] * d[0] + d[1] * d[1])
+    outward = d[0] * step[0] + d[1] * step[1]
+    radii = [standard.face_outer_radius_m, standard.face_inner_radius_m]
+    width = 2.0 * pitch + 0.0012 + 0.5 * _SLACK_M
+    rims = []
+    for r, way in zip(radii, (outward, -outward), strict=True):
+        at = np.flatnonzero((np.abs(rho - r) < width) & (way > 0.0))
+        if len(at) < 48:
+            raise CircleFitError("Too little of an edge was seen.")
+        rims.append(d[:, at[:: -(-len(at) // _EDGE_POINTS)]].T)
+    rough = refine_circles(rims, radii, noise_floor=0.1 * pitch, settled=0.05 * pitch)
+    if (
+        max(abs(f.radius - r) for f, r in zip(rough, radii, strict=True)) > width
+        or float(np.hypot(*(rough[0].center - rough[1].center))) > 3.0 * pitch + 0.001
+    ):
+        raise CircleFitError("The edges do not agree.")
+    starts, lowered, clear = [], [], []
+    for k, (f, way) in enumerate(zip(rough, (outward, -outward), strict=True)):
+        e = d - f.center.astype(np.float32)[:, None]
+        e = np.sqrt(e[0] * e[0] + e[1] * e[1]) - f.radius
+        clear.append(clear_band(standard, pitch, k == 0))
+        at = np.flatnonzero((np.abs(e) < max(clear[k], 1.2 * pitch) + height) & (way > 0.0))
+        beyond = view.above.ravel()[np.where(on_first[at], second[at], first[at])]
+        lowered.append(lowered_by(beyond, height))
+        center = near + f.center
+        if lowered[k]:
+            center = center - lowered[k] * view.slide(center)
+        e = e[at]
+        inliers = np.abs(e) < _TUKEY * max(f.rms, 0.3 * pitch)
+        rms = float(np.sqrt((e * e * inliers).sum() / max(int(np.count_nonzero(inliers)), 1)))
+        starts.append(CircleFit(center, f.radius, f.covariance, rms, inliers))
+    return _labelled(view, starts, pitch, lowered, clear), pitch
+
+
+def _labelled(
+    view: _View, starts: list[CircleFit], pitch: float, lowered: list[float], clear: list[float]
+) -> list[CircleFit]:
+    """Both edges from the pixels on either side of them."""
+    h, w = view.shape
+    bv = np.repeat(np.arange(0, h - _BLOCK + 1, _BLOCK, dtype=np.int32), w // _BLOCK)
+    bu = np.tile(np.arange(0, w - _BLOCK + 1, _BLOCK, dtype=np.int32), h // _BLOCK)
+    half = np.float32(0.5 * (_BLOCK - 1))
+    blocks = view.places(bu + half, bv + half)
+    known, face = view.known.ravel(), view.face.ravel()
+    places, sides = [], []
+    for k, start in enumerate(starts):
+        reach = min(clear[k], _LABELLED * pitch + 3.0 * float(np.sqrt(np.trace(start.covariance[:2, :2]))))
+        middle = start.center.astype(np.float32)[:, None]
+        d = blocks - middle
+        rho = np.sqrt(d[0] * d[0] + d[1] * d[1])
+        # the middle of a block's corner pixel lies 2.1 pixels from its own, and a leaning face stretches them
+        close = np.flatnonzero(np.abs(rho - start.radius) < reach + lowered[k] + 0.6 * _BLOCK * pitch)
+        u = (bu[close][:, None] + _BLOCK_U).ravel()
+        v = (bv[close][:, None] + _BLOCK_V).ravel()
+        at = v * w + u
+        xy = view.places(u, v)
+        if lowered[k]:
+            xy -= lowered[k] * view.slide(xy)
+        xy -= middle
+        good = np.flatnonzero((np.abs(np.sqrt(xy[0] * xy[0] + xy[1] * xy[1]) - start.radius) < reach) & known[at])
+        places.append(xy[:, good])
+        sides.append(face[at[good]])
+    return [replace(f, covariance=_SHARED * f.covariance) for f in refine_pair(places, sides, starts, pitch)]
+
+
+def _measured(view: _View, fits: list[CircleFit], pitch: float, standard: FlangeStandard) -> Measured:
+    """What the tests of a flange need, from every fourth pixel along rows and columns."""
+    h, w = view.shape
+    s = slice(None, None, _BLOCK)
+    face, known, above = view.face[s, s], view.known[s, s], view.above[s, s]
+    d = view.places(np.arange(0.0, w, _BLOCK), np.arange(0.0, h, _BLOCK)[:, None])
+    d -= fits[0].center.astype(np.float32)[:, None, None]
+    rho = np.sqrt(d[0] * d[0] + d[1] * d[1])
+    ring = (rho > standard.face_inner_radius_m + 0.5 * pitch) & (rho < fits[0].radius - 0.5 * pitch)
+    count = int(np.count_nonzero(ring & face))
+    core = rho < 0.7 * standard.bore_radius_m
+    said = core & (known | (above == above))
+    rim = face & (rho > fits[0].radius - (0.5 * _BLOCK + 2.0) * pitch) & (rho < fits[0].radius + 2.0 * pitch)
+    parts = 36
+    sector = ((np.arctan2(d[1][rim], d[0][rim]) + np.pi) * (parts / (2.0 * np.pi))).astype(np.intp) % parts
+    return Measured(
+        plane=view.plane,
+        outer=fits[0],
+        bore=fits[1],
+        pitch=pitch,
+        coverage=float(np.count_nonzero(np.bincount(sector, minlength=parts))) / parts,
+        count=count * _BLOCK**2,
+        core_share=1.0 - float(np.count_nonzero(core & known & ~face)) / max(int(np.count_nonzero(said)), 1),
+        ring_share=count / max(int(np.count_nonzero(ring & known)), int(_RING_SEEN * np.count_nonzero(ring)), 1),
+    )
