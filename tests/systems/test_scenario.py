@@ -161,6 +161,7 @@ robot: !UrRtde
   upper_registers: false
   payload_kg: 2.0
   payload_cog_m: [0.01, 0.02, 0.06]
+  process_output: 3
 """
 
 
