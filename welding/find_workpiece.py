@@ -19,6 +19,8 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
+from weldcal.welding.bent_face import BentFace, find_bent_faces
+from weldcal.welding.bent_registration import RADIUS_SHARE, flattened, into_plate
 from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, turned, upward_planes
 from weldcal.welding.registration import (
     RegistrationConfig,
@@ -191,6 +193,8 @@ def _decided(
 def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
     """Rough poses of the outline on the faces in view, best first."""
     rng = np.random.default_rng(config.seed)
+    if math.isfinite(workpiece.bend_radius_m):
+        return _bent_places(points, workpiece, config, rng)
     sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
     center = np.median(sample, axis=0)
     places: list[tuple[float, RigidTransform]] = []
@@ -202,8 +206,25 @@ def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tu
     return places[: config.candidates]
 
 
-def _correlate(q: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
-    """The few best poses of the outline in one plane: turns by template, places by correlation."""
+def _bent_places(
+    points: Floats, workpiece: Workpiece, config: FindConfig, rng: np.random.Generator
+) -> list[tuple[float, RigidTransform]]:
+    """The same on the bent faces in view: which way round the part lies on its cylinder is all there is of a turn."""
+    radius = workpiece.bend_radius_m
+    places: list[tuple[float, RigidTransform]] = []
+    for seen in find_bent_faces(points, ((1.0 - RADIUS_SHARE) * radius, (1.0 + RADIUS_SHARE) * radius), rng):
+        face = BentFace(seen.X_AQ, radius)
+        for score, X in _correlate(face.unrolled(points), workpiece, config, (0.0, math.pi)):
+            x, y, _ = X.translation()
+            places.append((score, face.at(float(x), float(y), _heading(X))))
+    places.sort(key=lambda place: -place[0])
+    return places[: config.candidates]
+
+
+def _correlate(
+    q: Floats, workpiece: Workpiece, config: FindConfig, only: tuple[float, ...] | None = None
+) -> list[tuple[float, RigidTransform]]:
+    """The few best poses of the outline in one plane: turns by template (`only` these, where given), places by correlation."""
     cell = config.cell_m
     reach = 0.5 * float(np.hypot(*workpiece.size_m[:2]))
     corner = q[:, :2].min(axis=0) - 0.3 * reach
@@ -221,6 +242,8 @@ def _correlate(q: Floats, workpiece: Workpiece, config: FindConfig) -> list[tupl
         return []
     best: list[tuple[float, RigidTransform]] = []
     turns = np.arange(0.0, math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi, config.turn_step_rad)
+    if only is not None:
+        turns = np.array(only[:1] if _half_turn_fits(workpiece) else only)
     for turn in turns:
         template, share = _template(workpiece.outline_P, float(turn), pad, cell)
         score = cv2.matchTemplate(seen, template, cv2.TM_CCORR)
@@ -278,10 +301,11 @@ def _groove_agreement(
 ) -> list[float | None]:
     """For each pose: the drawn seam's share with a groove below it, less the share of what is below it elsewhere."""
     half_width = workpiece.half_width_m
+    drawn_flat = flattened(workpiece)
     inner = 0.5 * np.array(workpiece.size_m[:2]) - 0.008
     out: list[float | None] = []
     for X_BP in poses:
-        p = into(X_BP, points)
+        p = into_plate(X_BP, points, workpiece)
         inside = (np.abs(p[:, :2]) < inner).all(axis=1)
         plane = p[inside & (np.abs(p[:, 2]) < 0.004)]
         if len(plane) < 300:
@@ -290,14 +314,15 @@ def _groove_agreement(
         _, sigma = robust_plane(plane)
         pitch = point_pitch(plane[:, :2])
         low = p[inside & (p[:, 2] < -max(5.0 * sigma, 0.001)) & (p[:, 2] > -workpiece.size_m[2] + 0.004)][:, :2]
-        drawn = workpiece.seam_P[(np.abs(workpiece.seam_P[:, :2]) < inner).all(axis=1)][::4, :2]
+        line = drawn_flat.seam_P
+        drawn = line[(np.abs(line[:, :2]) < inner).all(axis=1)][::4, :2]
         if len(low) < 40 or len(drawn) < 20:
             out.append(None)
             continue
         reach = config.groove_reach_m
         seen = np.asarray(cKDTree(plane[:, :2]).query(drawn)[0]) < 3.0 * half_width
         hit = np.asarray(cKDTree(low).query(drawn)[0]) < max(reach, pitch)
-        miss = np.asarray(cKDTree(workpiece.seam_P[::4, :2]).query(low)[0]) > half_width + reach
+        miss = np.asarray(cKDTree(line[::4, :2]).query(low)[0]) > half_width + reach
         if np.count_nonzero(seen) < 0.3 * len(drawn):
             out.append(None)
             continue

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.welding.groove_corner import Corner, round_corners, split_legs
+from weldcal.welding.groove_corner import WIDE_M, Corner, round_corners, split_legs
 from weldcal.welding.groove_extent import ends_at_edges, refuse_gap, seen_extent
 from weldcal.welding.groove_follow import (
     STATION_M,
@@ -34,8 +34,11 @@ from weldcal.welding.seam import SeamCurve
 
 SIGMA_SCALE = 1.1  # of the slices' own sigmas: what neighbouring slices err together
 SIGMA_FLOOR_PITCHES = 0.04
-SIGMA_FLOOR_NOISE = 0.15
+SIGMA_FLOOR_NOISE = 0.20
+HEIGHT_FLOOR_NOISE = 0.25  # of the root: what flies off the walls near it is the more, the noisier the scanner
 ONE_SIDED_PITCHES = 0.2
+END_PITCHES, END_REACH_M = 0.12, 0.006
+CORNER_REACH_M = 0.004
 LEAST_NOISE_M = 3e-5  # what a smooth profile itself misses
 
 
@@ -114,17 +117,41 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
         trim = min(groove.width_m, 0.25 * line.length)
         inner = (line.s >= trim) & (line.s <= line.length - trim)
         line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
-    profile = measured_profile(f, line, groove, config)
+    first_profile = measured_profile(f, line, groove, config)
+    half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
+    wide: list[Floats] = []
+    for _ in range(3):
+        whole, corners, profile = _traced(f, line, first_profile, groove, half_slice, config, wide)
+        bends = [c.apex for c in corners if c.radius > WIDE_M]
+        if not bends:
+            break
+        # What noise made look like a corner is a bend: the line is followed anew round it.
+        wide += bends
+    corners = [c for c in corners if c.radius <= WIDE_M]
+    slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
+    return _finish(f, around, whole, slices, corners, groove, profile, config, start_A)
+
+
+def _traced(
+    f: Floats,
+    line: Line,
+    profile: Profile,
+    groove: CoarseGroove,
+    half_slice: float,
+    config: GrooveConfig,
+    wide: list[Floats],
+) -> tuple[Line, list[Corner], Profile]:
+    """The coarse line moved to the groove, in legs between its corners; these joined, and the common profile."""
+    pitch, sigma = groove.pitch_m, groove.sigma_m
     lines: list[Line] = [line]
     corners: list[Corner] = []
-    half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
     for step in range(4):
         lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
         if groove.closed:
             # The joint of a ring is measured from one side only: each round it lies elsewhere.
             lines = [lines[0].rolled()]
         elif step == 0:
-            lines, corners = split_legs(lines[0], profile)
+            lines, corners = split_legs(lines[0], profile, wide)
         if step > 0:
             # One cutter made the whole groove: its angle and depth, once known, steady every slice.
             longest = max(lines, key=lambda one: one.length)
@@ -132,9 +159,8 @@ def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A
             profile = common_profile(f, longest, slices, profile, sigma, pitch)
     whole = lines[0]
     if corners:
-        whole, corners = round_corners(f, lines, corners, profile, sigma)
-    slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
-    return _finish(f, around, whole, slices, corners, groove, profile, config, start_A)
+        whole, corners = round_corners(f, lines, corners, profile, sigma, pitch)
+    return whole, corners, profile
 
 
 def _finish(
@@ -204,6 +230,12 @@ def _finish(
     one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
     sigma = np.hypot(errors["centre"], math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
     sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
+    if not groove.closed:
+        # The last sections have neighbours on one side only, and points of the plate's edge among their own.
+        sigma = np.hypot(sigma, END_PITCHES * pitch * np.exp(-np.minimum(at - first, last - at) / END_REACH_M))
+    for corner in corners:
+        reach = max(corner.blind, corner.radius, CORNER_REACH_M)
+        sigma = np.hypot(sigma, corner.sigma * np.exp(-0.5 * np.square((at - corner.s) / reach)))
     seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
         raise GrooveUncertain(
@@ -233,7 +265,12 @@ def _finish(
     target = np.zeros(3) if start_A is None else np.asarray(start_A, dtype=np.float64)
     what = "the robot" if start_A is None else "the point given"
     word = f"starts at the end nearest to {what}"
-    per_station = [sigma, np.hypot(errors["root"], 0.25 * SIGMA_FLOOR_PITCHES * pitch), depth, smooth["angle"]]
+    per_station = [
+        sigma,
+        np.hypot(errors["root"], math.hypot(0.25 * SIGMA_FLOOR_PITCHES * pitch, HEIGHT_FLOOR_NOISE * groove.sigma_m)),
+        depth,
+        smooth["angle"],
+    ]
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lines[0], axis=0), axis=1))])
     if groove.closed:
         k = int(np.argmin(np.linalg.norm(lines[0] - target, axis=1)))

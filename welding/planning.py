@@ -97,7 +97,7 @@ def plan_root(
     X_BP = registration.X_BP
     return RootPlan(
         root=workpiece.seam_P @ X_BP.rotation().matrix().T + X_BP.translation(),
-        up=X_BP.rotation().matrix()[:, 2],
+        up=np.broadcast_to(workpiece.up_P, workpiece.seam_P.shape) @ X_BP.rotation().matrix().T,
         half_angle_rad=workpiece.half_angle_rad,
         X_BP=X_BP,
         sigma_m=registration.seam_sigma_m,
