@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from weldcal.welding.planes import Floats, into
 
 LEAST_RADIUS_M, MOST_RADIUS_M = 0.100, 2.0
-SEEDS, NEIGHBOURS, PAIRS = 2500, 40, 600
+SEEDS, NEIGHBOURS, PAIRS = 2500, 40, 300
+STRIPS, STRIP_AGREES = 8, math.radians(2.5)
 LEAST_TURN = math.sin(math.radians(8.0))  # between two normals that are to span a cylinder
 NORMALS_AGREE = math.cos(math.radians(9.0))
 STEEPEST = math.cos(math.radians(65.0))
@@ -27,11 +28,12 @@ class BentFace:
     """A cylinder: frame Q touches it at its origin, x around it, y along its axis, z out of the face; m.
 
     radius_m is negative where the axis lies above the face (a hollow one). Unrolled, a point has the coordinates
-    (arc length around, along, height over the face).
+    (arc length around, along, height over the face). reach_m: how far from the origin the face was seen, around and along.
     """
 
     X_AQ: RigidTransform
     radius_m: float
+    reach_m: tuple[float, float] = (math.inf, math.inf)
 
     def unrolled(self, p_A: Floats) -> Floats:
         """Points (N,3) of the cloud's frame A, unrolled."""
@@ -90,12 +92,11 @@ def find_bent_faces(
         face = _spanned(at, normal, radii_m, rng, least_seeds, hollow)
         if face is None:
             break
-        face = fit_bent_face(points, face, radii_m)
+        face = fit_bent_face(points, _centred(face, at, normal), radii_m)
         u = face.unrolled(at)
         on = (np.abs(u[:, 2]) < BAND_M) & _agrees(face, u, normal)
         if np.count_nonzero(on) >= least_seeds and radii_m[0] <= abs(face.radius_m) <= radii_m[1]:
-            middle = 0.5 * (u[on, :2].min(axis=0) + u[on, :2].max(axis=0))
-            found.append(BentFace(face.at(float(middle[0]), float(middle[1]), 0.0), face.radius_m))
+            found.append(_centred(face, at, normal))
         rest = ~on & (np.abs(u[:, 2]) > 2.0 * BAND_M)
         at, normal = at[rest], normal[rest]
     return found
@@ -145,10 +146,31 @@ def _spanned(
         y = a if a[1] >= 0.0 else -a
         face = BentFace(RigidTransform(RotationMatrix(np.column_stack([np.cross(y, z), y, z])), at[i]), radius)
         u = face.unrolled(at)
-        count = int(np.count_nonzero((np.abs(u[:, 2]) < BAND_M) & _agrees(face, u, normal)))
-        if best is None or count > best[0]:
+        on = (np.abs(u[:, 2]) < BAND_M) & _agrees(face, u, normal)
+        count = int(np.count_nonzero(on))
+        if (best is None or count > best[0]) and count >= least and _turns(face, u[on, 0], normal[on]):
             best = (count, face)
-    return best[1] if best is not None and best[0] >= least else None
+    return None if best is None else best[1]
+
+
+def _centred(face: BentFace, at: Floats, normal: Floats) -> BentFace:
+    """The same with its origin in the middle of the points (M,3) that lie on it, and how far these reach."""
+    u = face.unrolled(at)
+    on = u[(np.abs(u[:, 2]) < BAND_M) & _agrees(face, u, normal), :2]
+    low, high = np.percentile(on, [1.0, 99.0], axis=0)
+    middle, reach = 0.5 * (low + high), 0.5 * (high - low) + 0.005
+    X = face.at(float(middle[0]), float(middle[1]), 0.0)
+    return BentFace(X, face.radius_m, (float(reach[0]), float(reach[1])))
+
+
+def _turns(face: BentFace, x: Floats, normal: Floats) -> bool:
+    """Whether the normals (M,3) turn with the way x (M,) around as on that cylinder: those of a plane it touches do not."""
+    n = normal @ face.X_AQ.rotation().matrix()
+    off = np.arctan2(n[:, 0], n[:, 2]) - x / face.radius_m
+    # Strip by strip around it: a mixture of planes agrees on the whole, but in no strip.
+    number = np.minimum((STRIPS * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), STRIPS - 1)
+    middle = [abs(float(np.median(off[number == k]))) for k in range(STRIPS) if np.count_nonzero(number == k) >= 4]
+    return len(middle) > STRIPS // 2 and np.count_nonzero(np.array(middle) < STRIP_AGREES) >= 0.8 * len(middle)
 
 
 def _agrees(face: BentFace, u: Floats, normal: Floats) -> npt.NDArray[np.bool_]:
@@ -163,10 +185,11 @@ def fit_bent_face(
     side = math.copysign(1.0, face.radius_m)
     low, high = (side * r for r in radii_m)
     low, high = min(low, high), max(low, high)
+    reach = np.minimum(face.reach_m, 0.3)
     for gate in gates_m:
         p = into(face.X_AQ, points)
         u = unrolled(p, face.radius_m)
-        on = p[(np.abs(u[:, 2]) < gate) & (np.abs(u[:, :2]) < 0.3).all(axis=1)]
+        on = p[(np.abs(u[:, 2]) < gate) & (np.abs(u[:, :2]) < reach).all(axis=1)]
         on = on[:: max(1, len(on) // 4000)]
         if len(on) < 100:
             return face
@@ -184,5 +207,5 @@ def fit_bent_face(
         fit = least_squares(
             heights, start, loss="soft_l1", f_scale=0.25 * gate, bounds=bounds, x_scale=[1e-2, 1e-3, 1e-2, 1e-2, 1e-1]
         )
-        face = BentFace(moved(fit.x), float(fit.x[4]))
+        face = BentFace(moved(fit.x), float(fit.x[4]), face.reach_m)
     return face

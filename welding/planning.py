@@ -79,7 +79,7 @@ def plan_root(
         groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
         return RootPlan(
             root=groove.curve.position(np.linspace(0.0, groove.curve.length, len(groove.curve.knots))),
-            up=groove.X_AF.rotation().matrix()[:, 2],
+            up=groove.curve.ups,
             half_angle_rad=groove.half_angle,
             X_BP=None,
             sigma_m=groove.typical_sigma,
