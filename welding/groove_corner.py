@@ -23,13 +23,15 @@ WIDE_M = 0.010  # a bend of a larger radius is no corner: the cross-sections fol
 @dataclass(frozen=True, eq=False)
 class Corner:
     """A corner at arc length s m of the whole line, its apex (2,) m, its radius m, and how far to each side of s no
-    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known."""
+    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known; wide: it is a
+    bend for sure."""
 
     s: float
     apex: Floats
     radius: float
     blind: float
     sigma: float = 0.0
+    wide: bool = False
 
 
 def split_legs(line: Line, profile: Profile, wide: list[Floats]) -> tuple[list[Line], list[Corner]]:
@@ -62,7 +64,7 @@ def round_corners(
     """The legs joined over their corners, each with the radius that agrees best with the points near it (N,3) m."""
     half_width = profile.depth / min(profile.slopes)
     whole = legs[0].points
-    met: list[tuple[Floats, Floats, float, float]] = []
+    met: list[tuple[Floats, Floats, float, float, bool]] = []
     for leg in legs[1:]:
         apex = meeting_point(*_side(whole[::-1]), *_side(leg.points))
         radius, spread = _radius(f, whole, apex, leg.points, profile, sigma, pitch)
@@ -70,15 +72,17 @@ def round_corners(
         half = 0.5 * np.arccos(np.clip(u @ v / np.linalg.norm(u) / np.linalg.norm(v), -1.0, 1.0))
         bend = filleted(whole[-1], apex, leg.points[0], max(radius, LEAST_RADIUS_M))
         # How far the bend's middle moves with the radius.
-        met.append((apex, bend[len(bend) // 2], radius, spread * (1.0 / np.sin(half) - 1.0)))
+        met.append(
+            (apex, bend[len(bend) // 2], radius, spread * (1.0 / np.sin(half) - 1.0), radius - 2.0 * spread > WIDE_M)
+        )
         whole = np.vstack([whole[:-1], bend, leg.points[1:]])
     line = Line(whole).even(0.00025)
     out = []
-    for (apex, place, radius, aside), corner in zip(met, corners, strict=True):
+    for (apex, place, radius, aside, wide), corner in zip(met, corners, strict=True):
         s = float(line.s[int(np.argmin(np.linalg.norm(line.points - place, axis=1)))])
         # Round a wide enough bend the coordinates along and across the line are sound, and sections may be cut.
         blind = 0.0 if radius > 1.3 * half_width else min(corner.blind, 1.5 * half_width + radius)
-        out.append(Corner(s, apex, radius, blind, float(aside)))
+        out.append(Corner(s, apex, radius, blind, float(aside), bool(wide)))
     return line, out
 
 

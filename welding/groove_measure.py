@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from weldcal.welding.groove_corner import WIDE_M, Corner, round_corners, split_legs
+from weldcal.welding.groove_corner import Corner, round_corners, split_legs
 from weldcal.welding.groove_extent import ends_at_edges, refuse_gap, seen_extent
 from weldcal.welding.groove_follow import (
     STATION_M,
@@ -64,12 +64,12 @@ def measure_groove(
     wide: list[Floats] = []
     for _ in range(3):
         whole, corners, profile = _traced(f, line, first_profile, groove, half_slice, config, wide)
-        bends = [c.apex for c in corners if c.radius > WIDE_M]
+        bends = [c.apex for c in corners if c.wide]
         if not bends:
             break
         # What noise made look like a corner is a bend: the line is followed anew round it.
         wide += bends
-    corners = [c for c in corners if c.radius <= WIDE_M]
+    corners = [c for c in corners if not c.wide]
     slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
     return _finish(f, around, whole, slices, corners, groove, profile, config, start_A)
 
@@ -179,6 +179,13 @@ def _finish(
         reach = max(corner.blind, corner.radius, CORNER_REACH_M)
         sigma = np.hypot(sigma, corner.sigma * np.exp(-0.5 * np.square((at - corner.s) / reach)))
     seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
+    for corner in corners:
+        if first < corner.s < last and corner.sigma > config.most_bridge_sigma_m:
+            raise GrooveUncertain(
+                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f} mm from this "
+                f"scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a finer scanner or move it "
+                "nearer."
+            )
     if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
         raise GrooveUncertain(
             f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan "
