@@ -136,11 +136,13 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None) -> Sea
         InputError: for a root too short for a seam.
     """
     height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m
-    line = plan.root + height * plan.up
+    ups = np.broadcast_to(plan.up, plan.root.shape)
+    line = plan.root + height * ups
     if length_m is not None:
         steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        line = line[np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7]
-    return SeamCurve.from_points(line, up=plan.up)
+        near = np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7
+        line, ups = line[near], ups[near]
+    return SeamCurve.from_points(line, up=ups)
 
 
 def arm_waypoints(

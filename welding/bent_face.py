@@ -170,7 +170,7 @@ def _turns(face: BentFace, x: Floats, normal: Floats) -> bool:
     # Strip by strip around it: a mixture of planes agrees on the whole, but in no strip.
     number = np.minimum((STRIPS * (x - x.min()) / max(float(np.ptp(x)), 1e-9)).astype(int), STRIPS - 1)
     middle = [abs(float(np.median(off[number == k]))) for k in range(STRIPS) if np.count_nonzero(number == k) >= 4]
-    return len(middle) > STRIPS // 2 and np.count_nonzero(np.array(middle) < STRIP_AGREES) >= 0.8 * len(middle)
+    return len(middle) > STRIPS // 2 and sum(m < STRIP_AGREES for m in middle) >= 0.8 * len(middle)
 
 
 def _agrees(face: BentFace, u: Floats, normal: Floats) -> npt.NDArray[np.bool_]:

@@ -18,8 +18,8 @@ from scipy.optimize import least_squares
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces import Workpiece
 from weldcal.welding.bent_face import BentFace, find_bent_faces, unrolled
-from weldcal.welding.outline_fit import inward_normals, outermost, slide
-from weldcal.welding.planes import Floats, into, point_pitch
+from weldcal.welding.outline_fit import by_the_edge, inward_normals, outermost, slide
+from weldcal.welding.planes import Floats, into, point_pitch, thinned
 from weldcal.welding.pose_covariance import (
     EDGE_NOISES,
     EDGE_PITCHES,
@@ -42,6 +42,7 @@ from weldcal.welding.registration_result import (
 RADIUS_SHARE = 0.15  # how far the radius of a face that is looked at may be from the drawn one
 MOST_SAG_M = 0.0006  # by how much the part may sag against its drawing from its middle to its ends
 FACE_POINTS = 4000
+COARSE_POINTS = 60_000
 
 
 def flattened(workpiece: Workpiece) -> Workpiece:
@@ -77,14 +78,15 @@ def register_bent(
     rng = np.random.default_rng(config.seed)
     best: tuple[float, RigidTransform] | None = None
     radii = ((1.0 - RADIUS_SHARE) * radius, (1.0 + RADIUS_SHARE) * radius)
-    for face in find_bent_faces(p, radii, rng):
+    few = thinned(p, COARSE_POINTS)
+    for face in find_bent_faces(few, radii, rng):
         y = face.X_AQ.rotation().matrix()[:, 1]
         if abs(math.atan2(-y[0], y[1])) > config.max_turn_rad + math.radians(3.0):
             continue
         # The unrolled place of the guess is where the search begins.
         x0, y0, _ = face.unrolled(np.zeros((1, 3)))[0]
         face = BentFace(face.at(float(x0), float(y0), 0.0), radius)
-        X_QP, score = slide(face.unrolled(p), workpiece.outline_P, config.max_shift_m, math.radians(5.0))
+        X_QP, score = slide(face.unrolled(few), workpiece.outline_P, config.max_shift_m, math.radians(5.0))
         if best is None or score > best[0]:
             x, y_, _ = X_QP.translation()
             yaw = RollPitchYaw(X_QP.rotation()).yaw_angle()
@@ -119,27 +121,37 @@ def _refine(
     if eye_B is not None:
         sight = eye_B - X_BP.translation()
         slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
-    pitch, inset, fit_rms, noise, band = 0.0, 0.0, math.inf, 0.0, 0.0
+    inset, fit_rms, noise, band = 0.0, math.inf, 0.0, 0.0
     covariance = np.zeros((6, 6))
+    u = unrolled(into(X_BP, points), radius)
+    near_edge, middle = (
+        points[by_the_edge(u, outline)],
+        points[inside_loops(u[:, :2], [core]) & (np.abs(u[:, 2]) < 0.01)],
+    )
+    if len(middle) < config.min_points // 2:
+        raise not_found(workpiece, "check the guess, the workpiece and the calibration.")
+    middle = thinned(middle, 10 * FACE_POINTS)
+    pitch = point_pitch(unrolled(into(X_BP, near_edge), radius)[:, :2])
     for gate in (0.008, 0.004, 0.002, 0.002):
-        p = into(X_BP, points)
+        p = into(X_BP, middle)
         u = unrolled(p, radius)
         above = inside_loops(u[:, :2], [core]) & (np.abs(u[:, 2]) < gate)
-        if np.count_nonzero(above) < config.min_points // 2:
+        if np.count_nonzero(above) < 300:
             raise not_found(workpiece, "check the guess, the workpiece and the calibration.")
         z = u[above, 2]
         noise = 1.4826 * float(np.median(np.abs(z - np.median(z))))
         band = max(4.0 * noise, 0.0003)
-        pitch = point_pitch(u[above][:, :2]) if pitch == 0.0 else pitch
-        on = (u[:, 2] > -0.5 * band) & (u[:, 2] < band)
-        rows = np.column_stack([u[on, :2], np.flatnonzero(on)])
+        edge_p = into(X_BP, near_edge)
+        edge_u = unrolled(edge_p, radius)
+        on = (edge_u[:, 2] > -0.5 * band) & (edge_u[:, 2] < band)
+        rows = np.column_stack([edge_u[on, :2], np.flatnonzero(on)])
         rims, edges = outermost(rows, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise not_found(workpiece, "too little of its outline is in view.")
         flat = np.flatnonzero(above & (np.abs(u[:, 2]) < band))
         step = max(1, len(flat) // FACE_POINTS)
-        crowd = points_per_independent(u[flat], pitch) / step
-        seen = _Seen(p[flat[::step]], p[rims[:, 2].astype(np.int64)], edges, pitch, noise, crowd)
+        crowd = points_per_independent(u[flat], point_pitch(u[flat][:, :2])) / step
+        seen = _Seen(p[flat[::step]], edge_p[rims[:, 2].astype(np.int64)], edges, pitch, noise, crowd)
         X_PP, inset, fit_rms, covariance = _fit(seen, outline, radius, slant)
         X_BP = X_BP @ X_PP
     u = into_plate(X_BP, points, workpiece)

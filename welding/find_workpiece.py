@@ -9,7 +9,7 @@ the outline leaves open the groove decides, where it was drawn unsymmetrically a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -21,13 +21,16 @@ from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
 from weldcal.welding.bent_face import BentFace, find_bent_faces
 from weldcal.welding.bent_registration import RADIUS_SHARE, flattened, into_plate
-from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, turned, upward_planes
+from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, turned, upward_planes
 from weldcal.welding.registration import (
     RegistrationConfig,
     WorkpieceNotFound,
     WorkpieceRegistration,
     register_workpiece,
 )
+
+COARSE_POINTS = 120_000
+CLOSE_M, CLOSE_RAD = 0.004, math.radians(1.5)  # how far the coarse place may be off
 
 
 class AmbiguousWorkpiece(WorkpieceNotFound):
@@ -108,7 +111,10 @@ def find_workpiece(
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < config.fine.min_points:
         raise WorkpieceNotFound(f"The scan has only {len(points)} points: move the workpiece into view.")
-    places = _places(points, workpiece, config)
+    # Which place it is, a thinned scan tells as well; where exactly, all of its points say at the end.
+    few = thinned(points, COARSE_POINTS)
+    coarse = config.fine if few is points else replace(config.fine, max_sigma_m=math.inf)
+    places = _places(few, workpiece, config)
     if not places:
         raise WorkpieceNotFound("The scan shows no flat face that could be the workpiece: move it into view.")
     fits: list[tuple[float, WorkpieceRegistration]] = []
@@ -117,7 +123,7 @@ def find_workpiece(
         if any(_same_place(X_BP, f.X_BP, workpiece) for _, f in fits):
             continue
         try:
-            found = register_workpiece(points, workpiece, X_BP, config.fine, eye_B)
+            found = register_workpiece(few, workpiece, X_BP, coarse, eye_B)
         except WorkpieceNotFound as error:
             refusal = refusal or error
             continue
@@ -129,10 +135,10 @@ def find_workpiece(
     judged = []
     for score, found in fits:
         turns = [found] if not _half_turn_fits(workpiece) else [found, found.turned_round(workpiece)]
-        grooves = _groove_agreement(points, workpiece, [t.X_BP for t in turns], config)
+        grooves = _groove_agreement(few, workpiece, [t.X_BP for t in turns], config)
         judged.append((score, turns, grooves))
     judged.sort(key=lambda j: -(j[0] + max((g for g in j[2] if g is not None), default=0.0)))
-    score, turns, grooves = judged[0]
+    _, turns, grooves = judged[0]
     other = 0.0
     if len(judged) > 1:
         mine, theirs = (s * (1.0 + max((g for g in gs if g is not None), default=0.0)) for s, _, gs in judged[:2])
@@ -143,12 +149,15 @@ def find_workpiece(
             f"Two places in the scan look equally like the {workpiece.name}: near ({a[0]:.0f}, {a[1]:.0f}) and "
             f"({b[0]:.0f}, {b[1]:.0f}) mm; cover or remove one, or give a guess of where the part is."
         )
-    return _decided(workpiece, score, turns, grooves, other, turn_hint_rad, config)
+    if few is not points:
+        close = replace(config.fine, max_shift_m=CLOSE_M, max_turn_rad=CLOSE_RAD)
+        exact = register_workpiece(points, workpiece, turns[0].X_BP, close, eye_B)
+        turns = [exact, exact.turned_round(workpiece)][: len(turns)]
+    return _decided(workpiece, turns, grooves, other, turn_hint_rad, config)
 
 
 def _decided(
     workpiece: Workpiece,
-    score: float,
     turns: list[WorkpieceRegistration],
     grooves: list[float | None],
     other: float,

@@ -12,11 +12,12 @@ from weldcal.welding.bent_face import LEAST_RADIUS_M, BentFace, find_bent_faces
 from weldcal.welding.groove_measure import measure_groove
 from weldcal.welding.groove_seam import GrooveConfig, GrooveSeam
 from weldcal.welding.groove_search import find_grooves
-from weldcal.welding.planes import Floats
+from weldcal.welding.planes import Floats, thinned
 from weldcal.welding.seam import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger one sags by 11 mm or less, and its walls lean by less than 9 deg
 MARGIN_M = 0.020
+COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006
 
 
 def bent_seams(
@@ -35,7 +36,7 @@ def bent_seams(
         flat = u[mine]
         if len(flat) < 1000:
             continue
-        for groove in find_grooves(flat, config.search)[0]:
+        for groove in find_grooves(thinned(flat, COARSE_POINTS, COARSE_CELL_M), config.search)[0]:
             try:
                 seam = measure_groove(flat, groove, config, start)
                 seams.append(_rolled(seam, face, "the robot" if start_A is None else "the point given"))

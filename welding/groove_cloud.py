@@ -16,7 +16,9 @@ from weldcal.welding.groove_bent import bent_seams
 from weldcal.welding.groove_measure import measure_groove
 from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, SeveralGrooves
 from weldcal.welding.groove_search import find_grooves
-from weldcal.welding.planes import Floats
+from weldcal.welding.planes import Floats, thinned
+
+COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # to find openings in: a groove 2 mm wide is still three cells wide
 
 
 def extract_groove(
@@ -45,7 +47,7 @@ def extract_groove(
     bent, points, failures = bent_seams(points, config, start_A)
     seams, noise, pitch = list(bent), 0.0, 0.0
     if len(points) >= 1000:
-        coarse, noise, pitch = find_grooves(points, config.search)
+        coarse, noise, pitch = find_grooves(thinned(points, COARSE_POINTS, COARSE_CELL_M), config.search)
         for groove in coarse:
             try:
                 seams.append(measure_groove(points, groove, config, start_A))

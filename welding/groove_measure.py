@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,11 @@ from weldcal.welding.groove_line import Line, smoothing_weights
 from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain
 from weldcal.welding.groove_search import CoarseGroove
 from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
-from weldcal.welding.planes import Floats, into
+from weldcal.welding.planes import Floats, into, point_pitch, thinned
 from weldcal.welding.seam import SeamCurve
 
+MOST_POINTS = 400_000  # about one groove
+THINNED = 0.9  # a smaller pitch than that of the cloud it was found in is that of a cloud which was thinned for it
 SIGMA_SCALE = 1.1  # of the slices' own sigmas: what neighbouring slices err together
 SIGMA_FLOOR_PITCHES = 0.04
 SIGMA_FLOOR_NOISE = 0.20
@@ -50,6 +53,10 @@ def measure_groove(
     # Later lines stay within a few millimetres of this one: all that lies further off is left here.
     rough = cKDTree(groove.line_Q[::4]).query(f[:, :2], distance_upper_bound=0.5 * groove.width_m + BAND_M + 0.012)[0]
     f = f[np.isfinite(rough)]
+    # The openings were found in a thinned cloud: here all of its points count.
+    f = thinned(f, MOST_POINTS)
+    fine = point_pitch(f[np.abs(f[:, 2]) < 0.003][:, :2])
+    groove = replace(groove, pitch_m=fine) if fine < THINNED * groove.pitch_m else groove
     pitch, sigma = groove.pitch_m, groove.sigma_m
     line = Line(groove.line_Q).even()
     if groove.closed:

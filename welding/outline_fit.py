@@ -67,6 +67,16 @@ def slide(q: Floats, outline: Floats, max_shift_m: float, max_turn_rad: float) -
     return turned(*best), score
 
 
+def by_the_edge(p: Floats, outline: Floats, reach: float = 0.020) -> npt.NDArray[np.bool_]:
+    """Which of points (N,k) lie within a reach of the outline, inside or outside of it."""
+    near = np.zeros(len(p), dtype=bool)
+    for a, b, inward in zip(outline, np.roll(outline, -1, axis=0), inward_normals(outline), strict=True):
+        length = float(np.linalg.norm(b - a))
+        t = (p[:, :2] - a) @ (b - a) / length
+        near |= (np.abs((p[:, :2] - a) @ inward) < reach) & (t > -reach) & (t < length + reach)
+    return near
+
+
 def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple[Floats, npt.NDArray[np.int64]]:
     """The face point nearest the outside in every strip across each edge: its row (M,k) and the edges' numbers (M,).
 

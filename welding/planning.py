@@ -44,7 +44,7 @@ class PlanningMethod:
 class RootPlan:
     """The groove's root in base, in the direction of travel.
 
-    root, up      (N,3) m and unit; half_angle_rad between a wall and the groove's middle plane
+    root, up      (N,3) m and unit normals of the face; half_angle_rad between a wall and the groove's middle plane
     X_BP          where the drawing lies, where one was used
     sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, which the real one may miss
     rms_m         of the face's points about their plane; confidence 0 to 1; words: what was found, in a sentence

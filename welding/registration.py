@@ -23,8 +23,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces import Workpiece
 from weldcal.welding.bent_registration import register_bent
-from weldcal.welding.outline_fit import fit_outline, outermost, slide
-from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, upward_planes
+from weldcal.welding.outline_fit import by_the_edge, fit_outline, outermost, slide
+from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, upward_planes
 from weldcal.welding.pose_covariance import pose_covariance
 from weldcal.welding.registration_result import (
     RegistrationConfig,
@@ -36,6 +36,8 @@ from weldcal.welding.registration_result import (
 )
 
 __all__ = ["RegistrationConfig", "WorkpieceNotFound", "WorkpieceRegistration", "register_workpiece"]
+COARSE_POINTS = 60_000  # to slide the outline over
+PLANE_POINTS = 60_000
 
 
 def register_workpiece(
@@ -73,8 +75,9 @@ def register_workpiece(
     rng = np.random.default_rng(config.seed)
     sample = p[rng.choice(len(p), size=min(len(p), 8000), replace=False)]
     best: tuple[float, RigidTransform] | None = None
+    few = thinned(p, COARSE_POINTS)
     for X_GQ in upward_planes(sample, config.max_turn_rad + math.radians(3.0), config.min_points // 4, rng):
-        X_QP, score = slide(into(X_GQ, p), workpiece.outline_P, config.max_shift_m, config.max_turn_rad)
+        X_QP, score = slide(into(X_GQ, few), workpiece.outline_P, config.max_shift_m, config.max_turn_rad)
         if best is None or score > best[0]:
             best = (score, X_BP_guess @ X_GQ @ X_QP)
     if best is None:
@@ -92,20 +95,21 @@ def _refine(
     above = inside_loops(p[:, :2], [core]) & (np.abs(p[:, 2]) < 4.0 * PLANE_BAND_M)
     if np.count_nonzero(above) < config.min_points // 2:
         raise not_found(workpiece, "check the guess, the workpiece and the calibration.")
-    X_PQ, sigma = robust_plane(p[above])
+    X_PQ, sigma = robust_plane(p[above][:: max(1, np.count_nonzero(above) // PLANE_POINTS)])
     X_BP = X_BP @ X_PQ
+    near_edge = points[by_the_edge(p, outline)]
 
     slant = None
     if eye_B is not None:
         sight = eye_B - X_BP.translation()
         slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
     band = max(4.0 * sigma, 0.0003)
-    pitch, inset, fit_rms = 0.0, 0.0, math.inf
+    pitch = point_pitch(into(X_PQ, p[above])[:, :2])
+    inset, fit_rms = 0.0, math.inf
     for gate in (0.008, 0.004, 0.002):
-        p = into(X_BP, points)
+        p = into(X_BP, near_edge)
         # Points a little below the face are the side of the plate, which would move the edges the scanner looks at.
         face = p[(p[:, 2] > -0.5 * band) & (p[:, 2] < band)][:, :2]
-        pitch = point_pitch(face[inside_loops(face, [core])]) if pitch == 0.0 else pitch
         rims, edges = outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:
             raise not_found(workpiece, "too little of its outline is in view.")
