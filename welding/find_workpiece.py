@@ -115,8 +115,10 @@ def find_workpiece(
     few = thinned(points, COARSE_POINTS)
     coarse = config.fine if few is points else replace(config.fine, max_sigma_m=math.inf)
     places = _places(few, workpiece, config)
+    bent = math.isfinite(workpiece.bend_radius_m)
     if not places:
-        raise WorkpieceNotFound("The scan shows no flat face that could be the workpiece: move it into view.")
+        what = f"face bent over {1e3 * workpiece.bend_radius_m:.0f} mm" if bent else "flat face"
+        raise WorkpieceNotFound(f"The scan shows no {what} that could be the workpiece: move it into view.")
     fits: list[tuple[float, WorkpieceRegistration]] = []
     refusal: WorkpieceNotFound | None = None
     for _, X_BP in places:

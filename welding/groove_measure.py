@@ -36,6 +36,7 @@ HEIGHT_FLOOR_NOISE = 0.25  # of the root: what flies off the walls near it is th
 ONE_SIDED_PITCHES = 0.2
 END_PITCHES, END_REACH_M = 0.12, 0.006
 CORNER_REACH_M = 0.004
+GAP_ENDS = 0.6
 LEAST_NOISE_M = 3e-5  # what a smooth profile itself misses
 
 
@@ -129,6 +130,7 @@ def _finish(
     pitch = groove.pitch_m
     refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
     first, last, gaps = seen_extent(f, line, profile, slices, groove)
+    gaps = [_unmeasured(gap, slices) for gap in gaps]
     if groove.closed:
         first, last = 0.0, line.length
     ends_seen = (True, True)
@@ -173,7 +175,9 @@ def _finish(
     for a, b in gaps:
         hidden = (at > a) & (at < b)
         bend = max(line.tightest_bend((a, b)), 2.0)
-        errors["centre"][hidden] += 0.25 * bend * (at[hidden] - a) * (b - at[hidden])
+        # Sections beside a shadow are few: towards its ends a bridge is not much better known than in its middle.
+        reach = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
+        errors["centre"][hidden] += 0.25 * bend * reach
     # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
     lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
     one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
@@ -262,6 +266,14 @@ def _finish(
         face_sigma=groove.sigma_m,
         n_sections=len(slices.s),
     )
+
+
+def _unmeasured(gap: tuple[float, float], slices: Slices) -> tuple[float, float]:
+    """A gap, as wide as there are no sections to both sides of it."""
+    before, after = slices.s[slices.s <= gap[0]], slices.s[slices.s >= gap[1]]
+    low = min(gap[0], float(before[-1]) + slices.half_slice) if len(before) else gap[0]
+    high = max(gap[1], float(after[0]) - slices.half_slice) if len(after) else gap[1]
+    return low, high
 
 
 def _close(line: Floats, over: int = 8) -> None:
