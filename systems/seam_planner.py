@@ -200,4 +200,15 @@ class DrawnSeamPlanner(SeamPlanner):
         except WeldcalError as error:
             return PlannedSeam(sequence=scan.sequence, reason=str(error))
         points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
-        return PlannedSeam(scan.sequence, seam, self._X_BP_guess, 0.0, 1.0, q_start, q_above, q_retract, points_B)
+        return PlannedSeam(
+            scan.sequence,
+            seam,
+            self._X_BP_guess,
+            0.0,
+            1.0,
+            q_start,
+            q_above,
+            q_retract,
+            points_B,
+            words="the fixture's drawing is believed: nothing in the scan was asked where the part lies",
+        )

@@ -176,8 +176,8 @@ def _finish(
         hidden = (at > a) & (at < b)
         bend = max(line.tightest_bend((a, b)), 2.0)
         # Sections beside a shadow are few: towards its ends a bridge is not much better known than in its middle.
-        reach = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
-        errors["centre"][hidden] += 0.25 * bend * reach
+        lever = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
+        errors["centre"][hidden] += 0.25 * bend * lever
     # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
     lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
     one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
