@@ -374,6 +374,8 @@ def _add_welding(
         hold=hold,
     )
     wiring.builder.ExportOutput(switch.GetOutputPort("process_on"), "process_on")
+    if station.diagram.HasInputPort("ur10e.process_on"):
+        wiring.builder.Connect(switch.GetOutputPort("process_on"), station.diagram.GetInputPort("ur10e.process_on"))
     return WeldingPorts(
         seam=planner.GetOutputPort("planned_seam"),
         report=servo.GetOutputPort("servo_report"),

@@ -251,7 +251,5 @@ def check_scenario(scenario: Scenario) -> None:
     get_law(scenario.welding.law)
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
-    if scenario.workpiece is not None and scenario.workpiece.bend_radius_mm and scenario.workpiece.located_by == "scan":
-        raise InputError("A bent workpiece cannot be registered to its scan yet: write workpiece.located_by: drawing.")
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
         raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")

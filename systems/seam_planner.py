@@ -136,11 +136,13 @@ def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None) -> Sea
         InputError: for a root too short for a seam.
     """
     height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m
-    line = plan.root + height * plan.up
+    ups = np.broadcast_to(plan.up, plan.root.shape)
+    line = plan.root + height * ups
     if length_m is not None:
         steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
-        line = line[np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7]
-    return SeamCurve.from_points(line, up=plan.up)
+        near = np.concatenate([[0.0], np.cumsum(steps)]) <= length_m + 1e-7
+        line, ups = line[near], ups[near]
+    return SeamCurve.from_points(line, up=ups)
 
 
 def arm_waypoints(
@@ -198,4 +200,15 @@ class DrawnSeamPlanner(SeamPlanner):
         except WeldcalError as error:
             return PlannedSeam(sequence=scan.sequence, reason=str(error))
         points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
-        return PlannedSeam(scan.sequence, seam, self._X_BP_guess, 0.0, 1.0, q_start, q_above, q_retract, points_B)
+        return PlannedSeam(
+            scan.sequence,
+            seam,
+            self._X_BP_guess,
+            0.0,
+            1.0,
+            q_start,
+            q_above,
+            q_retract,
+            points_B,
+            words="the fixture's drawing is believed: nothing in the scan was asked where the part lies",
+        )

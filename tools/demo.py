@@ -21,6 +21,7 @@ from weldcal.tools.outcome import (
     calibration_error,
     calibration_status,
     heat_input_kJ_mm,
+    planned_seam,
     weld_outcome,
 )
 from weldcal.tools.report.demo_report import demo_pictures, demo_report
@@ -103,6 +104,10 @@ class DemoResult:
             if self.weld.plan_error is not None:
                 found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
                 found["plan_max_mm"] = 1e3 * self.weld.plan_error.max_m
+            plan = planned_seam(self.run.cell, self.run.root)
+            if np.isfinite(plan.sigma_m):
+                found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
+            found["plan_words"] = plan.words
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
         found["simulated_seconds"] = float(self.run.root.get_time())
         found["wall_seconds"] = self.run.wall_seconds

@@ -9,7 +9,7 @@ the outline leaves open the groove decides, where it was drawn unsymmetrically a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -19,13 +19,18 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
-from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, turned, upward_planes
+from weldcal.welding.bent_face import BentFace, find_bent_faces
+from weldcal.welding.bent_registration import RADIUS_SHARE, flattened, into_plate
+from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, turned, upward_planes
 from weldcal.welding.registration import (
     RegistrationConfig,
     WorkpieceNotFound,
     WorkpieceRegistration,
     register_workpiece,
 )
+
+COARSE_POINTS = 120_000
+CLOSE_M, CLOSE_RAD = 0.004, math.radians(1.5)  # how far the coarse place may be off
 
 
 class AmbiguousWorkpiece(WorkpieceNotFound):
@@ -106,16 +111,21 @@ def find_workpiece(
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < config.fine.min_points:
         raise WorkpieceNotFound(f"The scan has only {len(points)} points: move the workpiece into view.")
-    places = _places(points, workpiece, config)
+    # Which place it is, a thinned scan tells as well; where exactly, all of its points say at the end.
+    few = thinned(points, COARSE_POINTS)
+    coarse = config.fine if few is points else replace(config.fine, max_sigma_m=math.inf)
+    places = _places(few, workpiece, config)
+    bent = math.isfinite(workpiece.bend_radius_m)
     if not places:
-        raise WorkpieceNotFound("The scan shows no flat face that could be the workpiece: move it into view.")
+        what = f"face bent over {1e3 * workpiece.bend_radius_m:.0f} mm" if bent else "flat face"
+        raise WorkpieceNotFound(f"The scan shows no {what} that could be the workpiece: move it into view.")
     fits: list[tuple[float, WorkpieceRegistration]] = []
     refusal: WorkpieceNotFound | None = None
     for _, X_BP in places:
         if any(_same_place(X_BP, f.X_BP, workpiece) for _, f in fits):
             continue
         try:
-            found = register_workpiece(points, workpiece, X_BP, config.fine, eye_B)
+            found = register_workpiece(few, workpiece, X_BP, coarse, eye_B)
         except WorkpieceNotFound as error:
             refusal = refusal or error
             continue
@@ -127,10 +137,10 @@ def find_workpiece(
     judged = []
     for score, found in fits:
         turns = [found] if not _half_turn_fits(workpiece) else [found, found.turned_round(workpiece)]
-        grooves = _groove_agreement(points, workpiece, [t.X_BP for t in turns], config)
+        grooves = _groove_agreement(few, workpiece, [t.X_BP for t in turns], config)
         judged.append((score, turns, grooves))
     judged.sort(key=lambda j: -(j[0] + max((g for g in j[2] if g is not None), default=0.0)))
-    score, turns, grooves = judged[0]
+    _, turns, grooves = judged[0]
     other = 0.0
     if len(judged) > 1:
         mine, theirs = (s * (1.0 + max((g for g in gs if g is not None), default=0.0)) for s, _, gs in judged[:2])
@@ -141,12 +151,15 @@ def find_workpiece(
             f"Two places in the scan look equally like the {workpiece.name}: near ({a[0]:.0f}, {a[1]:.0f}) and "
             f"({b[0]:.0f}, {b[1]:.0f}) mm; cover or remove one, or give a guess of where the part is."
         )
-    return _decided(workpiece, score, turns, grooves, other, turn_hint_rad, config)
+    if few is not points:
+        close = replace(config.fine, max_shift_m=CLOSE_M, max_turn_rad=CLOSE_RAD)
+        exact = register_workpiece(points, workpiece, turns[0].X_BP, close, eye_B)
+        turns = [exact, exact.turned_round(workpiece)][: len(turns)]
+    return _decided(workpiece, turns, grooves, other, turn_hint_rad, config)
 
 
 def _decided(
     workpiece: Workpiece,
-    score: float,
     turns: list[WorkpieceRegistration],
     grooves: list[float | None],
     other: float,
@@ -191,6 +204,8 @@ def _decided(
 def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
     """Rough poses of the outline on the faces in view, best first."""
     rng = np.random.default_rng(config.seed)
+    if math.isfinite(workpiece.bend_radius_m):
+        return _bent_places(points, workpiece, config, rng)
     sample = points[rng.choice(len(points), size=min(len(points), 12000), replace=False)]
     center = np.median(sample, axis=0)
     places: list[tuple[float, RigidTransform]] = []
@@ -202,8 +217,25 @@ def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tu
     return places[: config.candidates]
 
 
-def _correlate(q: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
-    """The few best poses of the outline in one plane: turns by template, places by correlation."""
+def _bent_places(
+    points: Floats, workpiece: Workpiece, config: FindConfig, rng: np.random.Generator
+) -> list[tuple[float, RigidTransform]]:
+    """The same on the bent faces in view: which way round the part lies on its cylinder is all there is of a turn."""
+    radius = workpiece.bend_radius_m
+    places: list[tuple[float, RigidTransform]] = []
+    for seen in find_bent_faces(points, ((1.0 - RADIUS_SHARE) * radius, (1.0 + RADIUS_SHARE) * radius), rng):
+        face = BentFace(seen.X_AQ, radius)
+        for score, X in _correlate(face.unrolled(points), workpiece, config, (0.0, math.pi)):
+            x, y, _ = X.translation()
+            places.append((score, face.at(float(x), float(y), _heading(X))))
+    places.sort(key=lambda place: -place[0])
+    return places[: config.candidates]
+
+
+def _correlate(
+    q: Floats, workpiece: Workpiece, config: FindConfig, only: tuple[float, ...] | None = None
+) -> list[tuple[float, RigidTransform]]:
+    """The few best poses of the outline in one plane: turns by template (`only` these, where given), places by correlation."""
     cell = config.cell_m
     reach = 0.5 * float(np.hypot(*workpiece.size_m[:2]))
     corner = q[:, :2].min(axis=0) - 0.3 * reach
@@ -221,6 +253,8 @@ def _correlate(q: Floats, workpiece: Workpiece, config: FindConfig) -> list[tupl
         return []
     best: list[tuple[float, RigidTransform]] = []
     turns = np.arange(0.0, math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi, config.turn_step_rad)
+    if only is not None:
+        turns = np.array(only[:1] if _half_turn_fits(workpiece) else only)
     for turn in turns:
         template, share = _template(workpiece.outline_P, float(turn), pad, cell)
         score = cv2.matchTemplate(seen, template, cv2.TM_CCORR)
@@ -278,10 +312,11 @@ def _groove_agreement(
 ) -> list[float | None]:
     """For each pose: the drawn seam's share with a groove below it, less the share of what is below it elsewhere."""
     half_width = workpiece.half_width_m
+    drawn_flat = flattened(workpiece)
     inner = 0.5 * np.array(workpiece.size_m[:2]) - 0.008
     out: list[float | None] = []
     for X_BP in poses:
-        p = into(X_BP, points)
+        p = into_plate(X_BP, points, workpiece)
         inside = (np.abs(p[:, :2]) < inner).all(axis=1)
         plane = p[inside & (np.abs(p[:, 2]) < 0.004)]
         if len(plane) < 300:
@@ -290,14 +325,15 @@ def _groove_agreement(
         _, sigma = robust_plane(plane)
         pitch = point_pitch(plane[:, :2])
         low = p[inside & (p[:, 2] < -max(5.0 * sigma, 0.001)) & (p[:, 2] > -workpiece.size_m[2] + 0.004)][:, :2]
-        drawn = workpiece.seam_P[(np.abs(workpiece.seam_P[:, :2]) < inner).all(axis=1)][::4, :2]
+        line = drawn_flat.seam_P
+        drawn = line[(np.abs(line[:, :2]) < inner).all(axis=1)][::4, :2]
         if len(low) < 40 or len(drawn) < 20:
             out.append(None)
             continue
         reach = config.groove_reach_m
         seen = np.asarray(cKDTree(plane[:, :2]).query(drawn)[0]) < 3.0 * half_width
         hit = np.asarray(cKDTree(low).query(drawn)[0]) < max(reach, pitch)
-        miss = np.asarray(cKDTree(workpiece.seam_P[::4, :2]).query(low)[0]) > half_width + reach
+        miss = np.asarray(cKDTree(line[::4, :2]).query(low)[0]) > half_width + reach
         if np.count_nonzero(seen) < 0.3 * len(drawn):
             out.append(None)
             continue

@@ -1,42 +1,24 @@
 """A weld seam from a cloud alone: the V-groove in a plate's face becomes its root and both shoulders, with their sigma.
 
-No drawing takes part. Openings in flat faces are found coarsely (groove_search); slices across them are fitted with a V
+No drawing takes part. Openings in faces are found coarsely (groove_search); slices across them are fitted with a V
 (groove_section), each slice with points of its own; the centres' offsets are smoothed along the line, the line is moved
-by them, and so again until it stays. Every figure carries a sigma, scaled by how much neighbouring slices really differ.
+by them, and so again until it stays (groove_measure). A face bent over a cylinder is unrolled first (groove_bent). Every figure
+carries a sigma, scaled by how much neighbouring slices really differ.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.welding.groove_corner import Corner, round_corners, split_legs
-from weldcal.welding.groove_extent import ends_at_edges, refuse_gap, seen_extent
-from weldcal.welding.groove_follow import (
-    STATION_M,
-    Slices,
-    agreed,
-    common_profile,
-    cut_slices,
-    followed,
-    measured_profile,
-)
-from weldcal.welding.groove_line import Line, smoothing_weights
-from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain, SeveralGrooves
-from weldcal.welding.groove_search import CoarseGroove, find_grooves
-from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
-from weldcal.welding.planes import Floats, into
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.groove_bent import bent_seams
+from weldcal.welding.groove_measure import measure_groove
+from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, SeveralGrooves
+from weldcal.welding.groove_search import find_grooves
+from weldcal.welding.planes import Floats, thinned
 
-SIGMA_SCALE = 1.1  # of the slices' own sigmas: what neighbouring slices err together
-SIGMA_FLOOR_PITCHES = 0.04
-SIGMA_FLOOR_NOISE = 0.15
-ONE_SIDED_PITCHES = 0.2
-LEAST_NOISE_M = 3e-5  # what a smooth profile itself misses
+COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # to find openings in: a groove 2 mm wide is still three cells wide
 
 
 def extract_groove(
@@ -62,21 +44,22 @@ def extract_groove(
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 1000:
         raise GrooveNotFound(f"The cloud has only {len(points)} points: move the workpiece into view.")
-    coarse, noise, pitch = find_grooves(points, config.search)
-    seams: list[GrooveSeam] = []
-    failures: list[WeldcalError] = []
-    for groove in coarse:
-        try:
-            seams.append(_measure(points, groove, config, start_A))
-        except WeldcalError as error:
-            failures.append(error)
+    bent, points, failures = bent_seams(points, config, start_A)
+    seams, noise, pitch = list(bent), 0.0, 0.0
+    if len(points) >= 1000:
+        coarse, noise, pitch = find_grooves(thinned(points, COARSE_POINTS, COARSE_CELL_M), config.search)
+        for groove in coarse:
+            try:
+                seams.append(measure_groove(points, groove, config, start_A))
+            except WeldcalError as error:
+                failures.append(error)
     if not seams and failures:
         # A groove that was seen but cannot be used says more than an opening that is none.
         raise next((e for e in failures if not isinstance(e, GrooveNotFound)), failures[0])
     if not seams:
         depth = 2.0 * max(4.0 * noise, 0.0008)
         raise GrooveNotFound(
-            f"No groove in any flat face: one longer than {1e3 * config.search.shortest_m:.0f} mm, deeper than "
+            f"No groove in any face: one longer than {1e3 * config.search.shortest_m:.0f} mm, deeper than "
             f"{1e3 * depth:.1f} mm and from {1e3 * config.least_pitches * pitch:.1f} to "
             f"{1e3 * config.search.max_width_m:.0f} mm wide would be seen with points {1e3 * pitch:.1f} mm apart."
         )
@@ -91,189 +74,3 @@ def extract_groove(
 
 def _mm(p: Floats) -> str:
     return "({:.0f}, {:.0f}, {:.0f}) mm".format(*(1e3 * p))
-
-
-def _measure(points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A: npt.ArrayLike | None) -> GrooveSeam:
-    """The groove's lines, refined from its coarse centre line."""
-    f = into(groove.X_AQ, points)
-    low = groove.line_Q.min(axis=0) - 0.03
-    high = groove.line_Q.max(axis=0) + 0.03
-    near = np.all((f[:, :2] > low) & (f[:, :2] < high), axis=1)
-    around = f[near & (f[:, 2] < 0.003)]
-    near &= (f[:, 2] > -config.search.max_depth_m) & (f[:, 2] < max(5.0 * groove.sigma_m, 0.003))
-    f = f[near]
-    # Later lines stay within a few millimetres of this one: all that lies further off is left here.
-    rough = cKDTree(groove.line_Q[::4]).query(f[:, :2], distance_upper_bound=0.5 * groove.width_m + BAND_M + 0.012)[0]
-    f = f[np.isfinite(rough)]
-    pitch, sigma = groove.pitch_m, groove.sigma_m
-    line = Line(groove.line_Q).even()
-    if groove.closed:
-        line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
-    else:
-        # The farthest cells of an opening are its corners: the coarse line's ends lead there and not along it.
-        trim = min(groove.width_m, 0.25 * line.length)
-        inner = (line.s >= trim) & (line.s <= line.length - trim)
-        line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
-    profile = measured_profile(f, line, groove, config)
-    lines: list[Line] = [line]
-    corners: list[Corner] = []
-    half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
-    for step in range(4):
-        lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
-        if groove.closed:
-            # The joint of a ring is measured from one side only: each round it lies elsewhere.
-            lines = [lines[0].rolled()]
-        elif step == 0:
-            lines, corners = split_legs(lines[0], profile)
-        if step > 0:
-            # One cutter made the whole groove: its angle and depth, once known, steady every slice.
-            longest = max(lines, key=lambda one: one.length)
-            slices = cut_slices(f, longest, profile, sigma, pitch, half_slice, [])
-            profile = common_profile(f, longest, slices, profile, sigma, pitch)
-    whole = lines[0]
-    if corners:
-        whole, corners = round_corners(f, lines, corners, profile, sigma)
-    slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
-    return _finish(f, around, whole, slices, corners, groove, profile, config, start_A)
-
-
-def _finish(
-    f: Floats,
-    around: Floats,
-    line: Line,
-    slices: Slices,
-    corners: list[Corner],
-    groove: CoarseGroove,
-    profile: Profile,
-    config: GrooveConfig,
-    start_A: npt.ArrayLike | None,
-) -> GrooveSeam:
-    """Ends, gaps, smoothed lines and their sigmas, in the cloud's frame and in the direction of travel."""
-    if len(slices.s) < 5:
-        raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
-    pitch = groove.pitch_m
-    refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
-    first, last, gaps = seen_extent(f, line, profile, slices, groove)
-    if groove.closed:
-        first, last = 0.0, line.length
-    ends_seen = (True, True)
-    if not groove.closed:
-        ends_seen = ends_at_edges(around, (first, last), line, profile)
-        # At the edge of a shadow the last section is not to be trusted.
-        first = first if ends_seen[0] else max(first, float(slices.s[1]))
-        last = last if ends_seen[1] else min(last, float(slices.s[-2]))
-    missing = sum(b - a for a, b in gaps)
-    longest = max((b - a for a, b in gaps), default=0.0)
-    gaps = [(a, b) for a, b in gaps if a >= first and b <= last]
-    if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
-        raise GrooveUncertain(
-            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan again "
-            "from elsewhere."
-        )
-    at = np.linspace(first, last, max(8, round((last - first) / STATION_M) + 1))
-    for corner in corners:
-        at = np.unique(np.append(at[np.abs(at - corner.s) > 0.0022], corner.s + np.arange(-0.002, 0.0021, 0.00025)))
-    at = at[(at >= first) & (at <= last)]
-    sigma, sigma_z = slices.sigma, slices.sigma_height
-    width = max(config.smoothing_m, 2.0 * slices.half_slice)
-    values = {
-        "centre": (slices.column("centre"), sigma),
-        "root": (slices.column("root"), sigma_z),
-        "angle": (slices.column("angle"), sigma_z),
-        "left": (np.array([x.shoulders[0] - x.centre for x in slices.sections]), sigma),
-        "right": (np.array([x.shoulders[1] - x.centre for x in slices.sections]), sigma),
-        "face_left": (np.array([x.faces[0] for x in slices.sections]), np.ones(len(sigma))),
-        "face_right": (np.array([x.faces[1] for x in slices.sections]), np.ones(len(sigma))),
-    }
-    smooth: dict[str, Floats] = {}
-    errors: dict[str, Floats] = {}
-    for name, (value, spread) in values.items():
-        own = smoothing_weights(slices.s, slices.s, spread, 2.0 * width)
-        off = (value - own @ value) / (spread * np.sqrt(np.maximum(1.0 - np.diag(own), 0.1)))
-        scale = 1.4826 * float(np.median(np.abs(off)))
-        spread = spread * np.maximum(1.0, np.abs(off) / max(4.0 * scale, 1e-12))
-        W = smoothing_weights(at, slices.s, spread, width)
-        smooth[name] = W @ value
-        errors[name] = SIGMA_SCALE * max(1.0, scale) * np.sqrt(np.square(W) @ np.square(spread))
-    for a, b in gaps:
-        hidden = (at > a) & (at < b)
-        bend = max(line.tightest_bend((a, b)), 2.0)
-        errors["centre"][hidden] += 0.25 * bend * (at[hidden] - a) * (b - at[hidden])
-    # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
-    lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
-    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
-    sigma = np.hypot(errors["centre"], math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
-    sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
-    seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
-    if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
-        raise GrooveUncertain(
-            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan "
-            f"(noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and "
-            f"{1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
-        )
-    if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
-        raise GrooveUncertain(
-            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its way there is only known to "
-            f"{1e3 * np.max(sigma[~seen]):.1f} mm: clear the view or scan again from elsewhere."
-        )
-    base, normal = line.at(at)
-    moved = base + smooth["centre"][:, None] * normal
-    root = np.column_stack([moved, smooth["root"]])
-    left = np.column_stack([moved + smooth["left"][:, None] * normal, smooth["face_left"]])
-    right = np.column_stack([moved + smooth["right"][:, None] * normal, smooth["face_right"]])
-    depth = 0.5 * (smooth["face_left"] + smooth["face_right"]) - smooth["root"]
-    if groove.closed:
-        for one in (root, left, right):
-            _close(one)
-    R, p = groove.X_AQ.rotation().matrix(), groove.X_AQ.translation()
-    lines = [v @ R.T + p for v in (root, left, right)]
-    corners = [c for c in corners if first < c.s < last]
-    corner_s = [c.s - first for c in corners]
-    apexes = np.array([[*c.apex, np.interp(c.s, at, smooth["root"])] for c in corners]).reshape(-1, 3) @ R.T + p
-    target = np.zeros(3) if start_A is None else np.asarray(start_A, dtype=np.float64)
-    what = "the robot" if start_A is None else "the point given"
-    word = f"starts at the end nearest to {what}"
-    per_station = [sigma, np.hypot(errors["root"], 0.25 * SIGMA_FLOOR_PITCHES * pitch), depth, smooth["angle"]]
-    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lines[0], axis=0), axis=1))])
-    if groove.closed:
-        k = int(np.argmin(np.linalg.norm(lines[0] - target, axis=1)))
-        order = np.concatenate([np.arange(k, len(at) - 1), np.arange(0, k + 1)])
-        lines = [v[order] for v in lines]
-        per_station = [v[order] for v in per_station]
-        word = f"a closed seam, starts where it is nearest to {what}"
-    elif np.linalg.norm(lines[0][-1] - target) < np.linalg.norm(lines[0][0] - target):
-        lines = [lines[0][::-1], lines[2][::-1], lines[1][::-1]]
-        per_station = [v[::-1] for v in per_station]
-        gaps = [(last - b + first, last - a + first) for a, b in gaps][::-1]
-        corner_s = [float(s[-1]) - c for c in corner_s][::-1]
-        apexes, ends_seen = apexes[::-1], ends_seen[::-1]
-    curve = SeamCurve.from_points(lines[0], up=R[:, 2])
-    return GrooveSeam(
-        curve=curve,
-        root=lines[0],
-        left=lines[1],
-        right=lines[2],
-        s=s,
-        depth=per_station[2],
-        angle=per_station[3],
-        sigma=per_station[0],
-        sigma_height=per_station[1],
-        gaps=tuple((a - first, b - first) for a, b in gaps),
-        corners=tuple(corner_s),
-        apexes=apexes,
-        closed=groove.closed,
-        ends_seen=ends_seen,
-        start=word,
-        X_AF=groove.X_AQ,
-        pitch=pitch,
-        face_sigma=groove.sigma_m,
-        n_sections=len(slices.s),
-    )
-
-
-def _close(line: Floats, over: int = 8) -> None:
-    """Makes the ends of a ring (N,3) meet, in place, the difference spread over the stations beside them."""
-    gap = line[0] - line[-1]
-    share = np.linspace(0.5, 0.0, over)[:, None]
-    line[:over] -= share * gap
-    line[-over:] += share[::-1] * gap

@@ -64,7 +64,7 @@ class GrooveSeam:
     corners, apexes      arc lengths of tight corners, and (K,3) where the two sides meet there
     ends_seen            whether first and last end lie at the edge of the face, not at the edge of what was seen
     start                in words, which end is the start
-    X_AF                 the face: origin on it, z up out of it
+    X_AF                 the face: origin on it, z up out of it; bend_radius of a face bent over a cylinder, negative for a hollow one
     """
 
     curve: SeamCurve
@@ -86,6 +86,7 @@ class GrooveSeam:
     pitch: float
     face_sigma: float
     n_sections: int
+    bend_radius: float = math.inf
 
     @property
     def width(self) -> float:
@@ -117,6 +118,9 @@ class GrooveSeam:
             f"{1e3 * float(np.median(self.depth)):.1f} mm deep, {math.degrees(2.0 * self.half_angle):.0f} deg; its root is "
             f"known to {1e3 * self.typical_sigma:.2f} mm; {self.start}"
         )
+        if math.isfinite(self.bend_radius):
+            bent = "bent over" if self.bend_radius > 0.0 else "hollow with"
+            text += f"; in a face {bent} a radius of {1e3 * abs(self.bend_radius):.0f} mm"
         for a, b in self.gaps:
             text += f"; not seen from {1e3 * a:.0f} to {1e3 * b:.0f} mm"
         for seen, end in zip(self.ends_seen, ("beginning", "end"), strict=True):

@@ -107,10 +107,34 @@ def robust_plane(p: Floats) -> tuple[RigidTransform, float]:
 
 
 def point_pitch(xy: Floats) -> float:
-    """Typical distance between neighbouring scan points on the face, m."""
+    """Typical distance between neighbouring scan points on the face, m; of a large cloud from a few windows of it."""
+    if len(xy) > 40_000:
+        size = np.ptp(xy, axis=0)
+        half = 0.5 * math.sqrt(3000.0 * float(np.prod(size)) / len(xy))
+        middles = xy[(np.linspace(0.15, 0.85, 6) * len(xy)).astype(int)]
+        windows = [xy[(np.abs(xy - m) < half).all(axis=1)] for m in middles]
+        return float(np.median([point_pitch(w) for w in windows if len(w) > 100]))
     some = xy[:: max(1, len(xy) // 1000)]
     distance = np.asarray(cKDTree(xy, balanced_tree=False, compact_nodes=False).query(some, k=2)[0])
     return max(float(np.median(distance[:, 1])), 1e-4)
+
+
+def thinned(points: Floats, most: int, least_cell_m: float = 0.0) -> Floats:
+    """About `most` of the points (N,3), z up: one in every cell of a square grid seen from above, none of them changed.
+
+    least_cell_m: cells are at least this large, so that even fewer may be left. Fewer points than that come back as they are.
+    """
+    if len(points) <= most and least_cell_m == 0.0:
+        return points
+    corner = points[:, :2].min(axis=0)
+    size = points[:, :2].max(axis=0) - corner
+    cell = max(math.sqrt(float(np.prod(size)) / most), least_cell_m, 1e-4)
+    index = ((points[:, :2] - corner) / cell).astype(np.int64)
+    width = int(size[0] / cell) + 1
+    chosen = np.full(width * (int(size[1] / cell) + 1), -1)
+    chosen[index[:, 1] * width + index[:, 0]] = np.arange(len(points))
+    kept = points[np.sort(chosen[chosen >= 0])]
+    return kept if len(kept) < 0.9 * len(points) else points
 
 
 def rasterise(p: Floats, face: Mask, below: Mask, pitch: float) -> Raster:

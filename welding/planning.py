@@ -44,7 +44,7 @@ class PlanningMethod:
 class RootPlan:
     """The groove's root in base, in the direction of travel.
 
-    root, up      (N,3) m and unit; half_angle_rad between a wall and the groove's middle plane
+    root, up      (N,3) m and unit normals of the face; half_angle_rad between a wall and the groove's middle plane
     X_BP          where the drawing lies, where one was used
     sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, which the real one may miss
     rms_m         of the face's points about their plane; confidence 0 to 1; words: what was found, in a sentence
@@ -79,7 +79,7 @@ def plan_root(
         groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
         return RootPlan(
             root=groove.curve.position(np.linspace(0.0, groove.curve.length, len(groove.curve.knots))),
-            up=groove.X_AF.rotation().matrix()[:, 2],
+            up=groove.curve.ups,
             half_angle_rad=groove.half_angle,
             X_BP=None,
             sigma_m=groove.typical_sigma,
@@ -97,7 +97,7 @@ def plan_root(
     X_BP = registration.X_BP
     return RootPlan(
         root=workpiece.seam_P @ X_BP.rotation().matrix().T + X_BP.translation(),
-        up=X_BP.rotation().matrix()[:, 2],
+        up=np.broadcast_to(workpiece.up_P, workpiece.seam_P.shape) @ X_BP.rotation().matrix().T,
         half_angle_rad=workpiece.half_angle_rad,
         X_BP=X_BP,
         sigma_m=registration.seam_sigma_m,

@@ -90,8 +90,7 @@ def moved_covariance(covariance: Floats, X_PQ: RigidTransform) -> Floats:
 def seam_sigma(covariance: Floats, workpiece: Workpiece) -> float:
     """Rms over the drawn seam of the sigma of its sideways position in the face, m."""
     p, t = workpiece.seam_P[::20], workpiece.tangents_P[::20]
-    n = np.column_stack([-t[:, 1], t[:, 0]])
-    row = np.zeros((len(p), 6))
-    row[:, 2] = n[:, 1] * p[:, 0] - n[:, 0] * p[:, 1]
-    row[:, 3:5] = n
+    n = np.cross(np.broadcast_to(workpiece.up_P, workpiece.seam_P.shape)[::20], t)
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    row = np.column_stack([np.cross(p, n), n])
     return math.sqrt(float(np.mean(np.einsum("ij,jk,ik->i", row, covariance, row))))

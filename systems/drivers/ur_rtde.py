@@ -18,6 +18,7 @@ from weldcal.systems.messages import UrStatus
 
 FULL_PACE = 1.0
 STILL_RAD_S = 1e-9
+N_OUTPUTS = 8
 
 
 @dc.dataclass
@@ -31,6 +32,7 @@ class UrRtde:
     upper_registers: bool | None = None  # 24 to 47 (the lower ones belong to fieldbuses); null: where ur_rtde can
     payload_kg: float = 1.4  # of the welding tool
     payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
+    process_output: int | None = None  # standard digital output (0 to 7) that switches the torch; null: none is wired
 
     def limits(self, arm: ArmModel) -> Limits:
         """What the worker holds commands against."""
@@ -45,8 +47,8 @@ class ArmLink(Protocol):
     def state(self) -> LinkState:
         """The newest state."""
 
-    def command(self, qd: np.ndarray) -> int:
-        """Hand over the newest joint velocity (6,) rad/s."""
+    def command(self, qd: np.ndarray, process: bool = False) -> int:
+        """Hand over the newest joint velocity (6,) rad/s, and whether the process may run."""
 
 
 class UrRtdeArm(LeafSystem):
@@ -57,6 +59,7 @@ class UrRtdeArm(LeafSystem):
         name: UrRtdeArm
         input_ports:
         - velocity_command
+        - process_on
         output_ports:
         - desired_state
         - position_measured
@@ -68,6 +71,7 @@ class UrRtdeArm(LeafSystem):
     Units as in the simulated arm. `sample_time` is when the robot took the sample, on the Diagram's clock: the moment of
     the update less the sample's age, which robot time mapped to host time gives. `desired_state` (12) rad, rad/s is where the
     real arm will be at the next tick, for a world that shadows it. Outputs depend on the state only: no feedthrough.
+    `process_on` (1) switches the torch's digital output, where one is wired; unconnected means off.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class UrRtdeArm(LeafSystem):
         self._arm, self._link, self._pace, self._period_s = arm, link, pace, period_s
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
+        self._process = self.DeclareVectorInputPort("process_on", 1)
         # q, qd, sample time, desired q, desired qd
         start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6)])
         vector = self.DeclareDiscreteState(start)
@@ -106,7 +111,8 @@ class UrRtdeArm(LeafSystem):
     def _send(self, context: Context) -> EventStatus:
         wanted = np.array(self._command.Eval(context))
         # an arm that is to stand still is told exactly so: only then may the cell think for as long as it likes
-        self._link.command(np.zeros(6) if np.abs(wanted).max() < STILL_RAD_S else wanted)
+        process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
+        self._link.command(np.zeros(6) if np.abs(wanted).max() < STILL_RAD_S else wanted, process)
         return EventStatus.Succeeded()
 
     def _desired(self, context: Context, output: BasicVector) -> None:
@@ -139,6 +145,10 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
     if config.pace != FULL_PACE and not config.host.startswith("127."):
         raise InputError("Only the emulator can run at another pace: leave pace at 1 for a robot.")
+    if config.process_output is not None and not 0 <= config.process_output < N_OUTPUTS:
+        raise InputError(
+            f"robot.process_output must be a standard digital output from 0 to 7, not {config.process_output}."
+        )
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal)
     require_ready(report)
     arm = report.arm
@@ -153,6 +163,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         upper_registers=report.upper_registers,
         payload_kg=config.payload_kg,
         payload_cog_m=(x, y, z),
+        process_output=config.process_output,
     )
     return PreparedRobot(arm, link.state().q, link, config.pace)
 
@@ -167,5 +178,7 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
         world = build.world
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
     build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
+    if config.process_output is not None:
+        build.inputs["ur10e.process_on"] = arm.GetInputPort("process_on")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
         build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)

@@ -17,6 +17,7 @@ class StillLink:
         self.age_s = 0.0
         self.fault = Fault.NONE
         self.commands: list[np.ndarray] = []
+        self.processes: list[bool] = []
 
     def state(self) -> LinkState:
         """What a worker would have written."""
@@ -38,7 +39,8 @@ class StillLink:
             **times,
         )
 
-    def command(self, qd: np.ndarray) -> int:
+    def command(self, qd: np.ndarray, process: bool = False) -> int:
         """Remember it."""
+        self.processes.append(process)
         self.commands.append(np.array(qd))
         return len(self.commands)

@@ -136,6 +136,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     UrRtdeArm: {
         "velocity_command": 6,
+        "process_on": 1,
         "desired_state": 12,
         "position_measured": 6,
         "velocity_measured": 6,

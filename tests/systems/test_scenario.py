@@ -197,6 +197,7 @@ robot: !UrRtde
   upper_registers: false
   payload_kg: 2.0
   payload_cog_m: [0.01, 0.02, 0.06]
+  process_output: 3
 """
 
 
@@ -334,7 +335,6 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
     [
         ("welding: {law: magic}", "magic"),
         ("workpiece: {located_by: luck}", "scan or drawing"),
-        ("workpiece: {bend_radius_mm: 200.0}", "located_by: drawing"),
         ("workpiece: {bend_radius_mm: -1.0, located_by: drawing}", "bend_radius_mm must be a positive number"),
     ],
 )

@@ -80,6 +80,17 @@ def test_each_command_is_sent_and_next_to_nothing_is_sent_as_nothing(link: Still
     assert link.commands[-1] == pytest.approx(np.full(6, 0.1))
 
 
+def test_the_process_is_asked_for_with_the_velocity_of_the_same_tick_and_off_where_nobody_asks(link: StillLink) -> None:
+    driven = Driven(link)
+    driven.simulator.AdvanceTo(0.02)
+    assert link.processes
+    assert not any(link.processes)
+    driven.system.GetInputPort("process_on").FixValue(driven.context, [1.0])
+    driven.simulator.AdvanceTo(0.03)
+    assert link.processes[-1]
+    assert len(link.processes) == len(link.commands)
+
+
 def test_a_command_that_is_no_number_goes_to_the_worker_which_refuses_it(link: StillLink) -> None:
     driven = Driven(link)
     driven.tell(np.full(6, np.nan))

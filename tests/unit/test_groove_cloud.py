@@ -179,7 +179,7 @@ def test_a_scanner_too_coarse_for_the_groove_is_told_by_how_much() -> None:
 
 def test_a_plain_plate_and_a_gap_between_two_are_not_grooves() -> None:
     plain = box(0.2, 0.15, 0.02).transformed(RigidTransform([0.6, 0.0, 0.0]))
-    with pytest.raises(GrooveNotFound, match="No groove in any flat face"):
+    with pytest.raises(GrooveNotFound, match="No groove in any face"):
         extract_groove(_seen(plain, scanner=COARSE))
     halves = [box(0.2, 0.07, 0.02).transformed(RigidTransform([0.6, y, 0.0])) for y in (-0.039, 0.039)]
     with pytest.raises(GrooveNotFound, match="not a V-groove"):

@@ -16,6 +16,12 @@ def seam_planning(
         list[str] | None,
         typer.Option("--preset", metavar="NAME", help="A scanner; again for more.", show_default="all"),
     ] = None,
+    full: Annotated[
+        bool, typer.Option("--full-resolution", help="Images as wide as the scanner has them, not 824 pixels at most.")
+    ] = False,
+    troubles: Annotated[
+        bool, typer.Option("--troubles/--no-troubles", help="Occlusion, clutter and wrong workpieces as well.")
+    ] = True,
     out: Annotated[Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write.")] = None,
     seed: Annotated[int, typer.Option("--seed", metavar="N", min=0, help="Other poses and noise.")] = 0,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
@@ -30,5 +36,5 @@ def seam_planning(
         from weldcal.tools.benchmarks.seam_planning import run_seam_planning_benchmark
 
         names = [get_scanner(name).name for name in preset] if preset else None
-        summary, rows = run_seam_planning_benchmark(folder, runs, seed, names, progress)
+        summary, rows = run_seam_planning_benchmark(folder, runs, seed, names, progress, full=full, troubles=troubles)
     finish("benchmark seam-planning", summary, folder, json_wanted=json, rows=rows)

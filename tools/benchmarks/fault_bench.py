@@ -76,6 +76,7 @@ class Stream(threading.Thread):
         self._stroke = Stroke(arm, home)
         self._done = threading.Event()
         self.twist: Callable[[Array], Array | None] = lambda qd: qd
+        self.process = False
         self.state: LinkState = link.state()
         self.worst_gap_s = 0.0
 
@@ -89,7 +90,7 @@ class Stream(threading.Thread):
             self.state = self._link.state()
             qd = self.twist(self._stroke.next(self.state.q, 1.0 / RATE_HZ))
             if qd is not None:
-                self._link.command(qd)
+                self._link.command(qd, self.process)
 
     def stop(self) -> None:
         """End the thread."""
@@ -106,8 +107,9 @@ class Stream(threading.Thread):
 class Bench:
     """One emulated controller and, between `start` and `end`, an arm that moves over a link to it."""
 
-    def __init__(self, emulator: Emulator) -> None:
+    def __init__(self, emulator: Emulator, output: int | None = None) -> None:
         self.emulator = emulator
+        self.output = output
         self.host = emulator.host
         self.arm = load_arm()
         self.home = np.array(HOME)
@@ -132,7 +134,13 @@ class Bench:
             require_ready(preflight(self.host))
         self.emulator.do("reset_checker")
         config = UrRtde(host=self.host)
-        self.link = UrLink.start(self.host, self.arm, config.limits(self.arm), payload_kg=config.payload_kg)
+        self.link = UrLink.start(
+            self.host,
+            self.arm,
+            config.limits(self.arm),
+            payload_kg=config.payload_kg,
+            process_output=self.output,
+        )
         self._stream = Stream(self.link, self.arm, self.home)
         self._stream.start()
 

@@ -74,8 +74,7 @@ def random_pose(rng: np.random.Generator, part: Workpiece, tilt_rad: float, spre
     R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
         rng.uniform(-math.pi, math.pi)
     )
-    corners = np.array([[*xy, -part.size_m[2]] for xy in part.outline_P])
-    lift = -float((corners @ R.matrix().T)[:, 2].min()) + 0.0005
+    lift = -float((part.mesh.vertices @ R.matrix().T)[:, 2].min()) + 0.0005
     x, y = np.array([0.6, 0.0]) + rng.uniform(-spread_m, spread_m, size=2)
     return RigidTransform(R, [x, y, lift])
 

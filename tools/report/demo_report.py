@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
-from weldcal.tools.outcome import heat_input_kJ_mm
+from weldcal.tools.outcome import heat_input_kJ_mm, planned_seam
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
 
@@ -72,6 +72,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         weld=weld,
         tip_error_mm=None if weld is None else 1e3 * plots_demo.tip_error(weld),
         pictures=pictures,
+        planned=_planned(result),
         heat=_process(result),
         pose=pose,
         observations=_observations(result),
@@ -99,6 +100,20 @@ def _observations(result: DemoResult) -> list[tuple[str, ...]]:
         for v in status.verifications
     ]
     return rows + [(label, f"refused: {reason}", "", "") for label, reason in status.refused]
+
+
+def _planned(result: DemoResult) -> list[tuple[str, str]]:
+    """What the planner found in the scan, and how well it says that it knows the root."""
+    plan = planned_seam(result.run.cell, result.run.root)
+    if plan.seam is None:
+        return []
+    rows = [("planned", plan.words[:1].upper() + plan.words[1:])] if plan.words else []
+    if np.isfinite(plan.sigma_m):
+        rows.append(
+            ("sigma of the planned root, sideways", f"{fixed(1e3 * plan.sigma_m, 3)} mm, as the planner states it")
+        )
+        rows.append(("confidence", fixed(plan.confidence, 2)))
+    return rows
 
 
 def _process(result: DemoResult) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ REST_RAD_S = 1e-3
 # A streamed motion whose client has been silent for longer than this moves unattended. Silence is counted in frames, as the
 # watchdogs count it and as the arm moves: a controller whose frames come late lives slowly, and its arm moves as slowly.
 SILENT_S = 0.25
-TIME, SPEED, TOOL, SILENCE, STREAMED = range(5)
+TIME, SPEED, TOOL, SILENCE, STREAMED, OUTPUTS = range(6)
 
 
 class Checker:
@@ -24,7 +24,7 @@ class Checker:
     def __init__(self, controller: Controller, pace: float = 1.0) -> None:
         self._controller = controller
         self._pace = pace
-        self._record = np.zeros((RECORD_FRAMES, 5))
+        self._record = np.zeros((RECORD_FRAMES, 6))
         self._count = 0
         self._heard: float = float("-inf")  # frame of the newest input package or script
         self._moving = False
@@ -59,7 +59,10 @@ class Checker:
         motion = arm.motion
         streamed = motion is not None and motion.streamed
         tool = float(np.linalg.norm(arm.tool_speed()[:3])) if moving_any else 0.0
-        self._record[self._count % RECORD_FRAMES] = (now, speed, tool, min(silence, 1e9), streamed)
+        self._record[self._count % RECORD_FRAMES] = (
+            *(now, speed, tool, min(silence, 1e9), streamed),
+            self._controller.terminals.digital_outputs,
+        )
         self._count += 1
         moving = speed > REST_RAD_S
         if moving and not self._moving:
@@ -105,6 +108,34 @@ class Checker:
             "travel_m": float(rows[:first, TOOL].sum() * STEP_S),
             "peak_tool_speed_after_m_s": float(rows[first:, TOOL].max()),
             "recorded_s": float(rows[-1, TIME] - fault_time) * self._pace,
+        }
+
+    def output_after(self, fault_time: float, output: int) -> dict[str, Any]:
+        """When after a point in time a digital output went off and when the arm began to slow down (s; None: not yet).
+
+        `frames_before_braking`: how many frames the output was off before the first in which the joints went slower than
+        at that time by a hundredth; `on_again_s`: when it went on again.
+        """
+        rows = self._rows()
+        # from the last frame before that time: what happens between frames is seen in the first one after it
+        rows = rows[max(0, int(np.searchsorted(rows[:, TIME], fault_time)) - 1) :]
+        on = (rows[:, OUTPUTS].astype(np.int64) >> output & 1).astype(bool)
+        if rows.shape[0] == 0 or not on[0]:
+            return {"ok": False, "reason": "the output was not on at that time"}
+        off = int(np.argmax(~on)) if not on.all() else None
+        slow = rows[:, SPEED] < 0.99 * rows[0, SPEED]
+        slower = int(np.argmax(slow)) if slow.any() else None
+        again = None if off is None or not on[off:].any() else off + int(np.argmax(on[off:]))
+
+        def seconds(row: int | None) -> float | None:
+            return None if row is None else float(rows[row, TIME] - fault_time) * self._pace
+
+        return {
+            "ok": off is not None and again is None,
+            "off_after_s": seconds(off),
+            "slows_after_s": seconds(slower),
+            "frames_before_braking": None if off is None or slower is None else slower - off,
+            "on_again_s": seconds(again),
         }
 
     def summary(self) -> dict[str, Any]:

@@ -144,6 +144,8 @@ class ControlServer(Server):
             return self._checker.at_rest_after(
                 _number(request, "fault_time"), _number(request, "within", 0.3), _number(request, "speed", 1e-3)
             )
+        if request.get("check") == "output_after":
+            return self._checker.output_after(_number(request, "fault_time"), int(_number(request, "output")))
         if request.get("check") == "summary":
             return self._checker.summary()
         if request.get("ask") == "state":
@@ -154,7 +156,9 @@ class ControlServer(Server):
             return {"source": self._controller.program.source if self._controller.program else None}
         if request.get("ask") == "connections":
             return {"connections": [c.kind for c in self._network.of_kind("all")]}
-        raise InputError("Send fault, do, check (at_rest_after, summary) or ask (state, log, program, connections).")
+        raise InputError(
+            "Send fault, do, check (at_rest_after, output_after, summary) or ask (state, log, program, connections)."
+        )
 
     def _links(self, request: Request) -> list[Connection]:
         """Connections of the protocol that the request names (rtde unless it says so), or the one at `index`."""

@@ -146,6 +146,7 @@ class Controller:
         if self.program is None:
             return
         self.program.close()
+        self.terminals.program_ended()
         self.note(f"program stopped: {self.program.name}")
         self.events.append(("STOPPED", self.program.name, 0))
         self.program = None
@@ -223,6 +224,8 @@ class Controller:
         self._drop_program()
         self.sidekicks.clear()
         self.inputs, self.outputs = Registers(), Registers()
+        self.terminals.digital_outputs = 0
+        self.terminals.runstate.clear()
         self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0
@@ -327,6 +330,7 @@ class Controller:
             "motion": type(motion).__name__ if motion is not None else None,
             "command": self.inputs.integers[0],
             "answer": self.outputs.integers[0],
+            "digital_outputs": self.terminals.digital_outputs,
             "script_line": self.program.line if self.program else 0,
             "watchdogs": sorted(self.watchdogs),
         }

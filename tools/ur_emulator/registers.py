@@ -52,6 +52,9 @@ class Terminals:
     def __init__(self) -> None:
         self.digital_inputs = 0
         self.digital_outputs = 0
+        self.runstate: dict[
+            int, int
+        ] = {}  # of standard outputs: what set_runstate_standard_digital_output_to_value chose
         self.analog_outputs = [0.0, 0.0]
         self.analog_output_types = 0
         self.speed_slider = 1.0
@@ -59,6 +62,14 @@ class Terminals:
     def set_digital(self, first: int, mask: int, value: int) -> None:
         """Sets the outputs that `mask` names, counted from `first` (0 standard, 8 configurable, 16 tool)."""
         self.digital_outputs = self.digital_outputs & ~(mask << first) | (value & mask) << first
+
+    def program_ended(self, *, unscheduled: bool = False) -> None:
+        """Outputs that follow the program's state take their level for a program that does not run."""
+        for n, choice in self.runstate.items():
+            if choice in (1, 3) or (unscheduled and choice in (4, 5)):
+                self.digital_outputs &= ~(1 << n)
+            elif choice == 2:
+                self.digital_outputs |= 1 << n
 
 
 def register_index(index: object, count: int) -> int:

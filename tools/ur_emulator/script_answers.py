@@ -227,6 +227,12 @@ class Answers:
     def set_digital_out(self, n: int, b: bool) -> None:
         self.set_standard_digital_out(n, b)
 
+    def get_standard_digital_out(self, n: int) -> bool:
+        return bool(self._controller.terminals.digital_outputs >> register_index(n, 8) & 1)
+
+    def set_runstate_standard_digital_output_to_value(self, outputId: int, state: int) -> None:
+        self._controller.terminals.runstate[register_index(outputId, 8)] = register_index(state, 8)
+
     def get_standard_digital_in(self, n: int) -> bool:
         return bool(self._controller.terminals.digital_inputs >> register_index(n, 8) & 1)
 

@@ -37,6 +37,7 @@ class Fault(IntEnum):
     CONTROL_REFUSED = 32
     START_FAILED = 33
     TCP_NOT_ZERO = 34
+    OUTPUT_IN_USE = 35
 
 
 SENTENCES = {
@@ -68,6 +69,7 @@ SENTENCES = {
     Fault.UPLOAD_REFUSED: "The controller did not start our program: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
     Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",
     Fault.TCP_NOT_ZERO: "The TCP could not be set to zero: set it to zero in Installation > General > TCP on the pendant and start again.",
+    Fault.OUTPUT_IN_USE: "The digital output of the process (robot.process_output) is taken: close the other RTDE client or fieldbus that writes the outputs.",
     Fault.START_FAILED: "The process that talks to the robot could not start; run `weldcal check-robot` and try again.",
 }
 

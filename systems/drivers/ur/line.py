@@ -75,6 +75,14 @@ class Line:
                 raise self.nonsense()
         return self.read(self._inbox.index(b"\n") + 1, until).decode("utf-8", "replace").strip()
 
+    def drain(self) -> None:
+        """Throws away what has arrived."""
+        self._inbox.clear()
+        self._socket.settimeout(0.0)
+        with contextlib.suppress(OSError):
+            while self._socket.recv(65536):
+                pass
+
     def nonsense(self) -> RobotUnreachable:
         """What to raise where the bytes make no sense."""
         return RobotUnreachable(

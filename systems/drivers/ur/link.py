@@ -52,6 +52,7 @@ class LinkState:
     late_periods: int
     clock_residual_s: float
     clock_drift: float
+    process_on: bool = False  # the process output, as the controller reports it
 
 
 class UrLink:
@@ -95,13 +96,16 @@ class UrLink:
         upper_registers: bool = True,
         payload_kg: float = 0.0,
         payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        process_output: int | None = None,
     ) -> UrLink:
-        """Start the worker, upload the guard, and wait until it obeys. The arm does not move.
+        """Start the worker, upload the guard, and wait until it obeys. The arm does not move, `process_output` is off.
 
         Raises:
             RobotRefused: one sentence that says what to press; nothing is left behind.
         """
-        config = WorkerConfig(host, arm, limits, rate_hz, upper_registers, payload_kg, payload_cog_m, os.getpid())
+        config = WorkerConfig(
+            host, arm, limits, rate_hz, upper_registers, payload_kg, payload_cog_m, os.getpid(), process_output
+        )
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace
         while time.monotonic() < until:
@@ -120,10 +124,10 @@ class UrLink:
         link._end()
         raise RobotRefused(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
 
-    def command(self, qd: NDArray[np.float64]) -> int:
-        """Hand the newest joint velocity (6,) rad/s to the worker; its number. Never blocks."""
+    def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
+        """Hand the newest joint velocity (6,) rad/s, and whether the process may run, to the worker; its number. Never blocks."""
         self._number += 1
-        self._memory.command.write([float(self._number), time.monotonic(), 0.0, *map(float, qd)])
+        self._memory.command.write([float(self._number), time.monotonic(), 0.0, float(process), *map(float, qd)])
         return self._number
 
     def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
@@ -178,6 +182,7 @@ class UrLink:
             int(found[_AT["late_periods"]]),
             found[_AT["residual"]],
             found[_AT["drift"]],
+            found[_AT["process"]] > 0.5,
         )
 
     def close(self) -> None:
@@ -186,7 +191,7 @@ class UrLink:
             return
         if self._process.poll() is None:
             self._number += 1
-            self._memory.command.write([float(self._number), time.monotonic(), 1.0, *[0.0] * 6])
+            self._memory.command.write([float(self._number), time.monotonic(), 1.0, 0.0, *[0.0] * 6])
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(CLOSE_LIMIT_S / self._config.limits.pace)
         last = self._memory.state.read() or self._last

@@ -18,7 +18,9 @@ from rtde_receive import RTDEReceiveInterface
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.clock import ClockMap
+from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.off_switch import OffSwitch
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
 
 RTDE_PORT = 30004
@@ -34,9 +36,13 @@ class Refused(Exception):
         self.fault = fault
 
 
-def guard_script(upper_registers: bool) -> str:
-    """The guard's text for the register range in use: 24 to 47, or 0 to 23 which fieldbuses share."""
+def guard_script(upper_registers: bool, output: int | None = None) -> str:
+    """The guard's text for the register range in use: 24 to 47, or 0 to 23 which fieldbuses share; `output`: the standard
+    digital output of the process, None where none is wired.
+    """
     text = files("weldcal.systems.drivers.ur").joinpath("guard.script").read_text(encoding="utf-8")
+    if output is not None:
+        text = text.replace("global output = -1", f"global output = {output}")
     if upper_registers:
         return text
     changed = text.replace("global base = 24", "global base = 0").replace("global word = 36", "global word = 12")
@@ -60,9 +66,10 @@ def _sockets_to(port: int) -> dict[int, int]:
 class Robot:
     """Both ur_rtde interfaces, the clock and the newest whole package."""
 
-    def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel) -> None:
+    def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel, output: int | None = None) -> None:
         self._word = 36 if upper else 12
-        self._script = guard_script(upper)
+        self._script = guard_script(upper, output)
+        self._output = output
         self._arm = arm
         self._pace = pace
         self.clock = ClockMap(pace)
@@ -75,6 +82,7 @@ class Robot:
             f"output_int_register_{self._word}",
             # the echo of the newest number, and the TCP read back
             *(f"output_double_register_{self._word + i}" for i in range(7)),
+            *(() if output is None else ("actual_digital_output_bits",)),
         ]
         try:
             self.receive = RTDEReceiveInterface(host, -1.0, names, False, upper)
@@ -83,11 +91,19 @@ class Robot:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
         self._sockets = _sockets_to(RTDE_PORT)
+        self._switch = None if output is None else self._off_switch(host, output)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._sent: dict[float, float] = {}
         self._number = 0.0
         self._heard = self._first_unheard = 0.0
         self.echo_latency = 0.0
+
+    def _off_switch(self, host: str, output: int) -> OffSwitch:
+        try:
+            return OffSwitch(host, output)
+        except (RobotUnreachable, RobotRefused) as error:
+            sys.stderr.write(f"{error}\n")
+            raise Refused(Fault.OUTPUT_IN_USE) from error
 
     def start_guard(self) -> None:
         """Clear the command register, upload the guard and wait until it obeys."""
@@ -168,14 +184,26 @@ class Robot:
             self._sent = {number: t for number, t in self._sent.items() if t > self._sent[echo]}
             self._first_unheard = min(self._sent.values(), default=now)
 
-    def send(self, qd: np.ndarray, acceleration: float) -> bool:
-        """One velocity, numbered for the guard's deadman; False where the program does not run."""
-        self._number = self._number % 1_000_000.0 + 1.0
+    def send(self, qd: np.ndarray, acceleration: float, process: bool = False) -> bool:
+        """One velocity, numbered for the guard's deadman; a half behind the number asks for the process. False where the
+        program does not run.
+        """
+        self._number = np.floor(self._number) % 1_000_000.0 + (1.5 if process else 1.0)
         now = time.monotonic()
         if not self._sent:
             self._first_unheard = now
         self._sent[self._number] = now
         return bool(self.control.speedJ(qd.tolist(), acceleration, self._number))
+
+    def torch_off(self) -> None:
+        """The process output off, past the guard, which may stand still or be gone."""
+        if self._switch is not None:
+            self._switch.off()
+
+    @property
+    def process_on(self) -> bool:
+        """What the controller reports of the output."""
+        return self._output is not None and bool(self.receive.getActualDigitalOutputBits() >> self._output & 1)
 
     @property
     def numbers(self) -> tuple[float, float, float]:

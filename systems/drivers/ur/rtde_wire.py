@@ -1,4 +1,4 @@
-"""A small RTDE client for the pre-flight: reads chosen outputs once, and asks whether inputs are free; it writes nothing.
+"""A small RTDE client: reads chosen outputs once, asks whether inputs are free, and writes those that it was granted.
 
 Packages of protocol version 2 are big endian: uint16 size (header included), uint8 type, payload. The driver's stream
 goes through ur_rtde; this client exists because ur_rtde cannot read `tcp_offset` and claims registers only for good.
@@ -15,6 +15,7 @@ from weldcal.systems.drivers.ur.line import Line
 RTDE_PORT = 30004
 IN_USE, NOT_FOUND = "IN_USE", "NOT_FOUND"
 FREQUENCY_HZ = 125.0
+SLOWEST_HZ = 1.0
 PROTOCOL_VERSION = 2
 MAX_NAMES_BYTES = 2048
 
@@ -105,8 +106,23 @@ class RtdeProbe:
             answer |= dict(zip(group, types, strict=True))
         return answer
 
-    def _set_outputs(self, names: Sequence[str]) -> list[str]:
-        request = struct.pack(">d", FREQUENCY_HZ) + ",".join(names).encode()
+    def grant(self, names: Sequence[str]) -> int | None:
+        """Takes these inputs for `write`, and starts: the recipe's number, or None where one of them is not free."""
+        payload = self._request(_INPUTS, ",".join(names).encode())
+        if {IN_USE, NOT_FOUND} & set(self._types(payload, len(names))):
+            return None
+        # a controller starts only what has outputs; once a second is next to nothing
+        self._set_outputs(("timestamp",), SLOWEST_HZ)
+        self._request(_START, b"")
+        return payload[0]
+
+    def write(self, package: bytes) -> None:
+        """One input package, its recipe's number first; what has arrived meanwhile is thrown away."""
+        self._line.drain()
+        self._line.send(struct.pack(">HB", len(package) + 3, _DATA) + package)
+
+    def _set_outputs(self, names: Sequence[str], frequency_hz: float = FREQUENCY_HZ) -> list[str]:
+        request = struct.pack(">d", frequency_hz) + ",".join(names).encode()
         return self._types(self._request(_OUTPUTS, request), len(names))
 
     def _types(self, payload: bytes, count: int) -> list[str]:

@@ -111,7 +111,7 @@ class JointRing:
         return np.asarray((1.0 - w) * np.array(q0) + w * np.array(q1))
 
 
-COMMAND = ("number", "host_time", "stop", *(f"qd{i}" for i in range(6)))
+COMMAND = ("number", "host_time", "stop", "process", *(f"qd{i}" for i in range(6)))
 STATE = (
     "heartbeat",  # host time of the worker's last pass
     "phase",  # Phase of the worker
@@ -132,6 +132,7 @@ STATE = (
     "echo_latency",
     "worst_period",
     "late_periods",  # passes that came more than 20 ms late
+    "process",  # 1 where the process output is on, as the controller reports it
     "residual",  # of the clock fit, s
     "drift",
 )

@@ -89,6 +89,7 @@ class Command:
     qd: Array = field(default_factory=lambda: np.zeros(6))
     stop: bool = False
     orphaned: bool = False  # the cell's process is gone
+    process: bool = False  # the torch may burn
 
 
 @dataclass(frozen=True)

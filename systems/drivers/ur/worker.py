@@ -54,6 +54,7 @@ class WorkerConfig:
     payload_kg: float
     payload_cog_m: tuple[float, float, float]
     parent: int
+    process_output: int | None = None
 
 
 class Worker:
@@ -66,6 +67,7 @@ class Worker:
         self._fault_time = 0.0
         self._worst = 0.0
         self._late = 0
+        self._put_out = False
         self._ringed = -1.0
         self._newest: tuple[float, ...] | None = None
         self._rest_since: float | None = None
@@ -92,6 +94,9 @@ class Worker:
             decision = self._supervisor.step(now, sample, command)
             if decision.fault is not Fault.NONE and self._fault_time == 0.0:
                 self._fault_time = now
+            if decision.action is not Action.SEND and (robot.process_on or not self._put_out):
+                robot.torch_off()
+                self._put_out = True
             if decision.action is Action.LEAVE:
                 self._publish(now, robot, sample, decision)
                 return LEFT
@@ -111,12 +116,14 @@ class Worker:
         found = self._newest
         if found is None:
             return Command(orphaned=orphaned)
-        number, given_at, stop, *qd = found
-        return Command(int(number), given_at, np.array(qd), bool(stop), orphaned)
+        number, given_at, stop, process, *qd = found
+        return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
-            if not robot.send(command.qd, ACCELERATION):
+            # a cell that thinks may keep the arm at rest, not the torch burning
+            process = command.process and now - command.given_at <= self._config.limits.late_s
+            if not robot.send(command.qd, ACCELERATION, process):
                 self._phase = Phase.STOPPED  # the next sample says why
         elif decision.action is Action.STOP:
             robot.forget()
@@ -144,7 +151,7 @@ class Worker:
         values = [time.monotonic(), self._phase, host_time, sample.robot_time, *sample.q, *sample.qd]
         values += [sample.robot_mode, sample.safety_mode, sample.runtime_state, sample.speed_scaling]
         values += [decision.fault, decision.detail, self._fault_time, number, sent_at, echo, robot.echo_latency]
-        values += [self._worst, self._late, robot.clock.residual_s, robot.clock.drift]
+        values += [self._worst, self._late, robot.process_on, robot.clock.residual_s, robot.clock.drift]
         self._memory.state.write([float(value) for value in values])
 
     def refuse(self, fault: Fault) -> None:
@@ -174,7 +181,13 @@ def main() -> None:
 
     worker = Worker(config, memory)
     try:
-        robot = Robot(config.host, upper=config.upper_registers, pace=config.limits.pace, arm=config.arm)
+        robot = Robot(
+            config.host,
+            upper=config.upper_registers,
+            pace=config.limits.pace,
+            arm=config.arm,
+            output=config.process_output,
+        )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
     except Refused as refused:

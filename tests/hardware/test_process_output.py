@@ -1,0 +1,264 @@
+"""The torch at a digital output of the controller: on only while somebody asks for it, off before whatever stops the arm."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from tests.hardware.emulator_process import run_client
+from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenario
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.ur.errors import RobotRefused
+from weldcal.systems.drivers.ur.off_switch import MASK, VALUE
+from weldcal.systems.drivers.ur.robot import guard_script
+from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
+from weldcal.systems.drivers.ur_rtde import PrepareRobot, UrRtde
+from weldcal.systems.station import make_station
+from weldcal.tools.benchmarks.fault_bench import Bench
+from weldcal.tools.benchmarks.robot_faults import recover
+from weldcal.tools.pacing import WallClock
+from weldcal.tools.ur_emulator.controller import Controller
+from weldcal.tools.ur_emulator.main import HOME
+from weldcal.tools.ur_emulator.modes import RuntimeState
+from weldcal.tools.ur_emulator.process import emulator_process
+from weldcal.tools.ur_emulator.versions import parse_version
+
+OUTPUT = 3
+HOST = "127.0.0.47"  # an address of its own: this module waits for no other
+TURNING = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
+BASE = 24
+SPEED_J, MOVE_J, SPEED_STOP, END = 9, 1, 15, 255
+
+
+class Guarded:
+    """The guard in a controller, frame by frame; a half behind the number asks for the process."""
+
+    def __init__(self, output: int | None = OUTPUT) -> None:
+        self.controller = Controller(load_arm(), np.array(HOME), parse_version("5.21"))
+        self.controller.terminals.digital_outputs = 0xFF  # somebody left them on
+        self.controller.submit(guard_script(True, output))
+        self.number = 0.0
+        self.history: list[tuple[bool, float]] = []
+        self.frames(5)
+
+    def frames(self, count: int, *, fed: bool = True) -> None:
+        for _ in range(count):
+            if fed:
+                self.controller.written((f"input_int_register_{BASE}",))
+            self.controller.step()
+            self.history.append((self.on, float(np.abs(self.controller.arm.qd).max())))
+
+    def write(self, command: int, values: Sequence[float] = ()) -> None:
+        self.controller.inputs.integers[BASE] = command
+        for i, value in enumerate(values):
+            self.controller.inputs.doubles[BASE + i] = value
+
+    def speed(self, qd: Sequence[float], frames: int, process: bool) -> None:
+        for _ in range(frames):
+            self.number += 1.0
+            self.write(SPEED_J, [*qd, 40.0, self.number + 0.5 * process])
+            self.frames(1)
+
+    @property
+    def on(self) -> bool:
+        return bool(self.controller.terminals.digital_outputs >> OUTPUT & 1)
+
+    def off_before_slower(self) -> bool:
+        """The newest frame at full speed with the process on comes before the first slower one."""
+        last_on = max(k for k, (on, _) in enumerate(self.history) if on)
+        fastest = max(speed for _, speed in self.history)
+        slower = [k for k, (_, speed) in enumerate(self.history) if k > last_on and speed < 0.999 * fastest]
+        return bool(slower) and all(speed >= 0.999 * fastest for _, speed in self.history[last_on : last_on + 1])
+
+
+def test_the_guard_begins_with_the_process_off_and_burns_while_it_is_asked_to() -> None:
+    guarded = Guarded()
+    assert not guarded.on
+    assert guarded.controller.terminals.digital_outputs == 0xFF & ~(1 << OUTPUT)  # the others are not ours
+    guarded.speed(TURNING, 20, process=False)
+    assert not guarded.on
+    guarded.speed(TURNING, 2, process=True)
+    assert guarded.on
+    guarded.speed([0.0] * 6, 40, process=True)
+    assert guarded.on  # an arc may burn while the arm stands
+    guarded.speed(TURNING, 2, process=False)
+    assert not guarded.on
+
+
+def test_a_guard_without_an_output_touches_none() -> None:
+    guarded = Guarded(None)
+    guarded.speed(TURNING, 20, process=True)
+    guarded.write(END)
+    guarded.frames(60)
+    assert guarded.controller.terminals.digital_outputs == 0xFF
+
+
+def silence(guarded: Guarded) -> None:
+    guarded.frames(60)
+
+
+def stale_number(guarded: Guarded) -> None:
+    for _ in range(60):
+        guarded.write(SPEED_J, [*TURNING, 40.0, guarded.number + 0.5])
+        guarded.frames(1)
+
+
+def too_fast(guarded: Guarded) -> None:
+    guarded.speed([0.0, 0.0, 0.0, 0.0, 0.0, -3.3], 60, process=True)
+
+
+def told_to_stop(guarded: Guarded) -> None:
+    guarded.write(SPEED_STOP, [5.0])
+    guarded.frames(60)
+
+
+def told_to_end(guarded: Guarded) -> None:
+    guarded.write(END)
+    guarded.frames(60)
+
+
+def another_move(guarded: Guarded) -> None:
+    guarded.write(MOVE_J, [*HOME, 1.0, 3.0])
+    guarded.frames(60)
+
+
+def watchdog(guarded: Guarded) -> None:
+    guarded.frames(60, fed=False)
+
+
+def program_stopped(guarded: Guarded) -> None:
+    guarded.controller.stop_program()
+    guarded.frames(60)
+
+
+@pytest.mark.parametrize(
+    "stop", [silence, stale_number, too_fast, told_to_stop, told_to_end, another_move, watchdog, program_stopped]
+)
+def test_whatever_brakes_the_arm_turns_the_process_off_first(stop: Callable[[Guarded], None]) -> None:
+    guarded = Guarded()
+    guarded.speed(TURNING, 50, process=True)
+    assert guarded.on
+    stop(guarded)
+    assert not guarded.on
+    assert guarded.off_before_slower()
+
+
+def test_an_arm_at_rest_keeps_its_guard_without_numbers_but_not_its_arc() -> None:
+    guarded = Guarded()
+    guarded.speed([0.0] * 6, 50, process=True)
+    guarded.frames(19)
+    assert guarded.on
+    guarded.frames(3)  # 44 ms
+    assert not guarded.on
+    assert guarded.controller.runtime_state == RuntimeState.PLAYING
+
+
+@pytest.fixture(scope="module")
+def bench() -> Iterator[Bench]:
+    """One controller for all that happens over the wire, and a link whose torch is wired."""
+    with emulator_process(host=HOST) as emulator:
+        yield Bench(emulator, OUTPUT)
+
+
+@pytest.fixture
+def burning(bench: Bench) -> Iterator[Bench]:
+    """The arm at full speed, the torch on."""
+    bench.start()
+    bench.stream.process = True
+    bench.cruise()
+    until = time.monotonic() + 2.0
+    while not bench.stream.state.process_on and time.monotonic() < until:
+        time.sleep(0.002)
+    assert bench.emulator.state()["digital_outputs"] >> OUTPUT & 1
+    yield bench
+    bench.end(kill=True)
+    recover(bench)
+
+
+def answer_of(bench: Bench, at: float) -> dict[str, float | bool | None]:
+    time.sleep(0.35)
+    return bench.emulator.ask(check="output_after", fault_time=at, output=OUTPUT)
+
+
+FAULTS: dict[str, tuple[Callable[[Bench], float], float]] = {
+    # what happens, and how long after it the torch may burn: one pass of the worker after the controller's own report, the
+    # deadman's 40 ms, or the 50 ms after which the worker calls a silent cell late; each with what a busy computer adds
+    "the cell wants it off": (lambda b: (setattr(b.stream, "process", False), time.monotonic())[1], 0.05),
+    "the cell falls silent": (lambda b: b.send(lambda qd: None, 1e9), 0.12),
+    "protective stop": (lambda b: b.emulator.fault("protective_stop"), 0.06),
+    "emergency stop": (lambda b: b.emulator.fault("estop"), 0.06),
+    "program stopped": (lambda b: b.emulator.fault("stop_program"), 0.06),
+    "connection reset": (lambda b: b.emulator.fault("reset_tcp"), 0.10),
+    "worker killed": (lambda b: b.signal_worker(signal.SIGKILL), 0.10),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_torch_goes_out_before_the_arm_stops(burning: Bench, name: str) -> None:
+    happen, limit_s = FAULTS[name]
+    at = happen(burning)
+    answer = answer_of(burning, at)
+    assert answer["ok"], answer  # off, and never on again
+    off = answer["off_after_s"]
+    assert isinstance(off, float)
+    assert off < limit_s, answer
+    if name in ("the cell falls silent", "connection reset", "worker killed", "program stopped"):
+        frames = answer["frames_before_braking"]
+        assert isinstance(frames, int)
+        assert frames >= 0, answer
+
+
+def test_the_stock_clients_output_reaches_the_terminals_and_the_state_stream(bench: Bench) -> None:
+    script = f"""
+import time, rtde_io, rtde_receive
+io = rtde_io.RTDEIOInterface({HOST!r})
+receive = rtde_receive.RTDEReceiveInterface({HOST!r})
+seen = []
+for on in (True, False):
+    assert io.setStandardDigitalOut(5, on)
+    time.sleep(0.1)
+    seen.append(receive.getActualDigitalOutputBits() >> 5 & 1)
+print(seen)
+"""
+    done = run_client(script)
+    assert done.stdout.strip() == "[1, 0]", done.stderr
+
+
+def test_outputs_that_somebody_else_writes_are_a_refusal(bench: Bench) -> None:
+    with RtdeProbe(HOST) as other:
+        assert other.grant((MASK, VALUE)) is not None
+        with pytest.raises(RobotRefused, match="process_output"):
+            bench.start()
+    bench.end(kill=True)
+
+
+@pytest.mark.parametrize("output", [OUTPUT, None])
+def test_the_cells_process_output_reaches_the_terminal_where_one_is_wired(bench: Bench, output: int | None) -> None:
+    bench.emulator.do("set_q", q=np.deg2rad(scenario().home_deg).tolist())
+    described = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE)
+    described.robot = UrRtde(host=HOST, process_output=output)
+    station = make_station(described, 0)
+    with closing(station):
+        wired = station.diagram.HasInputPort("ur10e.process_on")
+        assert wired == (output is not None)
+        if not wired:
+            return
+        drive = Drive(station)
+        clock = WallClock(1.0)
+        drive.set("ur10e.process_on", [1.0])
+        for _ in range(50):
+            drive.run(0.004)
+            clock.wait_for(drive.time, moving=True)
+        assert bench.emulator.state()["digital_outputs"] >> OUTPUT & 1
+    assert not bench.emulator.state()["digital_outputs"] >> OUTPUT & 1
+
+
+def test_an_output_that_does_not_exist_is_told_before_anything_is_asked_of_the_robot() -> None:
+    with pytest.raises(InputError, match="from 0 to 7, not 8"):
+        PrepareRobot(UrRtde(host=HOST, process_output=8), load_arm())

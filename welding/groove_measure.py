@@ -1,0 +1,284 @@
+"""One groove measured: its coarse line moved to the sections' centres, ends, gaps and corners found, every figure with a sigma."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from weldcal.welding.groove_corner import Corner, round_corners, split_legs
+from weldcal.welding.groove_extent import ends_at_edges, refuse_gap, seen_extent
+from weldcal.welding.groove_follow import (
+    STATION_M,
+    Slices,
+    agreed,
+    common_profile,
+    cut_slices,
+    followed,
+    measured_profile,
+)
+from weldcal.welding.groove_line import Line, smoothing_weights
+from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain
+from weldcal.welding.groove_search import CoarseGroove
+from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
+from weldcal.welding.planes import Floats, into, point_pitch, thinned
+from weldcal.welding.seam import SeamCurve
+
+MOST_POINTS = 400_000  # about one groove
+THINNED = 0.9  # a smaller pitch than that of the cloud it was found in is that of a cloud which was thinned for it
+SIGMA_SCALE = 1.1  # of the slices' own sigmas: what neighbouring slices err together
+SIGMA_FLOOR_PITCHES = 0.04
+SIGMA_FLOOR_NOISE = 0.20
+HEIGHT_FLOOR_NOISE = 0.25  # of the root: what flies off the walls near it is the more, the noisier the scanner
+ONE_SIDED_PITCHES = 0.2
+END_PITCHES, END_REACH_M = 0.12, 0.006
+CORNER_REACH_M = 0.004
+GAP_ENDS = 0.6
+LEAST_NOISE_M = 3e-5  # what a smooth profile itself misses
+
+
+def measure_groove(
+    points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A: npt.ArrayLike | None
+) -> GrooveSeam:
+    """The groove's lines, refined from its coarse centre line."""
+    f = into(groove.X_AQ, points)
+    low = groove.line_Q.min(axis=0) - 0.03
+    high = groove.line_Q.max(axis=0) + 0.03
+    near = np.all((f[:, :2] > low) & (f[:, :2] < high), axis=1)
+    around = f[near & (f[:, 2] < 0.003)]
+    near &= (f[:, 2] > -config.search.max_depth_m) & (f[:, 2] < max(5.0 * groove.sigma_m, 0.003))
+    f = f[near]
+    # Later lines stay within a few millimetres of this one: all that lies further off is left here.
+    rough = cKDTree(groove.line_Q[::4]).query(f[:, :2], distance_upper_bound=0.5 * groove.width_m + BAND_M + 0.012)[0]
+    f = f[np.isfinite(rough)]
+    # The openings were found in a thinned cloud: here all of its points count.
+    f = thinned(f, MOST_POINTS)
+    fine = point_pitch(f[np.abs(f[:, 2]) < 0.003][:, :2])
+    groove = replace(groove, pitch_m=fine) if fine < THINNED * groove.pitch_m else groove
+    pitch, sigma = groove.pitch_m, groove.sigma_m
+    line = Line(groove.line_Q).even()
+    if groove.closed:
+        line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
+    else:
+        # The farthest cells of an opening are its corners: the coarse line's ends lead there and not along it.
+        trim = min(groove.width_m, 0.25 * line.length)
+        inner = (line.s >= trim) & (line.s <= line.length - trim)
+        line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
+    first_profile = measured_profile(f, line, groove, config)
+    half_slice = max(0.0015, 1.5 * pitch, 0.003 * min(1.0, sigma / 0.0008))
+    wide: list[Floats] = []
+    for _ in range(3):
+        whole, corners, profile = _traced(f, line, first_profile, groove, half_slice, config, wide)
+        bends = [c.apex for c in corners if c.wide]
+        if not bends:
+            break
+        # What noise made look like a corner is a bend: the line is followed anew round it.
+        wide += bends
+    corners = [c for c in corners if not c.wide]
+    slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
+    return _finish(f, around, whole, slices, corners, groove, profile, config, start_A)
+
+
+def _traced(
+    f: Floats,
+    line: Line,
+    profile: Profile,
+    groove: CoarseGroove,
+    half_slice: float,
+    config: GrooveConfig,
+    wide: list[Floats],
+) -> tuple[Line, list[Corner], Profile]:
+    """The coarse line moved to the groove, in legs between its corners; these joined, and the common profile."""
+    pitch, sigma = groove.pitch_m, groove.sigma_m
+    lines: list[Line] = [line]
+    corners: list[Corner] = []
+    for step in range(4):
+        lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
+        if groove.closed:
+            # The joint of a ring is measured from one side only: each round it lies elsewhere.
+            lines = [lines[0].rolled()]
+        elif step == 0:
+            lines, corners = split_legs(lines[0], profile, wide)
+        if step > 0:
+            # One cutter made the whole groove: its angle and depth, once known, steady every slice.
+            longest = max(lines, key=lambda one: one.length)
+            slices = cut_slices(f, longest, profile, sigma, pitch, half_slice, [])
+            profile = common_profile(f, longest, slices, profile, sigma, pitch)
+    whole = lines[0]
+    if corners:
+        whole, corners = round_corners(f, lines, corners, profile, sigma, pitch)
+    return whole, corners, profile
+
+
+def _finish(
+    f: Floats,
+    around: Floats,
+    line: Line,
+    slices: Slices,
+    corners: list[Corner],
+    groove: CoarseGroove,
+    profile: Profile,
+    config: GrooveConfig,
+    start_A: npt.ArrayLike | None,
+) -> GrooveSeam:
+    """Ends, gaps, smoothed lines and their sigmas, in the cloud's frame and in the direction of travel."""
+    if len(slices.s) < 5:
+        raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
+    pitch = groove.pitch_m
+    refuse_gap(f, line, slices, profile, config.steepest_wall_rad)
+    first, last, gaps = seen_extent(f, line, profile, slices, groove)
+    gaps = [_unmeasured(gap, slices) for gap in gaps]
+    if groove.closed:
+        first, last = 0.0, line.length
+    ends_seen = (True, True)
+    if not groove.closed:
+        ends_seen = ends_at_edges(around, (first, last), line, profile)
+        # At the edge of a shadow the last section is not to be trusted.
+        first = first if ends_seen[0] else max(first, float(slices.s[1]))
+        last = last if ends_seen[1] else min(last, float(slices.s[-2]))
+    missing = sum(b - a for a, b in gaps)
+    longest = max((b - a for a, b in gaps), default=0.0)
+    gaps = [(a, b) for a, b in gaps if a >= first and b <= last]
+    if longest > config.longest_gap_m or missing > config.most_missing * (last - first):
+        raise GrooveUncertain(
+            f"{1e3 * missing:.0f} of {1e3 * (last - first):.0f} mm of the groove are hidden: clear the view or scan again "
+            "from elsewhere."
+        )
+    at = np.linspace(first, last, max(8, round((last - first) / STATION_M) + 1))
+    for corner in corners:
+        at = np.unique(np.append(at[np.abs(at - corner.s) > 0.0022], corner.s + np.arange(-0.002, 0.0021, 0.00025)))
+    at = at[(at >= first) & (at <= last)]
+    sigma, sigma_z = slices.sigma, slices.sigma_height
+    width = max(config.smoothing_m, 2.0 * slices.half_slice)
+    values = {
+        "centre": (slices.column("centre"), sigma),
+        "root": (slices.column("root"), sigma_z),
+        "angle": (slices.column("angle"), sigma_z),
+        "left": (np.array([x.shoulders[0] - x.centre for x in slices.sections]), sigma),
+        "right": (np.array([x.shoulders[1] - x.centre for x in slices.sections]), sigma),
+        "face_left": (np.array([x.faces[0] for x in slices.sections]), np.ones(len(sigma))),
+        "face_right": (np.array([x.faces[1] for x in slices.sections]), np.ones(len(sigma))),
+    }
+    smooth: dict[str, Floats] = {}
+    errors: dict[str, Floats] = {}
+    for name, (value, spread) in values.items():
+        own = smoothing_weights(slices.s, slices.s, spread, 2.0 * width)
+        off = (value - own @ value) / (spread * np.sqrt(np.maximum(1.0 - np.diag(own), 0.1)))
+        scale = 1.4826 * float(np.median(np.abs(off)))
+        spread = spread * np.maximum(1.0, np.abs(off) / max(4.0 * scale, 1e-12))
+        W = smoothing_weights(at, slices.s, spread, width)
+        smooth[name] = W @ value
+        errors[name] = SIGMA_SCALE * max(1.0, scale) * np.sqrt(np.square(W) @ np.square(spread))
+    for a, b in gaps:
+        hidden = (at > a) & (at < b)
+        bend = max(line.tightest_bend((a, b)), 2.0)
+        # Sections beside a shadow are few: towards its ends a bridge is not much better known than in its middle.
+        lever = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
+        errors["centre"][hidden] += 0.25 * bend * lever
+    # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
+    lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
+    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
+    sigma = np.hypot(errors["centre"], math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
+    sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
+    if not groove.closed:
+        # The last sections have neighbours on one side only, and points of the plate's edge among their own.
+        sigma = np.hypot(sigma, END_PITCHES * pitch * np.exp(-np.minimum(at - first, last - at) / END_REACH_M))
+    for corner in corners:
+        reach = max(corner.blind, corner.radius, CORNER_REACH_M)
+        sigma = np.hypot(sigma, corner.sigma * np.exp(-0.5 * np.square((at - corner.s) / reach)))
+    seen = ~np.any([(at > a) & (at < b) for a, b in gaps], axis=0) if gaps else np.ones(len(at), dtype=bool)
+    for corner in corners:
+        if first < corner.s < last and corner.sigma > config.most_bridge_sigma_m:
+            raise GrooveUncertain(
+                f"The groove's corner may be sharp or round: its line there is only known to {1e3 * corner.sigma:.1f} mm from this "
+                f"scan (noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart): use a finer scanner or move it "
+                "nearer."
+            )
+    if np.sqrt(np.mean(np.square(sigma[seen]))) > config.most_sigma_m:
+        raise GrooveUncertain(
+            f"The groove's root is only known to {1e3 * np.sqrt(np.mean(np.square(sigma[seen]))):.2f} mm from this scan "
+            f"(noise {1e3 * groove.sigma_m:.2f} mm, points {1e3 * pitch:.1f} mm apart) and "
+            f"{1e3 * config.most_sigma_m:.2f} mm are required: use a finer scanner or move it nearer."
+        )
+    if np.max(sigma[~seen], initial=0.0) > config.most_bridge_sigma_m:
+        raise GrooveUncertain(
+            f"{1e3 * longest:.0f} mm of the groove are hidden where it bends, and its way there is only known to "
+            f"{1e3 * np.max(sigma[~seen]):.1f} mm: clear the view or scan again from elsewhere."
+        )
+    base, normal = line.at(at)
+    moved = base + smooth["centre"][:, None] * normal
+    root = np.column_stack([moved, smooth["root"]])
+    left = np.column_stack([moved + smooth["left"][:, None] * normal, smooth["face_left"]])
+    right = np.column_stack([moved + smooth["right"][:, None] * normal, smooth["face_right"]])
+    depth = 0.5 * (smooth["face_left"] + smooth["face_right"]) - smooth["root"]
+    if groove.closed:
+        for one in (root, left, right):
+            _close(one)
+    R, p = groove.X_AQ.rotation().matrix(), groove.X_AQ.translation()
+    lines = [v @ R.T + p for v in (root, left, right)]
+    corners = [c for c in corners if first < c.s < last]
+    corner_s = [c.s - first for c in corners]
+    apexes = np.array([[*c.apex, np.interp(c.s, at, smooth["root"])] for c in corners]).reshape(-1, 3) @ R.T + p
+    target = np.zeros(3) if start_A is None else np.asarray(start_A, dtype=np.float64)
+    what = "the robot" if start_A is None else "the point given"
+    word = f"starts at the end nearest to {what}"
+    per_station = [
+        sigma,
+        np.hypot(errors["root"], math.hypot(0.25 * SIGMA_FLOOR_PITCHES * pitch, HEIGHT_FLOOR_NOISE * groove.sigma_m)),
+        depth,
+        smooth["angle"],
+    ]
+    s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lines[0], axis=0), axis=1))])
+    if groove.closed:
+        k = int(np.argmin(np.linalg.norm(lines[0] - target, axis=1)))
+        order = np.concatenate([np.arange(k, len(at) - 1), np.arange(0, k + 1)])
+        lines = [v[order] for v in lines]
+        per_station = [v[order] for v in per_station]
+        word = f"a closed seam, starts where it is nearest to {what}"
+    elif np.linalg.norm(lines[0][-1] - target) < np.linalg.norm(lines[0][0] - target):
+        lines = [lines[0][::-1], lines[2][::-1], lines[1][::-1]]
+        per_station = [v[::-1] for v in per_station]
+        gaps = [(last - b + first, last - a + first) for a, b in gaps][::-1]
+        corner_s = [float(s[-1]) - c for c in corner_s][::-1]
+        apexes, ends_seen = apexes[::-1], ends_seen[::-1]
+    curve = SeamCurve.from_points(lines[0], up=R[:, 2])
+    return GrooveSeam(
+        curve=curve,
+        root=lines[0],
+        left=lines[1],
+        right=lines[2],
+        s=s,
+        depth=per_station[2],
+        angle=per_station[3],
+        sigma=per_station[0],
+        sigma_height=per_station[1],
+        gaps=tuple((a - first, b - first) for a, b in gaps),
+        corners=tuple(corner_s),
+        apexes=apexes,
+        closed=groove.closed,
+        ends_seen=ends_seen,
+        start=word,
+        X_AF=groove.X_AQ,
+        pitch=pitch,
+        face_sigma=groove.sigma_m,
+        n_sections=len(slices.s),
+    )
+
+
+def _unmeasured(gap: tuple[float, float], slices: Slices) -> tuple[float, float]:
+    """A gap, as wide as there are no sections to both sides of it."""
+    before, after = slices.s[slices.s <= gap[0]], slices.s[slices.s >= gap[1]]
+    low = min(gap[0], float(before[-1]) + slices.half_slice) if len(before) else gap[0]
+    high = max(gap[1], float(after[0]) - slices.half_slice) if len(after) else gap[1]
+    return low, high
+
+
+def _close(line: Floats, over: int = 8) -> None:
+    """Makes the ends of a ring (N,3) meet, in place, the difference spread over the stations beside them."""
+    gap = line[0] - line[-1]
+    share = np.linspace(0.5, 0.0, over)[:, None]
+    line[:over] -= share * gap
+    line[-over:] += share[::-1] * gap
