@@ -24,8 +24,8 @@ from weldcal.calibration.handeye.next_pose import NextPose, next_pose
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.handeye.problem import Problem, full_problem
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
-from weldcal.calibration.handeye.view import view_of
-from weldcal.models.arms.chain import load_chain
+from weldcal.calibration.handeye.view import View, view_of
+from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner
 
@@ -45,7 +45,8 @@ class MethodRow:
 
 @dataclass(frozen=True)
 class HandEyeReport:
-    """A finished calibration: the result, how it compares, which pose to add, where the files are."""
+    """A finished calibration: the result, how it compares, which pose to add (``advice`` says it), where the files are;
+    ``corners``: what corners and robot errors added, in sentences."""
 
     result: HandEyeResult
     mounting: Mounting
@@ -54,6 +55,7 @@ class HandEyeReport:
     files: tuple[Path, ...]
     seconds: float
     corners: str = ""
+    advice: str = ""
 
     def summary(self) -> dict[str, object]:
         """The JSON object of the command."""
@@ -72,7 +74,7 @@ class HandEyeReport:
             "condition": r.condition,
             "method": r.method,
             "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
-            "next_pose": None if self.next_pose is None else self.next_pose.sentence(),
+            "next_pose": self.advice or None,
             "corners": self.corners or None,
             "seconds": self.seconds,
         }
@@ -113,8 +115,8 @@ class HandEyeReport:
                 lines += [
                     f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
                 ]
-        if self.next_pose is not None:
-            lines += ["", f"next pose    {self.next_pose.sentence()}"]
+        if self.advice:
+            lines += ["", f"next pose    {self.advice}"]
         return "\n".join(lines)
 
 
@@ -184,14 +186,20 @@ def run_hand_eye(
         result = _only_camera(result)
     # with corners or robot errors applied the poses are others, so that a comparison would be of two data
     comparison = () if motions or adopted else _compare(problem, result)
-    advice = None
+    advice, told = None, ""
     if not motions and equation != "ax-xb":
         view = view_of(problem.G, pairs.K if pairs.has_corners else None, scanner)
         advice = next_pose(problem, result, found, (IDENTITY,) * 3, arm=arm, view=view)
+        told = advice.sentence() if advice is not None else _no_advice(view, arm)
     provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
-    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said))
+    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), told)
+
+
+def _no_advice(view: View, arm: Chain | None) -> str:
+    reach = "" if arm is None else f" and within reach of {arm.name}"
+    return f"None of the poses like those so far is visible{reach} (seen within {view.source}): move where more can be seen."
 
 
 def _file(path: Path) -> Path:

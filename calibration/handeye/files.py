@@ -246,6 +246,9 @@ def _document(path: Path) -> dict[str, Any]:
     if not isinstance(samples, list) or not samples:
         raise DatasetError(f"'{path.name}' holds no list of samples.")
     first = samples[0]
+    if isinstance(first, list) and len(first) == 2:  # MoveIt's own test data: pairs without names
+        samples = [{"robot": s[0], "camera": s[1]} if isinstance(s, list) and len(s) == 2 else s for s in samples]
+        first = samples[0]
     if isinstance(first, dict) and "effector_wrt_world" in first:  # MoveIt: 16 numbers, row by row
         robot, camera = "effector_wrt_world", "object_wrt_sensor"
     elif isinstance(first, dict) and "robot" in first and "tracking" in first:  # easy_handeye2

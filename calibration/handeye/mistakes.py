@@ -29,7 +29,7 @@ _ROUGH_STEPS = 6
 _CHANCE = 1e-4  # at which few poses may agree that much better by luck
 _ONE_AXIS = 0.1  # share of the turns off the main axis below which no closed form is to be trusted
 _FEWEST = 5
-_AGREE = 0.05  # rad, or share of the extent: residuals of poses that agree
+_AGREE = 0.05  # rad, or share of the lesser spread: residuals of poses that agree
 _STEP = 1e-4  # of the scale, for its derivative
 _SURE = 6.0  # standard deviations at which a scale is off
 _LEAST_SCALE = 3e-3  # and by how much it must be, to be worth a sentence
@@ -63,7 +63,11 @@ def likely_mistake(pairs: PosePairs, given: HandEyeResult | None, config: HandEy
             result = solve_problem(full_problem(trial.F, trial.G), config=quick)
         except WeldcalError:
             continue
-        if _agrees(result) and (given is None or _far_better(result, given)):
+        shift = result.sigma_translation / _size(trial.F, trial.G)
+        agrees = result.sigma_rotation_rad < _AGREE and shift < _AGREE
+        if agrees and (
+            given is None or _far_better(result, shift, given, given.sigma_translation / _size(pairs.F, pairs.G))
+        ):
             return f"These poses contradict each other as given, but agree if {trial.sentence}: correct the file and run again."
     return None
 
@@ -130,7 +134,7 @@ def _trials(pairs: PosePairs) -> Iterator[_Trial]:
 
 def _rough(F: Array, G: Array) -> tuple[float, float]:
     """Medians of the residuals after a few steps from a closed form (where the robot turns about one axis only: from turns of
-    the cube): rad, and share of the extent."""
+    the cube): rad, and share of the lesser spread."""
     problem = full_problem(F, G)
     state = (IDENTITY, IDENTITY, IDENTITY)
     a, b, _ = diversity(problem).turn_spread_deg
@@ -142,8 +146,17 @@ def _rough(F: Array, G: Array) -> tuple[float, float]:
     w, d = residuals(problem, state)
     return (
         float(np.median(np.linalg.norm(w, axis=1))),
-        float(np.median(np.linalg.norm(d, axis=1))) / problem.extent,
+        float(np.median(np.linalg.norm(d, axis=1))) / _size(F, G),
     )
+
+
+def _size(F: Array, G: Array) -> float:
+    """The smaller of the spreads of robot and camera, however each is stated: scaling one of them away is no agreement."""
+
+    def spread(X: Array) -> float:
+        return max(float(np.sqrt(p.var(axis=0).sum())) for p in (X[:, :3, 3], inverse(X)[:, :3, 3]))
+
+    return max(min(spread(F), spread(G)), 1e-12)
 
 
 def _scale(F: Array, G: Array) -> float | None:
@@ -159,14 +172,10 @@ def _scale(F: Array, G: Array) -> float | None:
     return float(x[6]) if np.isfinite(x[6]) and float(x[6]) > 1e-6 else None
 
 
-def _agrees(result: HandEyeResult) -> bool:
-    return result.sigma_translation < _AGREE * result.extent and result.sigma_rotation_rad < _AGREE
-
-
-def _far_better(new: HandEyeResult, given: HandEyeResult) -> bool:
+def _far_better(new: HandEyeResult, new_shift: float, given: HandEyeResult, given_shift: float) -> bool:
     """Neither kind of residuals much worse, and their product smaller by far more than chance."""
     turn = given.sigma_rotation_rad / max(new.sigma_rotation_rad, 1e-12)
-    shift = (given.sigma_translation / given.extent) / max(new.sigma_translation / new.extent, 1e-12)
+    shift = given_shift / max(new_shift, 1e-12)
     lucky = float(np.sqrt(fisher.ppf(1.0 - _CHANCE, given.degrees_of_freedom, new.degrees_of_freedom)))
     return min(turn, shift) > _HARDLY_WORSE and turn * shift > max(_FAR_BETTER, lucky)
 
