@@ -34,7 +34,9 @@ CAUCHY = (
 EFFICIENCY = 0.95
 OUTLIER = 4.5  # in sigmas of a point: one of 25 000 good points lies beyond
 SINGULAR = 1e-4  # least over largest singular value of the Jacobian with columns of unit length
-INCONSISTENT_CHI2 = 9.0
+RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
+APART_RAD = np.radians(1.0)
+OPEN_RAD = np.radians(5.0)
 CONSISTENT_SHARE = 0.7
 ITERATIONS = 60
 NEAR, SETTLED = 1e-2, 1e-7  # in sigmas of the unknowns: steps that end the descent, and the settling after it
@@ -86,8 +88,27 @@ def edge_joint(
     some = np.unique(np.linspace(0, len(poses) - 1, STARTING_POSES).round().astype(int))
     starts = [init] if init is not None else edge_starts(poses[some], p[some])
     fits = [_fitted(start, poses, p, sigma_robot_m, sigmas) for start in starts]
-    state, _ = min(fits, key=lambda fit: fit[1])
-    return _estimate(state, poses, p, sigma_robot_m, sigmas)
+    state, cost = min(fits, key=lambda fit: fit[1])
+    estimate = _estimate(state, poses, p, sigma_robot_m, sigmas)
+    _refuse_rivals(estimate, [other for other, its in fits if CAUCHY**2 * (its - cost) < RIVAL**2])
+    return estimate
+
+
+def _refuse_rivals(estimate: EdgeEstimate, others: list[EdgeState]) -> None:
+    """Another mounting that explains the points as well is not to be told from the best by its covariance, which is local."""
+    sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+    for other in others:
+        cosine = 0.5 * (np.trace(estimate.rotation.T @ other.rotation) - 1.0)
+        angle = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        if angle > max(APART_RAD, 5.0 * sigma):
+            raise DegenerateMotion(
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these points alike: tilt the flange "
+                "more, about two axes, and let the edge cross the laser line at different places."
+            )
+    if sigma > OPEN_RAD:
+        raise DegenerateMotion(
+            f"These motions leave the rotation uncertain by {np.degrees(sigma):.0f} deg: turn the flange further, about two axes."
+        )
 
 
 def _system(
@@ -189,7 +210,10 @@ def _estimate(state: EdgeState, poses: FlangePoses, p: Floats, sigma_robot_m: fl
     kept = max(int(inliers.sum()), 1)
     chi2_all = float(np.median(_square(r)) / (2.0 * np.log(2.0)))  # the median of chi-square with 2 degrees is 2 ln 2
     if kept < MINIMUM_POSES or (kept < CONSISTENT_SHARE * len(poses) and chi2_all > 1.0):
-        text = f"Only {kept} of {len(poses)} points lie on one edge: scan one edge only, and state the sigmas of robot and scanner."
+        text = (
+            f"Only {kept} of {len(poses)} points lie on one edge: scan one edge only, state the sigmas of robot and scanner, "
+            "and check unit and convention of the poses."
+        )
         raise InconsistentData(text)
     Ji = J[inliers].reshape(-1, 10)
     scale = np.linalg.norm(Ji, axis=0)

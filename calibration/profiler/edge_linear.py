@@ -24,6 +24,7 @@ from weldcal.models.errors import InputError
 
 MINIMUM_GROUPS = 3
 MINIMUM_TRANSLATIONS = 3
+SMALL_M = 1e-3  # rms of a group's translations across their main direction: below, they are hardly more than noise
 PLANAR = 0.05  # second over first singular value of a group's translations: below, they lie on a line
 ONE_AXIS = 0.05  # of the axes between the orientations
 
@@ -79,10 +80,10 @@ def _refuse_degenerate(poses: FlangePoses, groups: list[np.ndarray]) -> None:
     flat = 0
     for g in groups:
         s = np.linalg.svd(poses.translation[g] - poses.translation[g].mean(axis=0), compute_uv=False)
-        flat += bool(s[1] < PLANAR * s[0])
+        flat += bool(s[1] < max(PLANAR * s[0], SMALL_M * np.sqrt(len(g))))
     if len(groups) - flat < MINIMUM_GROUPS:
         raise DegenerateMotion(
-            "The positions of the flange lie on a line in (nearly) every orientation: move along an arc or in a plane."
+            "The positions of the flange lie on a line, or within a millimetre, in (nearly) every orientation: move along an arc or in a plane."
         )
     if rotation_axes_spread(poses.rotation[[g[0] for g in groups]]) < ONE_AXIS:
         raise DegenerateMotion(

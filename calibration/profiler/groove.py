@@ -1,4 +1,8 @@
-"""The three features of a V-groove in a raw profile: both upper edges and the root, as intersections of four robust lines."""
+"""The three features of a V-groove in a raw profile: both upper edges and the root, as intersections of four robust lines.
+
+Where the seam turns under the laser line its walls are curved in the profile: a bend that the samples show is followed, and one
+that they may hide is in the sigmas.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,8 @@ MINIMUM_DEPTH_M = 1e-3
 MINIMUM_SAMPLES = 6  # of each of the four lines
 ROUNDS = 8
 TUKEY = 4.0
+BENT = 2.5  # sigmas of its bend from which a wall is taken for curved, as beside a seam that turns
+MEETINGS = 12
 MARGIN_M = 0.5e-3  # beside an intersection nothing is taken for either line
 
 
@@ -72,13 +78,32 @@ def groove_features(profile: ArrayLike) -> GrooveFeatures:
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """z = a + b (x - x0), the covariance (2, 2) of [a, b] and the sigma of a sample in z."""
+    """z, a polynomial of u = (x - x0) / reach: its coefficients (k,) and their covariance, and the sigma of a sample across it.
+
+    Straight where the samples show no bend; `unseen` are then the squares (m) that coefficients of higher powers may still have,
+    each with what of its power (m, 4) the polynomial leaves.
+    """
 
     x0: float
-    a: float
-    b: float
+    reach: float
+    coefficients: Floats
     covariance: Floats
+    unseen: Floats
+    left: Floats
     sigma: float
+
+    def at(self, x: float) -> tuple[float, float, float]:
+        """Height, slope and variance of the height at x."""
+        powers = ((x - self.x0) / self.reach) ** np.arange(4)
+        k = len(self.coefficients)
+        slope = self.coefficients[1:] * np.arange(1, k) @ powers[: k - 1] / self.reach
+        variance = powers[:k] @ self.covariance @ powers[:k] + self.unseen @ (self.left @ powers) ** 2
+        return float(self.coefficients @ powers[:k]), float(slope), float(variance)
+
+    @property
+    def slope(self) -> float:
+        """In the middle."""
+        return float(self.coefficients[1] / self.reach)
 
 
 def _start(x: Floats, z: Floats) -> Floats:
@@ -123,10 +148,27 @@ def _line(x: Floats, z: Floats) -> _Line:
         sigma = max(1.4826 * float(np.median(np.abs(r))), 1e-7)
         weight = np.clip(1.0 - (r / (TUKEY * sigma)) ** 2, 0.0, None) ** 2
         a, b = _orthogonal(x - x0, z, weight)
-    A = np.column_stack([np.ones(len(x)), x - x0]) * np.sqrt(weight)[:, None]
     # of Tukey's estimate at 4 sigma, which uses nine tenths of what the samples say
-    in_z = sigma * np.hypot(1.0, b)
-    return _Line(x0, a, b, np.asarray(np.linalg.inv(A.T @ A) * in_z**2 * (weight**2).mean() / weight.mean()), sigma)
+    spread = sigma**2 * (1.0 + b * b) * float((weight**2).mean() / weight.mean())
+    reach = float(np.ptp(x)) / 2.0
+    root = np.sqrt(weight)[:, None]
+    powers = root * ((x - x0) / reach)[:, None] ** np.arange(4)
+    rest = root[:, 0] * (z - a - b * (x - x0))
+    straight = np.array([a, b * reach, 0.0, 0.0])
+    unseen: list[float] = []
+    left: list[Floats] = []
+    for k in (4, 3, 2):
+        C = np.asarray(np.linalg.inv(powers[:, :k].T @ powers[:, :k]) * spread, float)
+        change = np.linalg.lstsq(powers[:, :k], rest, rcond=None)[0]
+        bend = float(change[-1] ** 2)
+        if k > 2 and bend > BENT**2 * C[-1, -1]:
+            coefficients = straight[:k] + change
+            return _Line(x0, reach, coefficients, C, np.array(unseen), np.array(left).reshape(-1, 4), sigma)
+        if k > 2:
+            unseen.append(max(bend - float(C[-1, -1]), 0.0))
+            lower = np.linalg.lstsq(powers[:, : k - 1], powers[:, k - 1], rcond=None)[0]
+            left.append(np.concatenate([-lower, [1.0], np.zeros(4 - k)]))
+    return _Line(x0, reach, straight[:2], C, np.array(unseen), np.array(left), sigma)
 
 
 def _orthogonal(u: Floats, z: Floats, weight: Floats) -> tuple[float, float]:
@@ -140,21 +182,27 @@ def _orthogonal(u: Floats, z: Floats, weight: Floats) -> tuple[float, float]:
 
 
 def _meet(one: _Line, two: _Line) -> float:
-    return float(((one.a - one.b * one.x0) - (two.a - two.b * two.x0)) / (two.b - one.b))
+    x = 0.5 * (one.x0 + two.x0)
+    for _ in range(MEETINGS):
+        (z1, b1, _), (z2, b2, _) = one.at(x), two.at(x)
+        step = (z1 - z2) / (b2 - b1) if b1 != b2 else np.nan
+        x += step
+        if not abs(step) > 1e-9:
+            break
+    return float(x)
 
 
 def _crossing(one: _Line, two: _Line) -> tuple[Floats, Floats]:
     """The intersection (2,) and its sigma (2,), by the covariances of both lines."""
     x = _meet(one, two)
-    z = one.a + one.b * (x - one.x0)
-    g1, g2 = np.array([1.0, x - one.x0]), np.array([1.0, x - two.x0])
-    v1, v2 = float(g1 @ one.covariance @ g1), float(g2 @ two.covariance @ g2)
-    lean = two.b - one.b
+    (z, b1, v1), (_, b2, v2) = one.at(x), two.at(x)
+    lean = b2 - b1
     return np.array([x, z]), np.array(
-        [np.sqrt(v1 + v2) / abs(lean), np.hypot(two.b * np.sqrt(v1), one.b * np.sqrt(v2)) / abs(lean)]
+        [np.sqrt(v1 + v2) / abs(lean), np.hypot(b2 * np.sqrt(v1), b1 * np.sqrt(v2)) / abs(lean)]
     )
 
 
 def _is_groove(lines: list[_Line]) -> bool:
-    plate = 0.5 * (lines[0].b + lines[3].b)
-    return lines[1].b > plate + 0.2 and lines[2].b < plate - 0.2 and abs(lines[0].b - lines[3].b) < 0.5
+    first, down, up, last = (line.slope for line in lines)
+    plate = 0.5 * (first + last)
+    return down > plate + 0.2 and up < plate - 0.2 and abs(first - last) < 0.5

@@ -43,6 +43,8 @@ class FlangePoses:
             raise InputError(
                 f"Flange poses need rotations (n, 3, 3) and translations (n, 3), not {R.shape} and {p.shape}."
             )
+        if not len(R):
+            raise InputError("There is no flange pose: take scans in several.")
         if not (np.isfinite(R).all() and np.isfinite(p).all()):
             raise InputError("A flange pose holds a number that is not finite: leave that sample out.")
         off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).reshape(len(R), -1).max(axis=1, initial=0.0)

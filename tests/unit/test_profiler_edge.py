@@ -137,6 +137,36 @@ def test_a_motion_that_leaves_something_open_is_refused_by_name(kept: str, names
         solved(Views(R, v.translation, points + rng.standard_normal(points.shape) * SIGMA_XZ))
 
 
+@pytest.mark.parametrize("kind", ["five poses repeated", "turns of half a degree", "one place of the laser line"])
+def test_where_another_mounting_explains_the_points_as_well_it_says_so(kind: str) -> None:
+    rng = np.random.default_rng(16)
+    v = views(40, rng, turn_deg=0.5 if kind.startswith("turns") else 35.0)
+    R, t = v.rotation, v.translation
+    if kind.startswith("five"):
+        R, t = np.repeat(R[:5], 8, axis=0), np.repeat(t[:5], 8, axis=0)
+    if kind.startswith("one"):
+        at = TRUTH.point + rng.uniform(-0.05, 0.05, (40, 1)) * TRUTH.direction
+        t = at - R @ (TRUTH.rotation @ [0.0, 0.0, 0.075] + TRUTH.translation)
+    points = predicted(TRUTH, FlangePoses(R, t))[0]
+    points = points + rng.standard_normal(points.shape) * SIGMA_XZ
+    with pytest.raises(DegenerateMotion, match=r"deg apart, explain these points alike|leave the"):
+        solved(Views(R, t + SIGMA_ROBOT * rng.standard_normal(t.shape), points))
+    with pytest.raises((DegenerateMotion, TooFewTranslations)):
+        edge_linear(R, t, points)
+
+
+def test_it_finds_a_profiler_mounted_anyhow() -> None:
+    rng = np.random.default_rng(17)
+    for k in range(8):
+        turn = Rotation.random(random_state=k).as_matrix()
+        v = views(15, rng)
+        # the flange turned by any rotation: the same scans of a profiler that is mounted otherwise
+        truth = EdgeState(turn @ TRUTH.rotation, turn @ TRUTH.translation, TRUTH.point, TRUTH.direction)
+        e = solved(Views(v.rotation @ turn.T, v.translation, v.points))
+        error = off(e.rotation, e.translation, truth)
+        assert error @ np.linalg.solve(e.covariance, error) < 27.9  # 1 in 10 000 of chi-square with 6 degrees
+
+
 def test_points_of_two_edges_are_not_taken_for_one() -> None:
     rng = np.random.default_rng(6)
     v = views(40, rng)
