@@ -52,15 +52,12 @@ def sampling_advice(
             "constant error of the flange centre or of the tool's offset cannot be seen."
         )
     sigma = sigma_at(estimate, middle)
-    reach = spread[2][: len(width)] * width[:, None]
-    corners = middle + 1.5 * np.vstack([reach, -reach])
-    errors = np.array([sigma_at(estimate, c) for c in corners])
-    worst = int(np.argmax(errors))
-    if errors[worst] > _WEAK_FACTOR * sigma:
-        x, y, z = 1e3 * corners[worst]
+    weak = weakest_place(estimate, p)
+    if sigma_at(estimate, weak) > _WEAK_FACTOR * sigma:
+        x, y, z = 1e3 * weak
         out.append(
             f"The next pose tells most near ({x:.0f}, {y:.0f}, {z:.0f}) mm of the base: a scanned point is known to "
-            f"{1e3 * errors[worst]:.2f} mm there and to {1e3 * sigma:.2f} mm in the middle."
+            f"{1e3 * sigma_at(estimate, weak):.2f} mm there and to {1e3 * sigma:.2f} mm in the middle."
         )
     n = len(used)
     gain = 1.0 - np.sqrt(n / (n + 1.0))
@@ -77,6 +74,17 @@ def sampling_advice(
             f"Add poses up to {want} or more: each still improves {1e3 * sigma:.2f} mm by {100 * gain:.0f} % or more."
         )
     return tuple(out)
+
+
+def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
+    """Of the ends of the axes along which poses (n, 3) m spread, half as far again, the one (3,) where a scanned point is known
+    worst."""
+    middle = p_B.mean(axis=0)
+    spread = np.linalg.svd(p_B - middle, full_matrices=False)
+    reach = spread[2] * (spread[1] / np.sqrt(len(p_B)))[:, None]
+    corners = middle + 1.5 * np.vstack([reach, -reach])
+    errors = [sigma_at(estimate, c) for c in corners]
+    return np.asarray(corners[int(np.argmax(errors))])
 
 
 def sigma_at(estimate: CalibrationEstimate, p_BQ: Array) -> float:

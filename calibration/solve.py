@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.special import gammaincinv
+from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
@@ -21,6 +24,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five
+_WIDEST_GATE = 10.0  # so many times wider at most, where three spare numbers or fewer set the scale
 _HUBER = 2.0
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
@@ -234,9 +238,12 @@ def _reweighted(data: _Data, start: RigidTransform, usual: float = 0.0) -> tuple
     return solution, keep
 
 
+@cache
 def _loose(redundancy: int) -> float:
-    """How much wider a gate must be whose scale was found from few spare numbers: it may be far too small by chance."""
-    return 1.0 + 4.0 / max(redundancy, 1)
+    """How much wider a gate must be whose scale was found from few spare numbers: it may be far too small by chance. The ratio of
+    the quantiles of F (3, redundancy) and chi-square (3) that one good pose in ten thousand exceeds."""
+    wide = 3.0 * f_distribution.isf(1e-4, 3, max(redundancy, 1)) / chi2.isf(1e-4, 3)
+    return float(min(np.sqrt(wide), _WIDEST_GATE))
 
 
 def _gate(data: _Data, X: RigidTransform, var_p: float) -> Flags:

@@ -13,12 +13,16 @@ ISO_50 = "iso9409-1-50-4-m6"
 CLOSED_FORM, NUMERIC = "closed form", "numeric"
 """How joint angles are found: every solution (arms.inverse), or one by iteration (arms.chain)."""
 
+CATALOGUE = ("flange", "payload", "reach", "repeatability", "joint limits")
+"""What a maker's data sheet says of a robot, beside its kinematics."""
+
 
 @dataclass(frozen=True)
 class Robot:
     """One robot. ``flange`` is its ISO 9409-1 designation, the dowel at ``pin_angle_rad``; payload kg, reach m (the maker's
     working radius), repeatability m; ``inverse`` says how its joint angles are found; ``source`` where the numbers are from.
-    Joint limits and kinematics are the arm's own files (`chain`)."""
+    Joint limits and kinematics are the arm's own files (`chain`). ``confirmed`` holds which of CATALOGUE a public source bears out,
+    and that source; what is not there is written from memory of the maker's data sheet."""
 
     name: str
     title: str
@@ -30,6 +34,13 @@ class Robot:
     repeatability_m: float
     inverse: str
     source: str
+    confirmed: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def unconfirmed(self) -> tuple[str, ...]:
+        """The entries of CATALOGUE that no public source was found for."""
+        found = {what for what, _ in self.confirmed}
+        return tuple(what for what in CATALOGUE if what not in found)
 
     @property
     def standard(self) -> FlangeStandard:
@@ -47,8 +58,41 @@ _UR_CB3 = "user manual, CB3, technical specifications; kinematics: Universal Rob
 _RIGHT_ANGLE = math.pi / 2
 
 
+_SCANS = "pattern of holes and dowel in the recorded scans and their CAD"
+_DESCRIPTION = "ur_description (URDF of ROS-Industrial)"
+CONFIRMED: dict[str, tuple[tuple[str, str], ...]] = {
+    "ur5": (
+        ("flange", _SCANS),
+        ("payload", "user manual UR5/CB3 3.4.5, appendix A: 5 kg"),
+        ("joint limits", _DESCRIPTION),
+    ),
+    "ur5e": (("payload", "hardware manual UR5e 2022, chapter 9: 5 kg"), ("joint limits", _DESCRIPTION)),
+    "ur10e": (
+        ("flange", _SCANS),
+        ("payload", "online manual UR10e, software 10.6, Maximum Payload: 10 or 12.5 kg, by the label on the arm"),
+        ("reach", "the same page: work space of 1300 mm"),
+    ),
+    "franka_panda": (
+        ("flange", _SCANS),
+        ("payload", "Elsner 2023, after the maker: 3 kg"),
+        ("reach", "Elsner 2023: 0.855 m"),
+        ("repeatability", "Elsner 2023: 0.1 mm"),
+        ("joint limits", "FCI documentation, control parameters; the same in Elsner 2023"),
+    ),
+    "franka_fr3": (("joint limits", "franka_rust 0.1.14 on docs.rs, FrankaFR3"),),
+    "aubo_i5": (
+        ("flange", _SCANS),
+        ("payload", "AUBO's aubo_description: the number in the name is the load in kg"),
+        ("reach", "sum of the published a2, a3 and d5: 0.408 + 0.376 + 0.1025 m"),
+        ("joint limits", "AUBO's aubo_description: 175 degrees either way"),
+    ),
+}
+"""By robot: what of CATALOGUE could be looked up, and where."""
+
+
 def _ur(name: str, title: str, payload: float, reach: float, repeatability: float, source: str) -> Robot:
-    return Robot(name, title, 6, ISO_50, _RIGHT_ANGLE, payload, reach, repeatability, CLOSED_FORM, source)
+    known = CONFIRMED.get(name, ())
+    return Robot(name, title, 6, ISO_50, _RIGHT_ANGLE, payload, reach, repeatability, CLOSED_FORM, source, known)
 
 
 ROBOTS: dict[str, Robot] = {
@@ -63,14 +107,17 @@ ROBOTS: dict[str, Robot] = {
         Robot(
             "franka_panda", "Franka Emika Panda", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
             "Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the recorded scans' CAD",
+            CONFIRMED["franka_panda"],
         ),
         Robot(
             "franka_fr3", "Franka Research 3", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
             "Franka Research 3 data sheet; limits and kinematics: franka_description; dowel as on the Panda",
+            CONFIRMED["franka_fr3"],
         ),
         Robot(
             "aubo_i5", "AUBO i5", 6, ISO_50, _RIGHT_ANGLE, 5.0, 0.8865, 5e-5, NUMERIC,
             "AUBO i5 user manual (not confirmed by a second source); kinematics: AUBO's aubo_i5.urdf",
+            CONFIRMED["aubo_i5"],
         ),
     )
 }  # fmt: skip

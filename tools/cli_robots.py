@@ -57,6 +57,8 @@ def _row(robot: object) -> dict[str, object]:
         ],
         "inverse_kinematics": robot.inverse,
         "source": robot.source,
+        "confirmed": dict(robot.confirmed),
+        "unconfirmed": list(robot.unconfirmed),
     }
 
 
@@ -70,10 +72,20 @@ def _print_all(rows: list[dict[str, object]]) -> None:
     for r in rows:
         joints = r["joints"]
         assert isinstance(joints, list)
-        cells = (r["name"], r["flange"], f"{r['dowel_deg']:.0f}", f"{r['payload_kg']:g}", f"{r['reach_m']:g}")
-        table.add_row(*map(str, cells), f"{r['repeatability_mm']:g}", str(len(joints)), str(r["inverse_kinematics"]))
+        open_ = r["unconfirmed"]
+        assert isinstance(open_, list)
+        doubt = {what: "?" if what in open_ else "" for what in ("flange", "payload", "reach", "repeatability")}
+        cells = (
+            *(r["name"], f"{r['flange']}{doubt['flange']}", f"{r['dowel_deg']:.0f}"),
+            *(f"{r['payload_kg']:g}{doubt['payload']}", f"{r['reach_m']:g}{doubt['reach']}"),
+            *(f"{r['repeatability_mm']:g}{doubt['repeatability']}", str(len(joints)), r["inverse_kinematics"]),
+        )
+        table.add_row(*map(str, cells))
     console = Console()
     console.print(table)
+    console.print(
+        "? unconfirmed: as the maker's data sheet is remembered, no public source was found.", highlight=False
+    )
     console.print("weldcal robots NAME shows one, joint by joint, with its sources.", highlight=False)
 
 
@@ -88,6 +100,11 @@ def _print_one(row: dict[str, object]) -> None:
         "inverse kinematics": str(row["inverse_kinematics"]),
         "source": str(row["source"]),
     }
+    confirmed, unconfirmed = row["confirmed"], row["unconfirmed"]
+    assert isinstance(confirmed, dict)
+    assert isinstance(unconfirmed, list)
+    rows |= {f"{what}, confirmed by": str(where) for what, where in confirmed.items()}
+    rows["unconfirmed"] = ", ".join(unconfirmed)
     for joint in joints:
         rows[joint["name"]] = (
             f"{joint['lower_deg']:.1f} to {joint['upper_deg']:.1f} degrees, {joint['speed_deg_s']:.0f} degrees/s"

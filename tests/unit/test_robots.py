@@ -15,7 +15,7 @@ from weldcal.models.arms.chain import chain_forward, chain_inverse, chain_jacobi
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.models.robots import CLOSED_FORM, ROBOTS, get_robot
+from weldcal.models.robots import CATALOGUE, CLOSED_FORM, ROBOTS, get_robot
 from weldcal.models.scanners import SCANNERS
 
 Array = NDArray[np.float64]
@@ -181,3 +181,17 @@ def test_the_command_lists_them() -> None:
     one = CliRunner().invoke(app, ["robots", "fr3"])
     assert "fr3_joint7" in one.stdout
     assert CliRunner().invoke(app, ["robots", "ur99"]).exit_code == 1
+
+
+def test_what_could_not_be_looked_up_is_called_unconfirmed() -> None:
+    from weldcal.tools.cli import app
+
+    shown = CliRunner().invoke(app, ["robots", "ur3e"])
+    assert shown.exit_code == 0
+    assert "unconfirmed" in shown.output
+    assert "flange, payload, reach, repeatability, joint limits" in shown.output
+    lines = {line.split(" ")[0]: line for line in CliRunner().invoke(app, ["robots"]).output.splitlines()}
+    assert lines["ur3e"].count("?") == 4
+    assert lines["ur10e"].count("?") == 1  # its repeatability
+    for robot in ROBOTS.values():
+        assert {what for what, _ in robot.confirmed} | set(robot.unconfirmed) == set(CATALOGUE)

@@ -13,6 +13,7 @@ from weldcal.calibration.result import export_ros2, export_ur_pose
 from weldcal.calibration.rigid import rotation_vector
 from weldcal.calibration.solve import point_error_covariance
 from weldcal.tools.report.pictures import OURS, error_bars, error_field, svg
+from weldcal.tools.report.plots_advice import knowledge_map
 from weldcal.tools.report.render import fixed, render
 
 if TYPE_CHECKING:
@@ -64,6 +65,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         field=_residual_field(report),
         seconds=report.seconds,
         advice=report.advice,
+        knowledge=_knowledge(report),
     )
 
 
@@ -73,6 +75,11 @@ def _axis_turn(turn: tuple[float, float] | None) -> list[tuple[str, str]]:
     return [
         ("holes turned about the flange's axis", f"{turn[0]:.2f} deg (spread {turn[1]:.2f}); --axis-turn next time")
     ]
+
+
+def _knowledge(report: CalibrationReport) -> bytes | None:
+    p = np.array([o.p_BR for o, keep in zip(report.observations, report.estimate.inliers, strict=True) if keep])
+    return None if len(p) < 2 else knowledge_map(report.estimate, p)
 
 
 def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
