@@ -7,7 +7,7 @@ import csv
 import io
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from weldcal.calibration.advice import sampling_advice
 from weldcal.calibration.dataset import Dataset, load_dataset
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.holes import HolePattern
 from weldcal.calibration.observability import turn_deg
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.result import (
@@ -52,6 +53,7 @@ from weldcal.calibration.verification import (
 )
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.tools.report.features import feature_residuals
 from weldcal.tools.report.plots_calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
 
@@ -108,6 +110,7 @@ class CalibrationReport:
     seconds: float
     out: Path
     advice: tuple[str, ...] = ()
+    patterns: dict[str, HolePattern] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `--json` (keys of the design's "calibrate" line, and Algorithm 1's figure beside them)."""
@@ -128,6 +131,7 @@ class CalibrationReport:
             "seconds": self.seconds,
             "k_fold_mm": self.k_fold_mm,
             "advice": list(self.advice),
+            "features": feature_residuals(self.fits, self.patterns),
             "algorithm1": None
             if a is None
             else {
@@ -240,6 +244,7 @@ def calibrate_dataset(
         time.monotonic() - started,
         Path(out),
         sampling_advice(estimate, corrected),
+        seen.patterns,
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)
