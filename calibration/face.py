@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 _CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
 _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so
 _WIDEST = 1.5  # connected parts much wider than a flange are tables and plates
-_ALONE = 0.5  # of the outer edge; less of it counts only beside as much of the bore
+_ALONE = 0.5  # of the outer edge; less of it counts only beside a part of the bore
+_BORE_SEEN = 0.25
 _FILLED = 0.4  # share of the bore's core that must not be face
 _HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it
 _FULL = 0.85  # and must be where the bore's edge itself was not found
@@ -30,7 +31,7 @@ _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulat
 @dataclass(frozen=True)
 class FlangeFitConfig:
     """What counts as a flange. Lengths in m; the defaults suit structured-light scanners and admit time-of-
-    flight ones. Below half of the outer edge, ``min_coverage`` of it is enough only beside as much of a concentric bore."""
+    flight ones. Below half of the outer edge, ``min_coverage`` of it is enough only beside a quarter of a concentric bore."""
 
     seed: int = 0
     hypothesis_tolerance_m: float = 0.0008
@@ -310,7 +311,7 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
             6,
             f"Only {100 * m.coverage:.0f} % of the flange's edge was seen; {100 * config.min_coverage:.0f} % are needed.",
         )
-    elif m.coverage < _ALONE and (m.bore is None or m.bore_coverage < config.min_coverage):
+    elif m.coverage < _ALONE and (m.bore is None or m.bore_coverage < _BORE_SEEN):
         refusal.note(
             6,
             f"Only {100 * m.coverage:.0f} % of the flange's edge was seen, and too little of its bore; {100 * _ALONE:.0f} % "

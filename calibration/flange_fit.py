@@ -43,7 +43,8 @@ class FlangeFit:
     ``center_C`` (3,) centre of the concentric edges in the face plane; ``normal_C`` (3,) outward, towards the scanner;
     ``center_covariance`` (3, 3) m^2 and ``normal_sigma`` rad (per axis) cover the noise of this scan, not the scanner's
     systematic error; ``outer_radius_m`` and ``bore_radius_m`` are the edges of the flat face (None where not seen);
-    ``coverage`` is the share 0..1 of the outer edge that was seen.
+    ``coverage`` is the share 0..1 of the outer edge that was seen. ``plane_rms_m``, ``outer_rms_m`` and ``bore_rms_m`` are
+    the residuals of each feature, ``rim_rms_m`` of both edges together.
     """
 
     center_C: Array
@@ -57,6 +58,8 @@ class FlangeFit:
     n_points: int
     n_rim: int
     coverage: float
+    outer_rms_m: float = float("nan")
+    bore_rms_m: float | None = None
 
 
 def fit_flange(
@@ -222,4 +225,6 @@ def _result(face: Face) -> FlangeFit:
         n_points=face.n_points,
         n_rim=n_rim,
         coverage=face.coverage,
+        outer_rms_m=face.outer.rms,
+        bore_rms_m=None if face.bore is None else face.bore.rms,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -74,6 +75,19 @@ def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, no
     rms = float(np.sqrt((d * d * inside).sum() / max(count, 1)))
     normal_sigma = rms / np.sqrt(max(count - 3, 1)) * float(np.sqrt(0.5 / values[1] + 0.5 / values[2]))
     return PlaneFit(origin + at, n, rms, count, normal_sigma)
+
+
+def shared_noise(e: Array, good: NDArray[np.bool_], at: NDArray[np.intp], shape: tuple[int, int]) -> float:
+    """How many readings of a grid tell only as much as one, because neighbours share their noise; at least 1.
+
+    ``e`` (N,) are residuals at the flat indices ``at`` (N,) of an image of that ``shape``, 0 where not ``good`` (N,). The
+    variance of sums over blocks of 10 x 10 pixels over what independent readings would have.
+    """
+    image = np.zeros((2, shape[0] * shape[1]), dtype=np.float32)
+    image[0, at], image[1, at] = e, good
+    total, number = (cv2.boxFilter(a.reshape(shape), -1, (10, 10), normalize=False)[5::10, 5::10] for a in image)
+    expected = float(e @ e) * float(number.sum()) / max(int(np.count_nonzero(good)), 1)
+    return max(float((total * total).sum()) / max(expected, 1e-30), 1.0)
 
 
 def local_planes(

@@ -12,7 +12,7 @@ from weldcal.calibration.circle import CircleFit, refine_circles
 from weldcal.calibration.edge_labels import refine_pair
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.face import Face, FlangeFitConfig, Measured, Refusal, clear_band, judge, lowered_by, thickness
-from weldcal.calibration.plane import PlaneFit
+from weldcal.calibration.plane import PlaneFit, shared_noise
 from weldcal.calibration.rim import plane_axes
 from weldcal.models.flanges import FlangeStandard
 
@@ -167,7 +167,7 @@ def _plane(
     e *= good
     count = int(np.count_nonzero(good))
     rms = float(np.sqrt(e @ e / count))
-    shared = _shared(e, good, on, (h, w))
+    shared = shared_noise(e, good, on, (h, w))
     new = axes @ np.array([-fit[1], -fit[2], 1.0])
     new /= float(np.sqrt(new @ new))
     middle = moments[0] / moments[0, 0]
@@ -175,15 +175,6 @@ def _plane(
     sigma = rms * float(np.sqrt(shared / count * 0.5 * (1.0 / spread[1, 1] + 1.0 / spread[2, 2])))
     point = center + axes @ np.array([middle[1], middle[2], float(fit @ middle)])
     return PlaneFit(point, new, rms, int(count / shared), sigma)
-
-
-def _shared(e: Array, good: Mask, on: NDArray[np.intp], shape: tuple[int, int]) -> float:
-    """How many readings (N,) with residuals ``e`` at pixels ``on`` tell only as much as one: neighbours share noise."""
-    image = np.zeros((2, shape[0] * shape[1]), dtype=np.float32)
-    image[0, on], image[1, on] = e, good
-    total, number = (cv2.boxFilter(a.reshape(shape), -1, (6, 6), normalize=False)[3::6, 3::6] for a in image)
-    expected = float(e @ e) * float(number.sum()) / max(int(np.count_nonzero(good)), 1)
-    return max(float((total * total).sum()) / max(expected, 1e-30), 1.0)
 
 
 class _View:

@@ -7,7 +7,7 @@ import csv
 import io
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,7 @@ from weldcal.calibration.validation import (
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.algorithm1_beside import Algorithm1Outcome, compare_algorithm1, summary_of
+from weldcal.tools.report.features import feature_residuals
 from weldcal.tools.report.plots_calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
 
@@ -69,6 +70,7 @@ class CalibrationReport:
     seconds: float
     out: Path
     advice: tuple[str, ...] = ()
+    patterns: dict[str, HolePattern] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `--json` (keys of the design's "calibrate" line, and Algorithm 1's figure beside them)."""
@@ -90,6 +92,7 @@ class CalibrationReport:
             "k_fold_mm": self.k_fold_mm,
             "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
             "advice": list(self.advice),
+            "features": feature_residuals(self.fits, self.patterns),
             "algorithm1": None
             if a is None
             else {
@@ -217,6 +220,7 @@ def calibrate_dataset(
         time.monotonic() - started,
         Path(out),
         sampling_advice(estimate, corrected),
+        seen.patterns,
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.result import export_ros2, export_ur_pose
 from weldcal.calibration.rigid import rotation_vector
 from weldcal.calibration.solve import point_error_covariance
+from weldcal.tools.report.features import HEADER, feature_table
 from weldcal.tools.report.pictures import OURS, error_bars, error_field, svg
 from weldcal.tools.report.plots_advice import knowledge_map
 from weldcal.tools.report.render import fixed, render
@@ -41,6 +42,8 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         n_total=len(report.observations) + len([p for p in r.poses if p.held_out_mm is None]),
         work_sigma_mm=work_sigma,
         pose_rows=_pose_table(report),
+        feature_rows=feature_table(report.fits, report.patterns),
+        feature_header=HEADER,
         refused=report.refused,
         matrix=[[fixed(float(v), 6) for v in row] for row in r.X_BC.GetAsMatrix4()],
         pose_facts=[
