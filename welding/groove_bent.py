@@ -17,6 +17,7 @@ from weldcal.welding.seam import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger one sags by 11 mm or less, and its walls lean by less than 9 deg
 MARGIN_M = 0.020
+GROUND_REACH_M = 0.030  # the ends of a bent plate lean: the ground beyond lies that much further off, unrolled
 COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006
 
 
@@ -36,9 +37,10 @@ def bent_seams(
         flat = u[mine]
         if len(flat) < 1000:
             continue
+        leaning = replace(config, ground_reach_m=GROUND_REACH_M)
         for groove in find_grooves(thinned(flat, COARSE_POINTS, COARSE_CELL_M), config.search)[0]:
             try:
-                seam = measure_groove(flat, groove, config, start)
+                seam = measure_groove(flat, groove, leaning, start)
                 seams.append(_rolled(seam, face, "the robot" if start_A is None else "the point given"))
             except WeldcalError as error:
                 failures.append(error)

@@ -42,17 +42,19 @@ def seen_extent(
     return first - loss, last + loss, gaps
 
 
-def ends_at_edges(f: Floats, ends: tuple[float, float], line: Line, profile: Profile) -> tuple[bool, bool]:
-    """Whether lower ground is seen beyond each end of the groove: then the plate ends there, and not only the view."""
+def ends_at_edges(
+    f: Floats, ends: tuple[float, float], line: Line, profile: Profile, reach_m: float
+) -> tuple[bool, bool]:
+    """Whether lower ground is seen within `reach_m` beyond each end: then the plate ends there, and not only the view."""
     half_width = profile.depth / min(profile.slopes)
-    tail = line.extended(0.010, 0.010)
+    tail = line.extended(reach_m + 0.001, reach_m + 0.001)
     s, n, beside = tail.coordinates(f[:, :2])
-    s = s - 0.010
+    s = s - (reach_m + 0.001)
     strip = beside & (np.abs(n) < half_width + BAND_M)
     seen = []
     for end, sign in zip(ends, (-1.0, 1.0), strict=True):
         beyond = sign * (s - end)
-        out = strip & (beyond > 0.002) & (beyond < 0.009)
+        out = strip & (beyond > 0.002) & (beyond < reach_m)
         ground = out & (f[:, 2] < -1.3 * profile.depth)
         seen.append(bool(np.count_nonzero(ground) > max(5.0, 0.5 * np.count_nonzero(out))))
     return seen[0], seen[1]

@@ -135,7 +135,7 @@ def _finish(
         first, last = 0.0, line.length
     ends_seen = (True, True)
     if not groove.closed:
-        ends_seen = ends_at_edges(around, (first, last), line, profile)
+        ends_seen = ends_at_edges(around, (first, last), line, profile, config.ground_reach_m)
         # At the edge of a shadow the last section is not to be trusted.
         first = first if ends_seen[0] else max(first, float(slices.s[1]))
         last = last if ends_seen[1] else min(last, float(slices.s[-2]))

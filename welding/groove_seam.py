@@ -39,6 +39,7 @@ class GrooveConfig:
     most_sigma_m   a root that is less certain than this, outside gaps, is refused
     longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
     steepest_wall_rad             steeper walls cannot be measured from above: an opening that has them is a gap
+    ground_reach_m                lower ground is looked for so far beyond an end, to tell the plate's end from the view's
     most_bridge_sigma_m           how uncertain the line may be where it is bridged
     """
 
@@ -50,6 +51,7 @@ class GrooveConfig:
     most_missing: float = 0.5
     most_bridge_sigma_m: float = 0.0015
     steepest_wall_rad: float = math.radians(78.0)
+    ground_reach_m: float = 0.009
 
 
 @dataclass(frozen=True, eq=False)

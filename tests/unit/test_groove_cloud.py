@@ -21,7 +21,7 @@ from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
 from weldcal.tools.benchmarks import seam_planning
 from weldcal.tools.benchmarks.plan_scenes import Scene, box, cast, looking_at, scan_part, table
-from weldcal.tools.benchmarks.seam_planning import sideways
+from weldcal.tools.benchmarks.plan_trials import sideways
 from weldcal.welding.groove_cloud import extract_groove
 from weldcal.welding.groove_seam import (
     GrooveNotFound,
@@ -197,7 +197,7 @@ def test_the_table_of_the_benchmark_counts_refusals_and_states_errors(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(seam_planning, "SHAPES", ("s",))
-    summary, rows = seam_planning.run_seam_planning_benchmark(tmp_path, 1, 50, ["azure_kinect"])
+    summary, rows = seam_planning.run_seam_planning_benchmark(tmp_path, 1, 50, ["azure_kinect"], troubles=False)
     assert summary["trials"] == 2
     assert set(rows) == {"azure_kinect cad", "azure_kinect cloud"}
     with (tmp_path / "trials.csv").open() as table_file:
