@@ -80,7 +80,7 @@ def solve(
     tried_sets: set[bytes] = set()
     for _ in range(10):
         noise = noise_of(problem, w, d, keep) if base is None else base.noise
-        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2)
+        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2, left_out=False)
         state = base.state
         tried_sets.add(keep.tobytes())
         new = _within(problem, base)
@@ -120,7 +120,8 @@ def solve(
             hold_centre=bool(fits),
             begin=near.lin if fits else None,
         )
-    agreed = _alike(fits)
+    squares = _left_out(fits)
+    agreed = _alike(fits, squares)
     best = fits[agreed[0]]
     state, covariance = best.state, best.scaled.covariance()
     if len(agreed) > 1:
@@ -131,7 +132,7 @@ def solve(
             sum((f.scaled.cross_covariance(o.scaled) for f in chosen for o in chosen), np.zeros_like(covariance))
             / len(chosen) ** 2
         )
-    scores = {k: _rms(s) for k, s in _left_out(fits).items()}
+    scores = {k: _rms(s) for k, s in squares.items()}
     return Choice(state, 0.5 * (covariance + covariance.T), best, " + ".join(agreed), name, scores)
 
 
@@ -165,7 +166,7 @@ def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...])
     cost, name = np.inf, ""
     # a closed form that fits well needs no second opinion
     for found in chain([[("given", s) for s in starts]], ([form] for form in closed_forms(problem, known))):
-        state, new, given = _best(problem, found, 2)
+        state, new, given = most_promising(problem, found, 2)
         if state is not None and new < cost:
             best, cost, name = state, new, given
             if _clean(problem, best):
@@ -178,7 +179,7 @@ def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...])
             rows = rng.choice(len(problem), size, replace=False)
             forms = islice(closed_forms(problem.pick(rows), known), 2)
             subsets += [(f"minimal sets, {n}", s) for n, s in forms]
-    other, other_cost, other_name = _best(problem, subsets + grid(problem, known, rng), 6)
+    other, other_cost, other_name = most_promising(problem, subsets + grid(problem, known, rng), 6)
     if best is None or (other is not None and other_cost < cost * (1.0 - 1e-6)):
         best, cost, name = other, other_cost, other_name
     if best is None:
@@ -186,7 +187,7 @@ def _start(problem: Problem, known: State, seed: int, starts: tuple[State, ...])
     return best, name
 
 
-def _best(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[State | None, float, str]:
+def most_promising(problem: Problem, pool: list[tuple[str, State]], tries: int) -> tuple[State | None, float, str]:
     """The start with the least cost after a descent from the most promising ones."""
     if not pool:
         return None, np.inf, ""
@@ -233,10 +234,9 @@ def _rms(squares: Array) -> tuple[float, float]:
     return float(np.degrees(rms[0])), float(rms[1])
 
 
-def _alike(fits: dict[str, Fit]) -> list[str]:
+def _alike(fits: dict[str, Fit], squares: dict[str, Array]) -> list[str]:
     """The candidate with the least regret, and those whose errors left out cannot be told apart from the best of either
     column (paired t test of the squares)."""
-    squares = _left_out(fits)
     means = {k: s.mean(axis=0) for k, s in squares.items()}
     least = np.maximum(np.min(list(means.values()), axis=0), 1e-300)
     order = sorted(fits, key=lambda k: (float(max(means[k] / least)), list(fits).index(k)))

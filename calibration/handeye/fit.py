@@ -18,7 +18,8 @@ _NEAR = 1e-3  # changes (rad, or share of the extent) up to which derivatives ta
 _MANY = 50  # sightings from which on a prediction costs less than new derivatives
 _FAR_APART = 1e-3  # how much smaller one kind of noise may start, rad against shares of the extent
 _LONGEST = 0.5  # step (rad, or share of the extent): beyond it the derivatives say nothing
-_HERE = 1e-8  # and up to which they are those of the place itself
+_STALE = 100.0  # steps (sigma) shorter than this many changes are decided by derivatives of the place itself
+_HERE = 0.1  # share of the tolerance up to which derivatives are those of the place itself
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,7 @@ def fit(
     begin: Linearised | None = None,
     iterations: int = 60,
     tolerance: float = 1e-6,
+    left_out: bool = True,
 ) -> Fit:
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
@@ -121,7 +123,7 @@ def fit(
     displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so the
     answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``hold_centre``: keep it,
     and count it only as something else that is uncertain. ``keep`` (n,): sightings that count; the others get residuals
-    only. ``begin``: the derivatives at the start, where known. ``tolerance``: of the last step, in standard deviations.
+    only. ``begin``: the derivatives at the start, where known. ``tolerance``: of what is left, in standard deviations.
     """
     sub = problem if keep.all() else problem.pick(keep)
     floor = sub.extent**2 * TINY
@@ -138,7 +140,7 @@ def fit(
     s = Scaled(sub, lin, noise, loss)
     scale = np.append(np.tile(np.repeat([1.0, sub.extent], 3), len(sub.blocks)), np.full(3, sub.extent))
     near = _NEAR if len(sub) >= _MANY else 0.0
-    before, drift = np.inf, np.zeros(len(s.g))
+    before, drift, stale = tolerance, np.zeros(len(s.g)), 0.0
     for _ in range(iterations):
         moving = sub.size if hold_centre else len(s.g)
         change = np.zeros(len(s.g))
@@ -151,19 +153,18 @@ def fit(
         # the same derivatives serve as long as little has changed since they were taken
         drift = drift + change
         far = float(np.abs(drift / scale[: len(drift)]).max())
-        if far < near:
+        if far < near and (size > _STALE * far or far <= _HERE * tolerance):
             lin = lin.after(change)
         else:
             lin, drift, far = taken(state, centre), np.zeros(len(change)), 0.0
         new = s.variances(lin, noise, floor)
         settled = s.unsettled(new)
         exact = new.translation <= floor and new.rotation <= TINY
-        done = (size < tolerance and settled < tolerance) or (size < 0.1 and exact)
-        done |= size < 1e-7 and settled < 1e-7 and size >= 0.5 * before  # rounding: nothing left to gain
-        if done and far > _HERE:
-            lin, drift, done = taken(state, centre), np.zeros(len(change)), False
-            new = s.variances(lin, noise, floor)
-            exact = new.translation <= floor and new.rotation <= TINY
+        # steps shrink at least as fast as they just did, so that the next one bounds what is left
+        leap = max(size, settled)
+        done = leap * min(1.0, leap / before) < tolerance or (size < 0.1 and exact)
+        done = done and stale <= _HERE * tolerance  # the step was not one of derivatives from elsewhere
+        stale = far
         noise = new
         if exact and loose:  # there is no noise to have a centre
             loose, centre = False, np.zeros(3)
@@ -171,9 +172,10 @@ def fit(
         s = Scaled(sub, lin, noise, loss)
         if done:
             break
-        before = size
+        before = leap
     # every sighting, at the same state
     w, d = (lin.w, lin.d) if sub is problem else residuals(problem, state, centre)
     left_w, left_d = w.copy(), d.copy()
-    left_w[keep], left_d[keep] = s.leave_one_out(lin)
+    if left_out:
+        left_w[keep], left_d[keep] = s.leave_one_out(lin)
     return Fit(state, noise, centre, loss, keep, s, lin, left_w, left_d, w, d)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
-from weldcal.calibration.handeye.choose import CANDIDATES
+from weldcal.calibration.handeye.choose import CANDIDATES, most_promising
 from weldcal.calibration.handeye.determinacy import diversity
 from weldcal.calibration.handeye.files import PosePairs
 from weldcal.calibration.handeye.fit import descend
@@ -141,8 +141,8 @@ def _rough(F: Array, G: Array) -> tuple[float, float]:
     if b > _ONE_AXIS * a:
         state, _ = descend(problem, with_positions(problem, kronecker(problem, state), state), iterations=_ROUGH_STEPS)
     else:
-        starts = [s for _, s in grid(problem, state, np.random.default_rng(0))]
-        state = min((descend(problem, s, iterations=_ROUGH_STEPS) for s in starts), key=lambda found: found[1])[0]
+        best, _, _ = most_promising(problem, grid(problem, state, np.random.default_rng(0)), 4)
+        state = state if best is None else best
     w, d = residuals(problem, state)
     return (
         float(np.median(np.linalg.norm(w, axis=1))),

@@ -70,7 +70,7 @@ class Problem:
         """Number of unknown numbers."""
         return 6 * len(self.blocks)
 
-    @property
+    @cached_property
     def blocks(self) -> tuple[int, ...]:
         """Indices (0 X, 1 Y, 2 Z) of the free poses, in the order of the unknowns."""
         return (0,) if self.tied else tuple(k for k in range(3) if self.free[k])

@@ -17,6 +17,7 @@ _HUBER = 2.0  # in sigma per axis
 _STUDENT = 5.0  # degrees of freedom of the heavy-tailed loss
 TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
 RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the sightings do not fix
+_VARIANCE_STEPS = 6
 _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
 
 
@@ -139,12 +140,19 @@ class Scaled:
         else:
             e = (self.root @ np.concatenate([lin.w, lin.d], axis=1)[:, :, None])[:, :, 0]
             qw, qd = (e[:, :3] ** 2).sum(axis=1), (e[:, 3:] ** 2).sum(axis=1)
-        rotation = noise.rotation
+        rotation, translation = noise.rotation, noise.translation
         if self.total_w:
             qw = np.where(self.numbers_w > 0.0, qw, 0.0)
-            rotation = max(rotation * _growth(qw, self.m_w, self.loss, self.free_w, self.share_w), TINY)
-        three = np.full(self.n, 3.0)
-        translation = max(noise.translation * _growth(qd, three, self.loss, self.free_d, self.share_d), floor)
+        # squares of whitened residuals follow a variance in proportion only where it is all there is
+        for _ in range(1 if self.root is not None else _VARIANCE_STEPS):
+            a, b = rotation / noise.rotation, translation / noise.translation
+            if self.total_w:
+                more = _growth(qw / a, self.m_w, self.loss, self.free_w, self.share_w)
+                rotation = max(rotation * more, TINY)
+            also = _growth(qd / b, np.full(self.n, 3.0), self.loss, self.free_d, self.share_d)
+            translation = max(translation * also, floor)
+            if self.loss is Loss.SQUARES or abs(also - 1.0) + (abs(more - 1.0) if self.total_w else 0.0) < 1e-9:
+                break
         return replace(noise, rotation=rotation, translation=translation)
 
     def unsettled(self, new: Noise) -> float:

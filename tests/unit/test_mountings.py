@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.hand_eye import HandEyeConfig, as_transform
+from weldcal.calibration.hand_eye import HandEyeConfig, as_transform, solve_problem
 from weldcal.calibration.handeye.mountings import MOUNTINGS, Sighting, calibrate_mounting, get_mounting
 from weldcal.calibration.handeye.next_pose import next_pose
 from weldcal.calibration.handeye.problem import full_problem
-from weldcal.calibration.handeye.se3 import IDENTITY, inverse
+from weldcal.calibration.handeye.se3 import IDENTITY, inverse, pose
+from weldcal.calibration.handeye.view import view_of
+from weldcal.models.arms.chain import chain_forward, load_chain
 from weldcal.models.errors import InputError
+from weldcal.models.scanners import get_scanner
 
 from .hand_eye_poses import Array, noise, random_poses
 
@@ -125,3 +128,35 @@ def test_the_next_pose_keeps_its_promise() -> None:
         found = calibrate_mounting("eye_in_hand", both, config=QUICK)
         sigmas.append(np.trace(found.covariance["X"][3:, 3:]) / found.sigma_translation**2)
     assert sigmas[0] < sigmas[1]
+
+
+def test_the_next_pose_is_seen_by_the_camera_and_reached_by_the_arm() -> None:
+    rng = np.random.default_rng(5)
+    arm, scanner = load_chain("ur10e"), get_scanner("phoxi_s")
+    q = np.array([0.3, -1.4, 1.7, -1.9, -1.5, 0.4]) + rng.uniform(-0.25, 0.25, (8, 6))
+    F = np.array([chain_forward(arm, each).GetAsMatrix4() for each in q])
+    X = random_poses(1, rng, 0.1, 0.02)[0]
+    Y = F[0] @ X @ pose(np.eye(3), np.array([0.0, 0.0, scanner.optimum_m]))
+    problem = full_problem(F, inverse(F @ X) @ Y @ noise(8, rng, TURN, SHIFT))
+    result = solve_problem(problem, config=QUICK)
+    mounting, known = get_mounting("eye_in_hand"), (IDENTITY,) * 3
+    view = view_of(problem.G, scanner=scanner)
+    advice = next_pose(problem, result, mounting, known, arm=arm, view=view)
+    assert advice is not None
+    assert advice.X_BF is not None
+    assert advice.q is not None
+    np.testing.assert_allclose(
+        chain_forward(arm, advice.q).GetAsMatrix4(), np.asarray(advice.X_BF.GetAsMatrix4()), atol=1e-8
+    )
+    assert (advice.q >= arm.position_lower).all()
+    assert (advice.q <= arm.position_upper).all()
+    p = advice.X_CM.translation()
+    assert scanner.near_m <= p[2] <= scanner.far_m
+    u, v = scanner.fx * p[0] / p[2] + scanner.cx, scanner.fy * p[1] / p[2] + scanner.cy
+    assert 0.0 < u < scanner.width
+    assert 0.0 < v < scanner.height
+    assert "Within reach and limits of ur10e" in advice.sentence()
+    # an arm that is too short for the poses so far is no judge of the next one, and that is said
+    other = next_pose(problem, result, mounting, known, arm=load_chain("ur3e"), view=view)
+    assert other is not None
+    assert "ur3e does not reach the poses so far" in other.sentence()
