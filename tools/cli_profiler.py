@@ -103,8 +103,10 @@ def sphere(
         from weldcal.tools.profiler import Sigmas, calibrate_sphere, write_calibration
 
         sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
-        data, measured = _sphere(file, unit, trial, radius, arm, touches, tip, seed)
+        lost: list[int] = []
+        data, measured = _sphere(file, unit, trial, radius, arm, touches, tip, seed, lost)
         record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=seed)
+        found["without_sphere"] = lost
         folder = _folder(out, file, seed)
         write_calibration(record, folder)
     _report("profiler sphere", found, folder, json)
@@ -173,6 +175,7 @@ def _sphere(
     touches: Path | None,
     tip: str,
     seed: int,
+    lost: list[int] | None = None,
 ) -> tuple[Any, Any]:
     import numpy as np
 
@@ -189,7 +192,7 @@ def _sphere(
     data = read_profiler_file(file, unit=unit, trial=trial)
     felt = None if touches is None else read_profiler_file(touches, unit=unit)
     radius_m = None if radius is None else 1e-3 * radius
-    return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, seed=seed)
+    return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=seed)
 
 
 def _folder(out: Path | None, file: Path, seed: int) -> Path:
@@ -209,7 +212,10 @@ def _report(command: str, found: Mapping[str, object], folder: Path, json: bool)
             turn = ", ".join(f"{v:.4f}" for v in pose[3:])
             left = after["rms_before_and_after_each_mm"]
             rows[f"add pose {k + 1}"] = f"{place} mm, {turn} rad: {left[k]:.3f} to {left[k + 1]:.3f} mm in the field"
-    summary = {"state": "done", **{k: v for k, v in found.items() if v != []}}
+    warnings = found.get("warnings")
+    for sentence in warnings if isinstance(warnings, list) else []:
+        console.emit_warning(str(sentence))
+    summary = {"state": "done", **{k: v for k, v in found.items() if v != [] and k != "warnings"}}
     if json:
         summary = {"state": "done", **found, "written_to": str(folder)}
     finish(command, summary, folder, json_wanted=json, rows=rows)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from weldcal.calibration.profiler.edge_features import Kind, extract_edge
 from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.edge_linear import edge_linear
 from weldcal.calibration.profiler.edge_model import EdgeState
-from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.profiler.errors import ArcNotFound, FeatureNotFound
 from weldcal.calibration.profiler.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import (
@@ -28,7 +28,7 @@ from weldcal.calibration.profiler.plan import (
 )
 from weldcal.calibration.profiler.record import ProfilerRecord, load_record, save_record
 from weldcal.calibration.profiler.result import ProfilerEstimate
-from weldcal.calibration.profiler.sphere_joint import Model, choose_model, sphere_joint
+from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, choose_model, sphere_joint
 from weldcal.calibration.profiler.sphere_linear import (
     compensate,
     fit_touch_sphere,
@@ -38,12 +38,15 @@ from weldcal.calibration.profiler.sphere_linear import (
 )
 from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import load_arm
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.profiler_files import ProfilerFile
 from weldcal.tools.report.render import write_atomic
 
 CANDIDATES = 300
+POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried
+RADIUS_OFF_M = 0.1e-3
 ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
+Estimate = TypeVar("Estimate", EdgeEstimate, SphereEstimate)
 MODELS = ("auto", "rigid", "affine", "affine+joints")
 FEATURES = ("bar", "step", "apex")
 
@@ -93,7 +96,7 @@ def calibrate_edge(
             "edge, linear", linear.rotation, linear.translation, figures=found, data_sha256=file.digest
         ), found
     xz = np.array([sigmas.x_m, sigmas.z_m])
-    e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz)
+    e = _widened(edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz))
     found |= _figures(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
     if plan:
         state = EdgeState(e.rotation, e.translation, e.point, e.direction)
@@ -135,9 +138,13 @@ def sphere_data(
     arm: str = "",
     tip_m: Floats | None = None,
     touches: ProfilerFile | None = None,
+    lost: list[int] | None = None,
     seed: int = 0,
 ) -> SphereData:
-    """A file's measurements of a sphere: its arcs found among other points, touches and joints where there are any."""
+    """A file's measurements of a sphere: its arcs found among other points, touches and joints where there are any.
+
+    Scans that show no arc are left out and their numbers added to `lost`; without that list they are refused.
+    """
     if file.profiles is None:
         raise InputError("The file has no 'profiles' of the sphere: give (n, m, 2), or 'xz' with the lengths 'n'.")
     radius = radius_m if radius_m is not None else float(file.needed("radius", "the sphere's (or give --radius in mm)"))
@@ -151,9 +158,23 @@ def sphere_data(
     poses = cast(FlangePoses, file.poses())
     if len(file.profiles) != len(poses):
         raise InputError(f"{len(poses)} poses need {len(poses)} profiles, not {len(file.profiles)}.")
-    profiles = [_arc(p, radius, seed) for p in file.profiles]
+    profiles, kept = [], []
+    for k, p in enumerate(file.profiles):
+        try:
+            profiles.append(_arc(p, radius, seed))
+            kept.append(k)
+        except ArcNotFound as e:
+            if lost is None:
+                raise ArcNotFound(f"Scan {k} shows no arc of the sphere: leave it out of the file.") from e
+            lost.append(k)
+    if not kept:
+        raise ArcNotFound("No scan shows an arc of the sphere: check the radius, the unit and which column is z.")
+    q = file.arrays.get("q")
+    if q is not None and len(q) != len(poses):
+        raise InputError(f"{len(poses)} scans need as many joints q, not {len(q)}.")
     return SphereData(
-        poses, profiles, radius, felt, tip if felt is not None else None, table, file.arrays.get("q"), file.arrays.get("touch_q")
+        poses[np.array(kept)], profiles, radius, felt, tip if felt is not None else None, table,
+        None if q is None else q[kept], file.arrays.get("touch_q"),
     )  # fmt: skip
 
 
@@ -175,14 +196,17 @@ def calibrate_sphere(
         raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
     s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
     found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
+    _refuse_turned_round(data, s)
     chosen = cast(Model, model)
     if model == "auto":
         full = data.arm is not None and data.q is not None and (data.touches is None or data.touch_q is not None)
         chosen, errors = choose_model(data if full else _without_arm(data), s)
         found["left_out_rms_mm"] = {name: 1e3 * v for name, v in errors.items()}
-    e = sphere_joint(data, chosen, s)
+    e = _widened(sphere_joint(data, chosen, s))
     found |= {"model": chosen} | _figures(e)
     found["wrong_scans"] = list(e.wrong_poses)
+    found["radius_of_profiles_mm"] = 1e3 * (data.radius_m + e.radius_change_m)
+    found["warnings"] = _warnings(e, data, s)
     if plan:
         if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
             raise InputError(
@@ -198,6 +222,51 @@ def calibrate_sphere(
         found["next_poses"] = _next(candidates, best.chosen, best.rms_m)
     arm = data.arm if chosen == "affine+joints" else None
     return ProfilerRecord.of(f"sphere, {chosen}", e, found, digest, arm), found
+
+
+def _widened(e: Estimate) -> Estimate:
+    """With the covariance that its residuals speak for, where they are larger than the sigmas stated."""
+    return replace(e, covariance=e.covariance * max(1.0, e.reduced_chi2 if np.isfinite(e.reduced_chi2) else 1.0))
+
+
+def _refuse_turned_round(data: SphereData, s: SphereSigmas) -> None:
+    """Poses of the base in the flange instead of the flange in the base are told by what they explain.
+
+    Raises:
+        InputError: turned round, they explain the profiles far better.
+    """
+    scans = SphereData(data.poses, data.profiles, data.radius_m)
+    chi2 = _explained(scans, s)
+    if chi2 < POORLY:
+        return
+    R, p = data.poses.rotation, data.poses.translation
+    inverse = FlangePoses(np.swapaxes(R, 1, 2), -np.einsum("nji,nj->ni", R, p))
+    if _explained(replace(scans, poses=inverse), s) < 0.4 * chi2:
+        raise InputError(
+            "The poses explain the profiles when they are turned round: give the flange in the base, not the base in the flange."
+        )
+
+
+def _explained(data: SphereData, s: SphereSigmas) -> float:
+    """Reduced chi-square of the rigid model; infinite where it refuses."""
+    try:
+        return sphere_joint(data, "rigid", s).reduced_chi2
+    except WeldcalError:
+        return float("inf")
+
+
+def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]:
+    said = []
+    if abs(e.radius_change_m) > max(4.0 * e.radius_sigma_m, RADIUS_OFF_M):
+        said.append(
+            f"The profiles make a sphere of {1e3 * (data.radius_m + e.radius_change_m):.2f} mm rather than of "
+            f"{1e3 * data.radius_m:.2f}: check the radius and the profiler's scale."
+        )
+    if e.tip is not None and data.tip is not None and np.linalg.norm(e.tip - data.tip) > 3.0 * s.tip_m:
+        said.append(
+            f"The touches put the tip {1e3 * float(np.linalg.norm(e.tip - data.tip)):.0f} mm from where it was said to be: check --tip."
+        )
+    return said
 
 
 def _without_arm(data: SphereData) -> SphereData:

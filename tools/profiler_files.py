@@ -17,6 +17,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 
 UNITS = {"m": 1.0, "mm": 1e-3}
+NEAR_M = 0.02  # nor always this near
 FAR_M = 20.0  # no robot's flange is this far from its base
 
 # other names of the same things: of files with one axis more, for trials or worlds
@@ -43,8 +44,12 @@ class ProfilerFile:
         """Flange poses of the scans, or of="touch_"; None where there are none."""
         T = self.arrays.get(f"{of}T")
         if T is not None:
-            if T.shape[1:] != (4, 4):
+            if T.ndim != 3 or T.shape[1:] not in ((4, 4), (3, 4)):
                 raise InputError(f"{of}T holds poses (n, 4, 4), not {T.shape}.")
+            if T.shape[1] == 4 and np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > 1e-6:
+                raise InputError(
+                    f"The last row of every {of}T is 0, 0, 0, 1: turn the matrices over if they are transposed."
+                )
             return FlangePoses.checked(T[:, :3, :3], T[:, :3, 3])
         R, t = self.arrays.get(f"{of}rotation"), self.arrays.get(f"{of}translation")
         return None if R is None or t is None else FlangePoses.checked(R, t)
@@ -96,6 +101,10 @@ def read_profiler_file(
         raise InputError(
             f"The flange would be {np.abs(X.translation).max():.0f} m from the base: give --unit mm if the lengths are in mm."
         )
+    if len(X) and float(np.abs(X.translation).max()) < NEAR_M:
+        raise InputError(
+            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base: give --unit m if the lengths are in m."
+        )
     return file
 
 
@@ -136,7 +145,7 @@ def _from_npz(
             value = _of_trial(value, trial)
         arrays[key] = value * scale if key.removeprefix("touch_") in LENGTHS else value
     for name in ("T", "touch_T"):
-        if name in arrays and arrays[name].ndim == 3 and arrays[name].shape[1:] == (4, 4):
+        if name in arrays and arrays[name].ndim == 3 and arrays[name].shape[1:] in ((4, 4), (3, 4)):
             arrays[name][:, :3, 3] *= scale
     if "scan_kind" in arrays:
         arrays["translated"] = (arrays.pop("scan_kind") == 0).astype(float)

@@ -33,6 +33,11 @@ class ArmErrors:
         m = k + len(SAG_JOINTS)
         return ArmErrors(values[:k], values[k:m], values[m:].reshape(6, 3))
 
+    @property
+    def values(self) -> Floats:
+        """The vector (24,)."""
+        return np.concatenate([self.offsets, self.sag, self.table.ravel()])
+
     @staticmethod
     def none() -> ArmErrors:
         """An arm as drawn."""

@@ -107,7 +107,7 @@ def _refuse_rivals(estimate: EdgeEstimate, others: list[EdgeState]) -> None:
             )
     if sigma > OPEN_RAD:
         raise DegenerateMotion(
-            f"These motions leave the rotation uncertain by {np.degrees(sigma):.0f} deg: turn the flange further, about two axes."
+            f"These motions leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange further, about two axes."
         )
 
 

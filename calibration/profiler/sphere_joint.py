@@ -6,7 +6,7 @@ where the joint angles are given, the arm's offsets and sag may be estimated wit
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -24,7 +24,11 @@ from weldcal.models.errors import InputError
 Model = Literal["rigid", "affine", "affine+joints"]
 MINIMUM_POSES = 5
 SINGULAR = 1e-5
-WRONG_POSE = 5.0  # sigmas by which one pose's mean residual may be off before it is named
+WRONG_POSE = 5.0  # times the others' residual (its mean, or its rms) at which a scan is named
+ARM_ALLOWED = 1.1  # times the best leave-one-out error
+MOST_WRONG = 0.25  # of the scans may be left out as wrong
+RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
+APART_RAD, OPEN_RAD = np.radians(1.0), np.radians(5.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +38,8 @@ class SphereEstimate(ProfilerEstimate):
     Attributes:
         center: (3,) m in B; tip: (3,) m in F or None; affine: (3,) [x scale, z scale, shear] about `origin` (2,) m.
         arm_errors: of the arm's joints and table; zero where the model has them not.
-        wrong_poses: scans whose points lie off the sphere together.
+        wrong_poses: scans whose points lie off the sphere together; the result, and its residuals, are without them.
+        radius_change_m, radius_sigma_m: what a free radius would be more than the one given, to first order.
         whole: (m, m) covariance of all unknowns: pose, centre, tip, sensor, arm, as far as the model has them.
     """
 
@@ -44,6 +49,8 @@ class SphereEstimate(ProfilerEstimate):
     origin: Floats = field(default_factory=lambda: np.zeros(2))
     arm_errors: ArmErrors = field(default_factory=ArmErrors.none)
     wrong_poses: tuple[int, ...] = ()
+    radius_change_m: float = 0.0
+    radius_sigma_m: float = float("nan")
     whole: Floats = field(default_factory=lambda: np.zeros((0, 0)))
 
     def points_F(self, profile: ArrayLike) -> Floats:
@@ -73,21 +80,61 @@ def sphere_joint(
     _check(data, model)
     layout = Layout(tip=data.touches is not None, affine=model != "rigid", joints=model == "affine+joints")
     problem = Problem(data, layout, s)
-    rigid = Problem(data, Layout(tip=layout.tip, affine=False, joints=False), s)
-    best = None
-    given = [] if init is None else [(init.rotation, init.translation, init.center)]
-    starts = given or sphere_starts(data.poses, problem.profiles, data.radius_m)
-    for R, t, c in starts:
-        found = rigid.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)]))
-        if best is None or found[1].cost < best[1].cost:
-            best = found
-    assert best is not None
-    R, result = best
-    x = np.zeros(layout.size)
-    x[: 9 + 3 * layout.tip] = result.x
-    if layout.size > len(result.x):
-        _, result = problem.solved(R, np.zeros(3), x)
-    return _estimate(problem, R, result.x)
+    rivals: list[Floats] = []
+    if init is not None:
+        R, result = problem.solved(init.rotation, init.translation, _started(init, data, layout))
+        about = _turned(R, result.x)
+    else:
+        rigid = Problem(data, Layout(tip=layout.tip, affine=False, joints=False), s)
+        starts = sphere_starts(data.poses, problem.profiles, data.radius_m)
+        found = [rigid.solved(R, t, np.concatenate([np.zeros(6), c, np.zeros(3 * layout.tip)])) for R, t, c in starts]
+        R, result = min(found, key=lambda one: float(one[1].cost))
+        about = _turned(R, result.x)
+        # soft_l1's cost is half of chi-square where residuals are small
+        rivals = [_turned(one[0], one[1].x) for one in found if 2.0 * float(one[1].cost - result.cost) < RIVAL**2]
+        if layout.size > len(result.x):
+            x = np.zeros(layout.size)
+            x[: 9 + 3 * layout.tip] = result.x
+            _, result = problem.solved(R, np.zeros(3), x)
+    estimate = _estimate(problem, R, result.x)
+    _refuse_open(estimate, about, rivals)
+    wrong, n = estimate.wrong_poses, len(data.poses)
+    if not wrong or len(wrong) > MOST_WRONG * n or n - len(wrong) < MINIMUM_POSES:
+        return estimate
+    return replace(sphere_joint(data.without(*wrong), model, sigmas, init=estimate), wrong_poses=wrong)
+
+
+def _started(init: SphereEstimate, data: SphereData, layout: Layout) -> Floats:
+    """The unknowns of an estimate, but for its pose."""
+    parts = [np.zeros(6), init.center]
+    if layout.tip:
+        parts.append(np.zeros(3) if init.tip is None or data.tip is None else init.tip - data.tip)
+    if layout.affine:
+        parts.append(init.affine)
+    if layout.joints:
+        parts.append(init.arm_errors.values)
+    return np.concatenate(parts)
+
+
+def _turned(R: Floats, x: Floats) -> Floats:
+    return np.asarray(Rotation.from_rotvec(x[:3]).as_matrix() @ R)
+
+
+def _refuse_open(estimate: SphereEstimate, best: Floats, rivals: list[Floats]) -> None:
+    """What the covariance, which is local, does not tell: another mounting as good, or a turn hardly known at all."""
+    sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+    for other in rivals:
+        angle = float(np.arccos(np.clip(0.5 * (np.trace(best.T @ other) - 1.0), -1.0, 1.0)))
+        if angle > max(APART_RAD, 5.0 * sigma):
+            raise DegenerateMotion(
+                f"Two mountings of the profiler, {np.degrees(angle):.0f} deg apart, explain these scans alike: tilt the flange "
+                "more, about two axes, and cut the sphere on both sides of its middle."
+            )
+    if sigma > OPEN_RAD:
+        raise DegenerateMotion(
+            f"These scans leave the rotation uncertain by {min(np.degrees(sigma), 180.0):.0f} deg: turn the flange further, about two axes, "
+            "and cut the sphere on both sides of its middle."
+        )
 
 
 def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None = None) -> Floats:
@@ -106,12 +153,21 @@ def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None 
 
 
 def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> tuple[Model, dict[Model, float]]:
-    """The model with the least leave-one-scan-out error (rms m of each is returned); the simpler one where they are equal."""
+    """The model with the least leave-one-scan-out error (rms m of each is returned); the simpler one where they are equal.
+
+    The arm's own errors show where the arm goes afterwards and hardly in scans of one sphere. Their priors keep them from
+    explaining noise: the model that has them is taken unless it foretells scans left out clearly worse.
+    """
     names: list[Model] = ["rigid", "affine"]
     if data.arm is not None:
         names.append("affine+joints")
-    errors = {name: float(np.sqrt(np.mean(leave_one_out_m(data, name, sigmas) ** 2))) for name in names}
+    each = {name: leave_one_out_m(data, name, sigmas) for name in names}
+    # a wrong scan is foretold by no model
+    usual = each["rigid"] < WRONG_POSE * np.median(each["rigid"])
+    errors = {name: float(np.sqrt(np.mean(e[usual] ** 2))) for name, e in each.items()}
     best = min(errors.values())
+    if errors.get("affine+joints", np.inf) <= ARM_ALLOWED * best:
+        return "affine+joints", errors
     return next(name for name in names if errors[name] <= 1.02 * best), errors
 
 
@@ -162,9 +218,13 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
             f"{1e3 * problem.sigmas.touch_m * float(np.median(np.abs(felt)) if felt.size else 0.0):.2f} mm off any sphere of "
             f"{1e3 * problem.data.radius_m:.2f} mm: check the radius, the poses and that only the sphere is in the profiles."
         )
-    per_pose = np.array([np.mean(distance[problem.of == k]) for k in range(len(problem.count))])
-    spread = max(1.4826 * float(np.median(np.abs(per_pose))), 0.2 * problem.sigmas.robot_m)
-    wrong = tuple(int(k) for k in np.flatnonzero(np.abs(per_pose) > WRONG_POSE * spread))
+    every = [distance[problem.of == k] for k in range(len(problem.count))]
+    mean, rms = np.array([d.mean() for d in every]), np.array([np.sqrt(np.mean(d**2)) for d in every])
+    spread = max(1.4826 * float(np.median(np.abs(mean))), 0.2 * problem.sigmas.robot_m)
+    off = (np.abs(mean) > WRONG_POSE * spread) | (rms > WRONG_POSE * np.median(rms) + problem.sigmas.robot_m)
+    wrong = tuple(int(k) for k in np.flatnonzero(off))
+    by_radius = problem.by_radius()
+    step, sigma = _last_step(np.column_stack([J, by_radius]), r)
     whole = np.asarray(np.linalg.inv(H))
     return SphereEstimate(
         rotation=R,
@@ -182,4 +242,13 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
         origin=problem.origin,
         arm_errors=ArmErrors.of(arm),
         wrong_poses=wrong,
+        radius_change_m=step,
+        radius_sigma_m=sigma * float(np.sqrt(max(1.0, float(r @ r) / freedom))),
     )
+
+
+def _last_step(J: Floats, r: Floats) -> tuple[float, float]:
+    """How far the last unknown would go in one step of least squares, and its sigma."""
+    unit = np.linalg.norm(J, axis=0)
+    C = np.linalg.pinv((J / unit).T @ (J / unit))
+    return float(-(C @ ((J / unit).T @ r))[-1] / unit[-1]), float(np.sqrt(C[-1, -1]) / unit[-1])

@@ -20,6 +20,7 @@ RADIUS_TOLERANCE_M = 0.2e-3
 PLANAR = 0.05  # second over first singular value of the translations
 ONE_AXIS = 0.02
 MINIMUM_TOUCHES = 4
+ONE_SPOT = 0.05  # of the radius: rms of the touches across the plane through them
 CLEARLY = 0.7  # of the spread that is left when a side is mirrored
 
 
@@ -149,7 +150,8 @@ def fit_touch_sphere(
         rotation: (n, 3, 3) R_BF; translation: (n, 3) p_BF m, at each touch; tip: (3,) m in F, as far as it is known.
 
     Raises:
-        InputError: fewer than four touches. DegenerateMotion: the tip is asked for and the orientations do not vary.
+        InputError: fewer than four touches. DegenerateMotion: the touches lie on one spot or circle, or the tip is asked for and the
+            orientations do not vary.
         RadiusError: the freed radius is off by more than four of its sigmas.
     """
     poses = FlangePoses.checked(rotation, translation)
@@ -163,6 +165,14 @@ def fit_touch_sphere(
     at = np.einsum("nij,j->ni", poses.rotation, tip_0) + poses.translation
     A = np.column_stack([2.0 * at, np.ones(len(at))])
     start = np.linalg.lstsq(A, np.einsum("ni,ni->n", at, at), rcond=None)[0][:3]
+
+    out = at - start
+    singular = np.linalg.svd(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9), compute_uv=False)
+    spread = np.linalg.svd(at - at.mean(axis=0), compute_uv=False)[-1] / (np.sqrt(len(at)) * radius_m)
+    if not (singular[-1] > ONE_SPOT * singular[0] and spread > ONE_SPOT):
+        raise DegenerateMotion(
+            "The touches lie on one spot or one circle of the sphere, which leaves its centre open: touch it from above and all around."
+        )
 
     def unpack(x: Floats) -> tuple[Floats, Floats, float]:
         return x[:3], tip_0 + (x[3:6] if solve_tip else 0.0), radius_m + (x[-1] if solve_radius else 0.0)

@@ -65,11 +65,11 @@ class SphereData:
     q: Floats | None = None
     touch_q: Floats | None = None
 
-    def without(self, k: int) -> SphereData:
-        """The same but for scan k."""
-        keep = np.arange(len(self.poses)) != k
+    def without(self, *scans: int) -> SphereData:
+        """The same but for these scans."""
+        keep = ~np.isin(np.arange(len(self.poses)), scans)
         q = None if self.q is None else self.q[keep]
-        profiles = [p for j, p in enumerate(self.profiles) if j != k]
+        profiles = [p for p, kept in zip(self.profiles, keep, strict=True) if kept]
         return SphereData(self.poses[keep], profiles, self.radius_m, self.touches, self.tip, self.arm, q, self.touch_q)
 
 
@@ -233,6 +233,12 @@ class Problem:
         bottom = np.hstack(touch) / self.sigmas.touch_m if m else np.empty((0, self.layout.size))
         prior = np.diag(1.0 / self.layout.sigmas(self.sigmas))[9:]
         return np.vstack([top, bottom, prior])
+
+    def by_radius(self) -> Floats:
+        """Derivative of `residual` by the sphere's radius (1/m)."""
+        m = 0 if self.data.touches is None else len(self.data.touches)
+        scan = self._whitened(np.full((len(self.p), 1), -1.0 / self.sigmas.sensor_m))[:, 0]
+        return np.concatenate([scan, np.full(m, -1.0 / self.sigmas.touch_m), np.zeros(self.layout.size - 9)])
 
     def _robot_error(self, x: Floats) -> list[tuple[Floats, Floats]]:
         """Per scan (U, less) that whiten residuals which share the robot's error: C^-1/2 r = r - U less U^T r."""
