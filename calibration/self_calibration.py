@@ -105,7 +105,7 @@ def self_calibrate(
     together = from_motion(observations, patterns, seed=seed, usual=True)
     if together.certainty < _EVIDENT:
         return refused(f"No scanner correction is needed: {both}, which may be chance.")
-    held_out, tilt = _held_out(observations, patterns, seed, 1)
+    held_out, tilt = held_out_errors(observations, patterns, seed, 1)
     before, after = _means(rigid_held_out_m, held_out)
     if not after < _GAIN * before:
         return refused(
@@ -117,7 +117,7 @@ def self_calibrate(
         f"The scanner is corrected: {both}; held-out errors fall from {1e3 * before:.3f} to {1e3 * after:.3f} mm (mean)"
     )
     for order in (2, 3) if n >= _LEAST_FOR_THIRD else (2,):
-        bent, bent_tilt = _held_out(observations, patterns, seed, order)
+        bent, bent_tilt = held_out_errors(observations, patterns, seed, order)
         if not _pays(held_out, tilt, bent, bent_tilt):
             break
         was, now = _means(tilt, bent_tilt)
@@ -159,7 +159,7 @@ def _from_few(
         return None
     if from_motion(observations, patterns, seed=seed, usual=True).certainty < _EVIDENT_FEW:
         return None
-    errors, tilts = _held_out(observations, patterns, seed, 2)
+    errors, tilts = held_out_errors(observations, patterns, seed, 2)
     before, after = _means(rigid_held_out_m, errors)
     if not np.isfinite(errors).all() or not after < _CHANCE_FEW * before:
         return None
@@ -211,7 +211,7 @@ def apply_self_calibration(
     return scanner, corrected, replace(estimate, held_out=HeldOut(position, tilt))
 
 
-def _held_out(
+def held_out_errors(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], seed: int, order: int
 ) -> tuple[Array, Array]:
     """Errors (n,) m and tilts (n,) rad of each pose under correction and calibration made without it."""
