@@ -62,5 +62,5 @@ def test_the_spread_of_a_median_is_that_of_many_medians() -> None:
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
 def test_a_comparison_of_ingredients_needs_a_dozen_scans() -> None:
-    with pytest.raises(TooFewPoses, match="needs 12 usable scans, and there are 0|at least 4 usable poses"):
+    with pytest.raises(TooFewPoses, match="needs 12 usable scans, and there are 1"):
         study_ingredients(DATA / "franka_phoxi_m")

@@ -51,16 +51,10 @@ def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progr
     seen = see_flanges(
         data, get_flange(data.header.flange), seed=seed, tell=lambda f: progress("fitting flanges", 0.5 * f)
     )
-    rough = (
-        estimate_eye_on_base(seen.observations, SolveConfig(seed=seed, leave_one_out=False))
-        if seen.observations
-        else None
-    )
-    good = [] if rough is None else [o for o, keep in zip(seen.observations, rough.inliers, strict=True) if keep]
-    if len(good) < LEAST:
-        raise TooFewPoses(
-            f"The comparison leaves every scan out in turn: it needs {LEAST} usable scans, and there are {len(good)}."
-        )
+    _enough(len(seen.observations))
+    rough = estimate_eye_on_base(seen.observations, SolveConfig(seed=seed, leave_one_out=False))
+    good = [o for o, keep in zip(seen.observations, rough.inliers, strict=True) if keep]
+    _enough(len(good))
     rows = []
     for k, (name, normals) in enumerate((("centres, scanner as it is", False), ("and face normals", True))):
         progress(name, 0.5 + 0.05 * k)
@@ -81,6 +75,13 @@ def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progr
         sigma = from_motion(good, seen.patterns, seed=seed, order=order, usual=True).sigma_position_m
         rows.append(Ingredient(name, position, tilt, _floor(sigma)))
     return rows
+
+
+def _enough(n: int) -> None:
+    if n < LEAST:
+        raise TooFewPoses(
+            f"The comparison leaves every scan out in turn: it needs {LEAST} usable scans, and there are {n}."
+        )
 
 
 def _floor(sigma_m: float) -> float:
