@@ -31,6 +31,8 @@ _FEWEST_PATTERNS = 3  # below eight poses, where the hole circle decides
 _BLIND_SCALE = 2e-3  # a scale known worse than this is as good as unknown: scanners are right to 0.2 %
 _BLIND_GRADIENT = 2e-2
 _EVIDENT = 0.999  # probability that the correction is not zero by chance
+_EVIDENT_FEW = 0.95  # the same below eight poses, where the correction is held back besides
+_CHANCE_FEW = 1.6  # held-out errors of four poses differ by as much by chance: root of F (12, 12) at 5 %
 _CONTRADICT = 0.99  # probability beyond which two sources that differ so much do contradict each other
 _GAIN = 0.95  # of the held-out error that must be left at most: a correction that gains less is not worth its unknowns
 
@@ -103,7 +105,7 @@ def self_calibrate(
     together = from_motion(observations, patterns, seed=seed, usual=True)
     if together.certainty < _EVIDENT:
         return refused(f"No scanner correction is needed: {both}, which may be chance.")
-    held_out, tilt = _held_out(observations, patterns, seed, 1)
+    held_out, tilt = held_out_errors(observations, patterns, seed, 1)
     before, after = _means(rigid_held_out_m, held_out)
     if not after < _GAIN * before:
         return refused(
@@ -115,7 +117,7 @@ def self_calibrate(
         f"The scanner is corrected: {both}; held-out errors fall from {1e3 * before:.3f} to {1e3 * after:.3f} mm (mean)"
     )
     for order in (2, 3) if n >= _LEAST_FOR_THIRD else (2,):
-        bent, bent_tilt = _held_out(observations, patterns, seed, order)
+        bent, bent_tilt = held_out_errors(observations, patterns, seed, order)
         if not _pays(held_out, tilt, bent, bent_tilt):
             break
         was, now = _means(tilt, bent_tilt)
@@ -150,23 +152,18 @@ def _from_few(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], rigid_held_out_m: Array, seed: int
 ) -> SelfCalibration | None:
     """The verdict below eight poses: the hole circles, and motion as far as it tells, held to what scanners usually are off;
-    believed where errors at poses left out of correction and calibration fall; None where they do not."""
+    believed where that is not zero by chance and errors at poses left out of correction and calibration do not rise beyond
+    chance; None where they do. That they fall is not asked: four errors from three poses each are no measure of a gain."""
     n = len(observations)
     if n < 4 or sum(o.id in patterns for o in observations) < _FEWEST_PATTERNS:
         return None
-    best: tuple[int, Array, Array] | None = None
-    for order in (1, 2):
-        errors, tilts = _held_out(observations, patterns, seed, order)
-        if not np.isfinite(errors).all():
-            return None
-        if best is None or _pays(best[1], best[2], errors, tilts):
-            best = (order, errors, tilts)
-    assert best is not None
-    order, errors, tilts = best
-    before, after = _means(rigid_held_out_m, errors)
-    if not after < _GAIN * before:
+    if from_motion(observations, patterns, seed=seed, usual=True).certainty < _EVIDENT_FEW:
         return None
-    found = from_motion(observations, patterns, seed=seed, order=order, usual=True)
+    errors, tilts = held_out_errors(observations, patterns, seed, 2)
+    before, after = _means(rigid_held_out_m, errors)
+    if not np.isfinite(errors).all() or not after < _CHANCE_FEW * before:
+        return None
+    found = from_motion(observations, patterns, seed=seed, order=2, usual=True)
     return SelfCalibration(
         found,
         None,
@@ -174,7 +171,7 @@ def _from_few(
         errors,
         tilts,
         f"The scanner is corrected by what the flange's hole circle shows, as {n} poses are too few for the robot's motion to "
-        f"confirm it: a scale of {_percent(found)}; held-out errors fall from {1e3 * before:.3f} to {1e3 * after:.3f} mm "
+        f"confirm it: a scale of {_percent(found)}; held-out errors are {1e3 * after:.3f} mm with it and {1e3 * before:.3f} without "
         "(mean). X_BC belongs to scans that are corrected so.",
         True,
     )
@@ -214,7 +211,7 @@ def apply_self_calibration(
     return scanner, corrected, replace(estimate, held_out=HeldOut(position, tilt))
 
 
-def _held_out(
+def held_out_errors(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], seed: int, order: int
 ) -> tuple[Array, Array]:
     """Errors (n,) m and tilts (n,) rad of each pose under correction and calibration made without it."""

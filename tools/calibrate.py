@@ -142,7 +142,7 @@ def calibrate_dataset(
             observations, seen.patterns, None if axis_turn_deg is None else float(np.radians(axis_turn_deg)), seed=seed
         )
         if few
-        else estimate_eye_on_base(observations, SolveConfig(seed=seed))
+        else estimate_eye_on_base(observations, SolveConfig(seed=seed, allow_coplanar=bool(fits)))
     )
     tell("judging the scanner", 0.72)
     rigid = estimate

@@ -1,4 +1,4 @@
-"""weldcal benchmark flange, flange-frames, flange-honesty and flange-live: speed, certainty, honesty, the live target."""
+"""weldcal benchmark flange, flange-frames, flange-honesty, flange-live, flange-ingredients: speed, certainty, honesty, limits."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ OutOption = Annotated[
 
 
 def mount(benchmarks: typer.Typer) -> None:
-    """Adds the four commands."""
+    """Adds the five commands."""
     benchmarks.command("flange")(speed)
     benchmarks.command("flange-frames")(frames)
     benchmarks.command("flange-honesty")(honesty)
     benchmarks.command("flange-live")(live)
+    benchmarks.command("flange-ingredients")(ingredients)
 
 
 def speed(
@@ -173,6 +174,48 @@ def live(
         "no method below": f"{summary['bound_mm']:.3f} mm and {summary['bound_deg']:.4f} degrees rms (Cramer-Rao, these poses)",
     }
     _finish("benchmark flange-live", summary, lines, out, json)
+
+
+def ingredients(
+    dataset: Annotated[Path, typer.Argument(help="A folder of twelve scans and more.")],
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """What normals, hole circle, gradient and bends are each worth on recorded scans, and the floor under it."""
+    with (
+        console.boundary(json_wanted=json, debug=debug),
+        console.progress_bar("benchmark flange-ingredients") as progress,
+    ):
+        import numpy as np
+
+        from weldcal.tools.studies.ingredients import study_ingredients
+
+        found = study_ingredients(dataset, seed, progress)
+        rows: list[dict[str, object]] = []
+        for r in found:
+            e, t = 1e3 * r.position_m, np.degrees(r.tilt_rad)
+            rows.append(
+                {
+                    "name": r.name,
+                    "position_mm": {
+                        "median": float(np.median(e)),
+                        "mean": float(e.mean()),
+                        "p95": float(np.percentile(e, 95)),
+                    },
+                    "median_sigma_mm": 1e3 * r.median_sigma_m(),
+                    "tilt_deg": {"median": float(np.nanmedian(t)), "p95": float(np.nanpercentile(t, 95))},
+                    "floor_mm": 1e3 * r.floor_m,
+                }
+            )
+    lines = {
+        r.name: f"{np.median(1e3 * r.position_m):.3f} +- {1e3 * r.median_sigma_m():.3f} / {1e3 * r.position_m.mean():.3f} / "
+        f"{np.percentile(1e3 * r.position_m, 95):.3f} mm, tilt {np.nanmedian(np.degrees(r.tilt_rad)):.3f} / "
+        f"{np.nanpercentile(np.degrees(r.tilt_rad), 95):.3f} degrees; spread alone {1e3 * r.floor_m:.3f} mm"
+        for r in found
+    }
+    _finish("benchmark flange-ingredients", {"state": "done", "rows": rows}, lines, out, json)
 
 
 def _finish(command: str, summary: dict[str, object], lines: dict[str, str], out: Path | None, json: bool) -> None:

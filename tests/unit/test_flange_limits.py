@@ -1,0 +1,66 @@
+"""What bounds a flange calibration: the arm's repeatability and the scanner, and how many scans a comparison needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.observation import Observation
+from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.tools.studies.ingredients import Ingredient, study_ingredients
+from weldcal.tools.studies.live_target import bound, live_scenario
+
+DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
+Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])
+X_CB = RigidTransform(RollPitchYaw(3.1, 0.05, -1.5), [0.0, 0.6, 0.9])
+WORK = np.array([0.65, 0.0, 0.05])
+
+
+def _sightings(n: int, center_sigma_m: float = 1e-5) -> tuple[Observation, ...]:
+    arm, rng = load_arm("ur10e"), np.random.default_rng(0)
+    out = []
+    for k in range(n):
+        X_BF = forward_kinematics(arm, Q_HOME + rng.uniform(-0.25, 0.25, 6))
+        p_C, n_C = X_CB @ X_BF.translation(), X_CB.rotation() @ X_BF.rotation().matrix()[:, 2]
+        out.append(Observation(f"p{k}", X_BF, p_C, n_C, center_sigma_m**2 * np.eye(3), 1e-5))
+    return tuple(out)
+
+
+def test_the_bound_falls_with_the_number_of_scans_and_with_the_arms_repeatability() -> None:
+    arm, eight = load_arm("ur10e"), _sightings(8)
+    at_work, turn = bound(eight, arm, Q_HOME, 5e-5, WORK)
+    # eight independent offsets of 0.05 mm: their mean is known to 0.018 mm, a point beside them a little worse
+    assert 5e-5 / np.sqrt(8) < at_work < 4.0 * 5e-5 / np.sqrt(8)
+    twice = tuple(o for o in eight for _ in range(2))
+    # the same eight poses seen twice, each stop its own: half the variance
+    assert bound(twice, arm, Q_HOME, 5e-5, WORK)[0] == pytest.approx(at_work / np.sqrt(2.0), rel=1e-6)
+    # the scanner's own noise is small beside the arm's here: what is left scales with the arm
+    assert bound(eight, arm, Q_HOME, 1e-4, WORK)[0] == pytest.approx(2.0 * at_work, rel=0.1)
+    assert bound(_sightings(8, 1e-4), arm, Q_HOME, 5e-5, WORK)[0] > 1.3 * at_work
+    assert np.degrees(turn) < 0.02
+
+
+def test_the_live_target_is_measured_with_that_many_scans_and_that_arm() -> None:
+    scenario = live_scenario(0.05, 8)
+    assert scenario.robot.repeatability_mm == 0.05  # type: ignore[union-attr]
+    assert scenario.calibration.minimum_scans == scenario.calibration.maximum_scans == 8
+    assert scenario.scanner.preset == "phoxi_m"  # type: ignore[union-attr]
+
+
+def test_the_spread_of_a_median_is_that_of_many_medians() -> None:
+    rng = np.random.default_rng(1)
+    medians = [float(np.median(np.abs(rng.standard_normal(18)))) for _ in range(2000)]
+    stated = [
+        Ingredient("x", np.abs(rng.standard_normal(18)), np.zeros(18), 0.0).median_sigma_m(seed) for seed in range(40)
+    ]
+    assert np.mean(stated) == pytest.approx(np.std(medians), rel=0.25)
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
+def test_a_comparison_of_ingredients_needs_a_dozen_scans() -> None:
+    with pytest.raises(TooFewPoses, match="needs 12 usable scans, and there are 1"):
+        study_ingredients(DATA / "franka_phoxi_m")

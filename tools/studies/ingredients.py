@@ -1,0 +1,112 @@
+"""What each ingredient of a calibration is worth on recorded scans: held-out errors, step by step, and the floor under them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi
+
+from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.observation import Observation
+from weldcal.calibration.scanner_fit import from_holes, from_motion
+from weldcal.calibration.scanner_model import ScannerCorrection
+from weldcal.calibration.self_calibration import held_out_errors
+from weldcal.calibration.sightings import see_flanges
+from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.validation import position_errors, tilt_errors
+from weldcal.models.flanges import get_flange
+from weldcal.tools.simulation import Progress, no_progress
+
+Array = NDArray[np.float64]
+
+LEAST = 12
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Ingredient:
+    """One way to calibrate, every scan left out in turn: errors (n,) m and tilts (n,) rad; ``floor_m`` is the median error that the
+    spread of arm and scanner about this model leaves even where it is known exactly."""
+
+    name: str
+    position_m: Array
+    tilt_rad: Array
+    floor_m: float
+
+    def median_sigma_m(self, seed: int = 0) -> float:
+        """How well so many errors tell their median (bootstrap standard deviation, m)."""
+        draws = np.random.default_rng(seed).choice(self.position_m, (_DRAWS, len(self.position_m)))
+        return float(np.median(draws, axis=1).std())
+
+
+def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progress) -> list[Ingredient]:
+    """Step by step on one dataset of scans. Raises InputError for a folder that is none, TooFewPoses below twelve usable scans."""
+    data = load_dataset(folder)
+    seen = see_flanges(
+        data, get_flange(data.header.flange), seed=seed, tell=lambda f: progress("fitting flanges", 0.5 * f)
+    )
+    _enough(len(seen.observations))
+    rough = estimate_eye_on_base(seen.observations, SolveConfig(seed=seed, leave_one_out=False))
+    good = [o for o, keep in zip(seen.observations, rough.inliers, strict=True) if keep]
+    _enough(len(good))
+    rows = []
+    for k, (name, normals) in enumerate((("centres, scanner as it is", False), ("and face normals", True))):
+        progress(name, 0.5 + 0.05 * k)
+        config = SolveConfig(seed=seed, use_normals=normals)
+        e = estimate_eye_on_base(good, config)
+        tilt = e.held_out.tilt_rad if normals else _tilts(good, config)
+        rows.append(Ingredient(name, e.held_out.position_m, tilt, _floor(e.sigma_position_m)))
+    progress("hole circle alone", 0.6)
+    if from_holes(good, seen.patterns) is not None:
+        rows.append(_holes_alone(good, seen.patterns, seed))
+    for order, name in (
+        (1, "scale and gradient, hole circle and motion"),
+        (2, "and bends of order 2"),
+        (3, "and bends of order 3"),
+    ):
+        progress(name, 0.55 + 0.12 * order)
+        position, tilt = held_out_errors(good, seen.patterns, seed, order)
+        sigma = from_motion(good, seen.patterns, seed=seed, order=order, usual=True).sigma_position_m
+        rows.append(Ingredient(name, position, tilt, _floor(sigma)))
+    return rows
+
+
+def _enough(n: int) -> None:
+    if n < LEAST:
+        raise TooFewPoses(
+            f"The comparison leaves every scan out in turn: it needs {LEAST} usable scans, and there are {n}."
+        )
+
+
+def _floor(sigma_m: float) -> float:
+    return float(sigma_m * chi.median(3))
+
+
+def _tilts(good: Sequence[Observation], config: SolveConfig) -> Array:
+    """Held-out tilts of calibrations by centres alone."""
+    once = SolveConfig(seed=config.seed, use_normals=False, leave_one_out=False)
+    return np.array(
+        [float(tilt_errors(estimate_eye_on_base([p for p in good if p is not o], once).X_BC, [o])[0]) for o in good]
+    )
+
+
+def _holes_alone(good: Sequence[Observation], patterns: Mapping[str, HolePattern], seed: int) -> Ingredient:
+    """The correction from the hole circle, no robot in it; then as with an exact scanner."""
+    config = SolveConfig(seed=seed, leave_one_out=False)
+    errors, tilts = np.full((2, len(good)), np.nan)
+    sigma = 0.0
+    for k, o in enumerate(good):
+        rest = [p for p in good if p is not o]
+        found = from_holes(rest, patterns)
+        correction = ScannerCorrection() if found is None else found.correction
+        e = estimate_eye_on_base([correction.observation(p) for p in rest], config)
+        seen = [correction.observation(o)]
+        errors[k], tilts[k] = float(position_errors(e.X_BC, seen)[0]), float(tilt_errors(e.X_BC, seen)[0])
+        sigma += e.sigma_position_m / len(good)
+    return Ingredient("scale and gradient, hole circle alone", errors, tilts, _floor(sigma))
