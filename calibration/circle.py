@@ -134,6 +134,7 @@ def refine_circles(
         normal = weighted @ J.transpose(0, 2, 1)
         if fixed is not None:
             normal[fixed, 2, 2] = np.maximum(w[fixed].sum(axis=1), 1e-9)
+        # one check after the start: a step that leads astray ends in a matrix that cannot be inverted, or far off
         if k < 2 and not (np.abs(np.linalg.det(normal)) > 1e-9 * normal[:, 2, 2] ** 3).all():
             raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
         try:
@@ -150,7 +151,12 @@ def refine_circles(
     information = J @ J.transpose(0, 2, 1)
     if fixed is not None:
         information[fixed, 2, 2] = 1.0
-    covariance = variance[:, None, None] * np.linalg.inv(information)
+    try:
+        covariance = variance[:, None, None] * np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        raise CircleFitError("The points do not fix a circle: they cover too short an arc.") from None
+    if not np.isfinite(theta).all():
+        raise CircleFitError("No circle agrees with enough of the points.")
     if fixed is not None:
         covariance[fixed, 2, 2] = 0.0
     out = []

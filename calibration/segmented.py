@@ -70,7 +70,7 @@ def fit_segmented(points: Array, standard: FlangeStandard, config: FlangeFitConf
     if min(len(r) for r in rims) < 24:
         return None
     try:
-        fits = refine_circles(rims, radii, noise_floor=0.1 * pitch, settled=0.01 * pitch)
+        fits = refine_circles(rims, radii, noise_floor=0.1 * pitch, settled=0.02 * pitch)
     except CircleFitError:
         return None
     outer_fit, bore = fits
@@ -112,10 +112,10 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
     normal, at = normals[:, best], a[:, best]
     scale = config.hypothesis_tolerance_m / _TUKEY * 2.0
     points, values = Q, np.ones(3)
-    for k in range(4):
+    for k in range(3):
         d = normal @ points - normal @ at
         if k:
-            spread = np.abs(d if k < 3 else d[:: max(1, d.size // _FEW)])
+            spread = np.abs(d if k < 2 else d[:: max(1, d.size // _FEW)])
             scale = max(_MAD * float(np.partition(spread, len(spread) // 2)[len(spread) // 2]), 2e-5)
         t = d * np.float32(1.0 / (_TUKEY * scale))
         w = np.float32(1.0) - t * t
@@ -129,7 +129,7 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
         moments = (weighted @ points.T / total - np.outer(at, at)).astype(np.float64)
         values, vectors = np.linalg.eigh(moments)
         normal = vectors[:, 0].astype(np.float32)
-        if k == 2:
+        if k == 1:
             points = P
     if values[1] < 1e-12:
         return None, d

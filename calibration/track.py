@@ -30,6 +30,7 @@ _SHARED = 1.3  # variance of a labelled edge over the expected one, as in the wi
 _RING_SEEN = 0.6
 _FLAT_M = 3e-4  # rms of a face from its plane; a rougher one is for the careful way
 _EDGE_POINTS = 240  # crossings that place a circle well enough to look at the pixels about it
+_BENT = 0.05  # pixels: a lens that bends rays more is for the careful way, which knows quadratics
 _THREE = np.ones((3, 3), np.uint8)
 _BLOCK_V, _BLOCK_U = (a.ravel() for a in np.mgrid[0:_BLOCK, 0:_BLOCK].astype(np.int32))
 
@@ -41,12 +42,14 @@ def fit_tracked(
 
     None wherever anything is out of the ordinary: not there, partly hidden, no bore, rays that are no pinhole's.
     """
-    rect = _rectangle(cloud, center, 0.5 * standard.outer_m + _SLACK_M)
-    if rect is None:
+    found = _rectangle(cloud, center, 0.5 * standard.outer_m + _SLACK_M)
+    if found is None:
         return None
+    rect, rays = found
     grid = cloud[rect]
     z = np.ascontiguousarray(grid[..., 2], dtype=np.float32)  # to a twentieth of a micrometre
-    rays = _rays(grid)
+    if rays is None:
+        rays = _rays(grid)
     if rays is None:
         return None
     plane = _plane(z, rays, center, normal, standard, config)
@@ -82,8 +85,9 @@ def _pinhole(A: Array, p: Array) -> Array | None:
         return None
 
 
-def _rectangle(cloud: Array, center: Array, reach: float) -> tuple[slice, slice] | None:
-    """The pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels."""
+def _rectangle(cloud: Array, center: Array, reach: float) -> tuple[tuple[slice, slice], Array | None] | None:
+    """The pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels; and
+    their rays, as ``_rays`` gives them, where that pinhole fits the whole image."""
     some = _sampled(cloud, 12)
     if some is None or not float(center[2]) > 2.0 * reach:
         return None
@@ -101,7 +105,13 @@ def _rectangle(cloud: Array, center: Array, reach: float) -> tuple[slice, slice]
     high = [int(np.ceil(x + wide / abs(k))) + 1 for x, k in zip(at, (c[1, 0], c[2, 1]), strict=True)]
     if min(low) < 0 or high[0] > cloud.shape[1] or high[1] > cloud.shape[0]:
         return None  # cut by the image's border: partly hidden
-    return slice(low[1], high[1]), slice(low[0], high[0])
+    rays = None
+    off = some[0] @ c - some[1][:, :2] / some[1][:, 2:]
+    if float(np.abs(off).max()) < _BENT * float(np.abs(c[1:]).max()):
+        rays = np.zeros((3, 3))
+        rays[:, :2], rays[0, 2] = c, 1.0
+        rays[0, :2] += low[0] * c[1] + low[1] * c[2]
+    return (slice(low[1], high[1]), slice(low[0], high[0])), rays
 
 
 def _rays(grid: Array) -> Array | None:
@@ -110,8 +120,7 @@ def _rays(grid: Array) -> Array | None:
     c = None if some is None else _pinhole(*some)
     if some is None or c is None:
         return None
-    # a lens that bends rays by a twentieth of a pixel is for the careful way, which knows quadratics
-    if not float(np.abs(some[0] @ c - some[1][:, :2] / some[1][:, 2:]).max()) < 0.05 * float(np.abs(c[1:]).max()):
+    if not float(np.abs(some[0] @ c - some[1][:, :2] / some[1][:, 2:]).max()) < _BENT * float(np.abs(c[1:]).max()):
         return None
     out = np.zeros((3, 3))
     out[:, :2], out[0, 2] = c, 1.0
@@ -147,8 +156,8 @@ def _plane(
     B, b = A[:, ::few], d[::few]
     fit = np.array([float(np.partition(b, len(b) // 2)[len(b) // 2]), 0.0, 0.0])
     scale = 2.0 * config.hypothesis_tolerance_m / _TUKEY
-    for k in range(5):  # a part of the points finds the plane; then all of them
-        if k == 3:
+    for k in range(4):  # a part of the points finds the plane; then all of them
+        if k == 2:
             B, b = A, d
         e = b - fit @ B
         if k:

@@ -329,7 +329,7 @@ def _face(
         better = fit_plane(points, (plane.point, plane.normal), tolerance=2.0 * thickness(plane))
     except PlaneFitError:
         return face
-    better = _honest(better, w, np.flatnonzero(ring))
+    better = _honest(better, w, ring)
     # the centres stay on their rays
     shift = [_moved(f.center, plane, better, axes) for f in (outer, bore) if f is not None]
     return replace(
@@ -356,26 +356,32 @@ def _seen(w: _Window, circle: CircleFit, blind: Mask | None, pitch: float) -> fl
 
 def _domed(w: _Window, ring: Mask, rho2: Array, plane: PlaneFit) -> bool:
     """Does a ring (h, w) bulge, as that part of a ball does which lies near a plane?"""
-    at = np.flatnonzero(ring & w.face)
-    above = w.z.ravel()[at] * w.slope.ravel()[at] - float(plane.normal @ plane.point)
-    inner = rho2.ravel()[at] < np.median(rho2.ravel()[at])
+    s = _thin(ring)
+    on = ring[s] & w.face[s]
+    above, far = (w.z[s] * w.slope[s])[on] - float(plane.normal @ plane.point), rho2[s][on]
+    inner = far < np.median(far)
     return abs(float(above[inner].mean() - above[~inner].mean())) > max(_FLAT_M, _DOMED * plane.rms)
 
 
-def _honest(plane: PlaneFit, w: _Window, at: NDArray[np.intp]) -> PlaneFit:
-    """The plane with the spread that is left when neighbouring pixels (flat indices (N,)) share their noise."""
-    e = w.z.ravel()[at] * _slopes(plane, w, at) - float(plane.normal @ plane.point)
+def _thin(ring: Mask) -> tuple[slice, slice]:
+    """Every so manieth pixel along rows and columns that some thousands of a ring's remain."""
+    step = slice(None, None, max(1, int(np.sqrt(np.count_nonzero(ring) / _PLANE_POINTS) + 0.5)))
+    return step, step
+
+
+def _honest(plane: PlaneFit, w: _Window, ring: Mask) -> PlaneFit:
+    """The plane with the spread that is left when neighbouring pixels share their noise: as some of them tell it."""
+    s = _thin(ring)
+    n = plane.normal
+    at = np.flatnonzero(ring[s])
+    slope = n[0] * w.rays[0][s].ravel()[at] + n[1] * w.rays[1][s].ravel()[at] + n[2]
+    e = w.z[s].ravel()[at] * slope - float(n @ plane.point)
     good = np.abs(e) < 4.0 * plane.rms
-    shared = shared_noise(e * good, good, at, w.z.shape)
+    shared = shared_noise(e * good, good, at, ring[s].shape) * plane.n_inliers / max(int(np.count_nonzero(good)), 1)
+    shared = max(shared, 1.0)
     return replace(
         plane, n_inliers=int(plane.n_inliers / shared), normal_sigma=plane.normal_sigma * float(np.sqrt(shared))
     )
-
-
-def _slopes(plane: PlaneFit, w: _Window, at: NDArray[np.intp]) -> Array:
-    """A plane's normal times the rays of pixels (flat indices (N,))."""
-    n = plane.normal
-    return np.asarray(n[0] * w.rays[0].ravel()[at] + n[1] * w.rays[1].ravel()[at] + n[2])
 
 
 def _moved(center: Array, old: PlaneFit, new: PlaneFit, axes: Array) -> Array:

@@ -1,4 +1,4 @@
-"""weldcal benchmark flange, flange-frames, flange-honesty, flange-live, flange-ingredients: speed, certainty, honesty, limits."""
+"""weldcal benchmark flange and flange-frames, -hidden, -parts, -honesty, -live, -ingredients: how fast, sure, honest and good."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ OutOption = Annotated[
 
 
 def mount(benchmarks: typer.Typer) -> None:
-    """Adds the five commands."""
+    """Adds the commands."""
     benchmarks.command("flange")(speed)
     benchmarks.command("flange-frames")(frames)
+    benchmarks.command("flange-hidden")(hidden)
+    benchmarks.command("flange-parts")(parts)
     benchmarks.command("flange-honesty")(honesty)
     benchmarks.command("flange-live")(live)
     benchmarks.command("flange-ingredients")(ingredients)
@@ -94,6 +96,65 @@ def frames(
         "centre": f"{found.rms_mm:.3f} mm rms, {summary['centre_max_mm']:.3f} at most",
     }
     _finish("benchmark flange-frames", summary, lines, out, json)
+
+
+def hidden(
+    count: Annotated[int, typer.Option("--frames", metavar="N", min=1, help="Frames for each way of hiding.")] = 30,
+    share: Annotated[
+        float, typer.Option("--share", metavar="S", min=0.0, max=0.9, help="Hidden part of the flange's width.")
+    ] = 0.5,
+    width: Annotated[
+        int, typer.Option("--width", metavar="PX", min=200, help="Of a PhoXi M frame; 2064 is all.")
+    ] = 824,
+    flange: Annotated[str, typer.Option("--flange", metavar="NAME", help="Flange standard.")] = "iso9409-1-50-4-m6",
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """A flange half hidden by a plate, the image's border or missing readings: found, and how honestly?"""
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-hidden") as progress:
+        from weldcal.models.flanges import get_flange
+        from weldcal.models.scanners import get_scanner
+        from weldcal.tools.studies.flange_hidden import WAYS, study_hidden
+
+        scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
+        rows = [study_hidden(w, scanner, standard, count, share=share, seed=seed, progress=progress) for w in WAYS]
+    summary: dict[str, object] = {"state": "done", "rows": [r.summary() for r in rows]}
+    lines = {
+        r.way: f"{len(r.errors_m)} of {r.frames} found, centre {r.rms_mm:.3f} mm rms; squared error over the stated one "
+        f"{r.mean_normalised:.2f}; {100 * r.mean_coverage:.0f} % of the edge seen"
+        for r in rows
+    }
+    _finish("benchmark flange-hidden", summary, lines, out, json)
+
+
+def parts(
+    dataset: Annotated[Path, typer.Argument(metavar="DATASET", help="Folder with clouds, as calibrate takes it.")],
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """How far do two parts of one cloud disagree about the flange's centre, and how far must they?"""
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-parts") as progress:
+        from weldcal.calibration.dataset import load_dataset
+        from weldcal.models.errors import InputError
+        from weldcal.models.flanges import get_flange
+        from weldcal.tools.studies.flange_halves import study_parts
+
+        data = load_dataset(dataset)
+        if not data.clouds:
+            raise InputError(f"'{dataset}' holds no clouds to divide: give a dataset with scans.")
+        rows = study_parts(
+            [data.cloud(id) for id in data.clouds], get_flange(data.header.flange), seed=seed, progress=progress
+        )
+    lines = {
+        f"{r.points} points each": f"{r.apart_mm:.3f} mm apart (rms; least possible {r.bound_mm:.3f}, stated "
+        f"{r.stated_mm:.3f}); of the two together {0.5 * r.apart_mm:.3f}"
+        for r in rows
+    }
+    _finish("benchmark flange-parts", {"state": "done", "rows": [vars(r) for r in rows]}, lines, out, json)
 
 
 def honesty(

@@ -32,6 +32,33 @@ class Hidden:
     coverage: Array
     missed: tuple[str, ...]
 
+    @property
+    def rms_mm(self) -> float:
+        """Root mean square (3-D) of the centre errors, mm."""
+        return float(1e3 * np.sqrt(np.mean(self.errors_m**2))) if len(self.errors_m) else float("nan")
+
+    @property
+    def mean_normalised(self) -> float:
+        """Mean square of the normalised errors: 1 where the stated covariance is right."""
+        return float(np.mean(self.normalised)) if len(self.normalised) else float("nan")
+
+    @property
+    def mean_coverage(self) -> float:
+        """Mean share of the edge that was seen."""
+        return float(np.mean(self.coverage)) if len(self.coverage) else 0.0
+
+    def summary(self) -> dict[str, object]:
+        """The row as one JSON object."""
+        return {
+            "way": self.way,
+            "frames": self.frames,
+            "found": len(self.errors_m),
+            "centre_rms_mm": self.rms_mm,
+            "normalised": self.mean_normalised,
+            "coverage": self.mean_coverage,
+            "missed": list(self.missed),
+        }
+
 
 def hidden_frame(
     way: str, scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, share: float = 0.5
