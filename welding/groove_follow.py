@@ -11,7 +11,7 @@ from weldcal.welding.groove_corner import Corner
 from weldcal.welding.groove_line import Line, smoothing_weights
 from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveTooNarrow
 from weldcal.welding.groove_search import CoarseGroove
-from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile, Section, fit_section
+from weldcal.welding.groove_section import BAND_M, Profile, Section, fit_section
 from weldcal.welding.planes import Floats
 
 STATION_M = 0.001
@@ -130,10 +130,6 @@ def agreed(slices: Slices) -> Slices:
         return slices
     points = np.array([sum(x.on_walls) for x in slices.sections])
     good = points >= max(5.0, 0.35 * float(np.median(points)))
-    # Beside what hides a part of the groove one wall is seen and the other is not: such a section leans to one side.
-    fewer = np.array([min(x.on_walls) for x in slices.sections])
-    if np.median(fewer) >= 2 * ENOUGH:
-        good &= fewer >= 0.35 * float(np.median(fewer))
     for name, least in (("centre", 3e-4), ("root", 6e-4)):
         value = slices.column(name)
         # Against a smooth curve through the others near it: a bend is not an outlier.

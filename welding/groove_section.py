@@ -17,6 +17,7 @@ from weldcal.welding.planes import Floats
 ITERATIONS = 12
 ENOUGH = 3  # points on a wall to be a wall
 WIDE_M = 0.0015  # how far off in z points may at first be, on a line that is not yet the groove's
+SHOULDER_PITCHES = 1.5  # how far the end of the face may lie from the shoulder and be it
 BAND_M = 0.006  # of face beyond each shoulder that takes part
 
 
@@ -129,8 +130,10 @@ def fit_section(
             row = np.zeros(4)
             row[0], row[1], row[2 + side] = 1.0, -sign / x[2 + side], -sign * rise / x[2 + side] ** 2
             off = centre + edge - (x[0] + sign * rise / x[2 + side])
-            A += np.outer(row, row) / (0.5 * pitch) ** 2
-            b += row * off / (0.5 * pitch) ** 2
+            # Where something hides the groove the face ends at its shadow, and not at the shoulder.
+            belief = 1.0 if step < 3 else 1.0 / (1.0 + (off / (SHOULDER_PITCHES * pitch)) ** 2) ** 2
+            A += belief * np.outer(row, row) / (0.5 * pitch) ** 2
+            b += belief * row * off / (0.5 * pitch) ** 2
         information = A
         change = np.linalg.solve(A, b)
         change[0] = np.clip(change[0], -0.5 * half, 0.5 * half)
