@@ -1,4 +1,4 @@
-"""Reading what a visit to the tablet left: one npz of planar touches, or the page's CSV with robot poses and an image."""
+"""Reading what a visit to the tablet left: the page's CSV with robot poses and an image."""
 
 from __future__ import annotations
 
@@ -17,23 +17,10 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.tablet.detection import Look, find_landmarks
 from weldcal.calibration.tablet.errors import TabletDataError
-from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.calibration.tablet.wrist import WristTouches
 
 Array = NDArray[np.float64]
 
-NPZ_KEYS = (
-    "uv",
-    "depth",
-    "hand",
-    "theta_deg",
-    "delta_px",
-    "tablet_px",
-    "mm_per_px",
-    "f",
-    "c",
-    "hand_capture",
-)
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
 POSE_COLUMNS = ("landmark", "x", "y", "z", "qw", "qx", "qy", "qz")
 SEEN_COLUMNS = ("landmark", "u", "v")
@@ -70,38 +57,6 @@ class WristVisit:
 def file_hash(path: Path) -> str:
     """SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def load_planar(path: Path) -> TabletTouches:
-    """Touches from an npz: uv (n, 2) px, depth (n) mm, hand (n, 2) mm, theta_deg (n), delta_px (n, 2), tablet_px (n, 2),
-    mm_per_px, f (px; one number or two), c (2) px, hand_capture (3) mm.
-
-    Raises TabletDataError: unreadable, a key missing, a shape that does not fit.
-    """
-    try:
-        with np.load(_there(path), allow_pickle=False) as archive:
-            d = {key: np.asarray(archive[key], dtype=float) for key in NPZ_KEYS if key in archive.files}
-    except (ValueError, OSError, EOFError, KeyError) as error:
-        raise TabletDataError(f"'{path.name}' is no npz file of numbers.") from error
-    except Exception as error:  # zipfile has errors of its own
-        raise TabletDataError(f"'{path.name}' is no npz file of numbers.") from error
-    missing = [key for key in NPZ_KEYS if key not in d]
-    if missing:
-        raise TabletDataError(f"'{path.name}' lacks {', '.join(missing)}; docs/tablet.md lists what it must hold.")
-    if d["uv"].ndim != 2 or d["mm_per_px"].size != 1 or d["f"].size not in (1, 2):
-        raise TabletDataError(f"'{path.name}' must hold uv (n, 2), one mm_per_px and one or two f.")
-    return TabletTouches(
-        uv_px=d["uv"],
-        depth_m=1e-3 * d["depth"],
-        hand_m=1e-3 * d["hand"],
-        theta_rad=np.radians(d["theta_deg"]),
-        delta_px=d["delta_px"],
-        landmark_px=d["tablet_px"],
-        pitch_m=1e-3 * float(d["mm_per_px"].reshape(())),
-        focal_px=np.broadcast_to(d["f"].ravel(), 2).copy(),
-        centre_px=d["c"],
-        hand_capture_m=1e-3 * d["hand_capture"],
-    )
 
 
 def load_intrinsics(path: Path) -> Intrinsics:

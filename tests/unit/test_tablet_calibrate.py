@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from tests.unit.tablet_image import grid, picture, project
 from weldcal.calibration.tablet.errors import TabletDataError
-from weldcal.calibration.tablet.files import load_planar
+from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
 from weldcal.models.errors import InputError
 from weldcal.tools.cli_tablet import tablet
@@ -203,7 +203,7 @@ def test_an_npz_that_is_none_is_told(tmp_path: Path, npz: Path) -> None:
     with pytest.raises(TabletDataError, match="no npz file"):
         load_planar(broken)
     np.savez(tmp_path / "part.npz", uv=np.zeros((4, 2)))
-    with pytest.raises(TabletDataError, match="lacks depth, hand"):
+    with pytest.raises(TabletDataError, match="lacks hand, theta_deg"):
         load_planar(tmp_path / "part.npz")
 
 
