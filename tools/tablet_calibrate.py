@@ -10,6 +10,7 @@ import numpy as np
 
 from weldcal.calibration.tablet.chain import HTM_NAMES
 from weldcal.calibration.tablet.detection import Look
+from weldcal.calibration.tablet.doubts import wrist_doubts
 from weldcal.calibration.tablet.files import file_hash, load_visit
 from weldcal.calibration.tablet.planar_files import hand_step_m, load_planar
 from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
@@ -167,11 +168,6 @@ def _wrist(inputs: TabletInputs) -> TabletCalibration:
     )
     fit = fit_wrist(visit.data, inputs.pen_length_m)
     files = (inputs.file, inputs.poses, inputs.camera, inputs.image, inputs.seen)
-    checked = (
-        ()
-        if visit.size_checked
-        else ("The page's size was not checked with a card: lengths may be wrong by percents.",)
-    )
     in_page = fit.touch_residuals_m @ fit.X_BT.rotation().matrix()[:, :2]
     picture = None if visit.picture is None else marked_picture(visit.picture, visit.found_px)
     shown = Shown(visit.data.landmark_m, in_page, visit.names, picture)
@@ -186,7 +182,7 @@ def _wrist(inputs: TabletInputs) -> TabletCalibration:
         p_FP_m=fit.p_FP.tolist(),
         p_FP_covariance=fit.pen_covariance.tolist(),
         unobservable=fit.unobservable,
-        warnings=checked,
+        warnings=(*visit.warnings, *wrist_doubts(visit.data, fit, visit.names)),
         data_sha256={path.name: file_hash(path) for path in files if path is not None},
     )
     return TabletCalibration(result, shown, fit)
