@@ -120,7 +120,7 @@ def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
     found = fit_visit(visits[0], sign, step_m)
     best, errors = best_model([found])
     fit, touches = found.fits[best], visits[0].touches
-    shown = Shown(touches.landmark_m, fit.residuals_m, tuple(map(str, visits[0].rows)))
+    shown = Shown(touches.landmark_m, found.in_page(fit.residuals_m), tuple(map(str, visits[0].rows)))
     result = TabletResult(
         model=best,
         parameters=dict(zip(NAMES[best], fit.parameters.tolist(), strict=True)),

@@ -37,6 +37,11 @@ class VisitFits:
     warnings: tuple[str, ...]
     step_m: float
 
+    def in_page(self, hand_m: Array) -> Array:
+        """Differences of hands (n, 2) m as they lie on the page."""
+        phi = self.fits[PNP].parameters[0]
+        return np.asarray(hand_m @ np.array([[np.cos(phi), np.sin(phi)], [np.sin(phi), -np.cos(phi)]]))
+
     def left_out_mm(self, model: str) -> Array:
         """What each left-out landmark misses by, (n,) mm; NaN where it could not be left out."""
         return np.asarray(1e3 * np.linalg.norm(self.fits[model].leave_one_out_m, axis=1))

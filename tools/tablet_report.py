@@ -87,6 +87,7 @@ def miss_arrows(shown: Shown) -> bytes:
     figure = Figure(figsize=(6.4, float(np.clip(1.6 + 5.2 * ratio, 2.6, 7.0))), layout="constrained")
     axes = figure.subplots()
     axes.plot(p[:, 0], p[:, 1], "o", color="#555", markersize=4)
+    axes.plot(*(p + times * miss).T, ".", alpha=0.0)  # the arrows' tips belong to what is shown
     axes.quiver(p[:, 0], p[:, 1], *(times * miss).T, angles="xy", scale_units="xy", scale=1, color=OURS, width=0.006)
     for name, (x, y) in zip(shown.names, p, strict=True):
         axes.annotate(name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=9, color="#333")
@@ -105,7 +106,7 @@ def landmark_rows(result: TabletResult, names: Sequence[str]) -> tuple[tuple[str
     rows: list[tuple[str, ...]] = [
         (n, fixed(r, 3), fixed(lo, 3)) for n, r, lo in zip(names, result.residual_mm, left, strict=True)
     ]
-    return ("landmark", "in the fit, mm", "left out, mm"), rows
+    return ("landmark", "fit, mm", "left out, mm"), rows
 
 
 def calibration_report(

@@ -94,7 +94,7 @@ class ManyVisits:
             cards.insert(0, ("The file's queries, mean", fixed(held["mean"], 3), "mm", "good", worst))
         cards.append(("Visits", str(len(self.visits)), "", "plain", f"{len(self.refused)} refused"))
         rows = [
-            (v["id"], str(v["n_landmarks"]), fixed(v["residual_mm"], 3), fixed(v["leave_one_out_mm"], 3), fixed(v["held_out_mm"], 3))
+            (v["id"], fixed(v["held_out_mm"], 3), fixed(v["leave_one_out_mm"], 3), fixed(v["residual_mm"], 3), str(v["n_landmarks"]))
             for v in map(self._visit, self.visits)
         ]  # fmt: skip
         told = [(f"Visit {v.visit.name}: {text}") for v in self.visits for text in v.warnings]
@@ -107,7 +107,7 @@ class ManyVisits:
                 verdict=("warn" if self.refused else "good", f"{len(self.visits)} visits are calibrated", f"Model: {self.model}."),
                 cards=cards,
                 notes=[*(f"Visit {name} is refused: {reason}" for name, reason in self.refused), *told],
-                header=("visit", "landmarks", "in the fit, mm", "left out, mm", "queries, mm"),
+                header=("visit", "queries, mm", "left out, mm", "fit, mm", "landmarks"),
                 rows=rows,
                 provenance=[
                     ("software", software_version()),
