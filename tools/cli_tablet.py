@@ -60,8 +60,15 @@ def calibrate(
         float, typer.Option("--pen-radius-mm", metavar="MM", min=0.0, help="Radius of the pen's round tip.")
     ] = 0.0,
     hand_step_mm: Annotated[
-        float, typer.Option("--hand-step-mm", metavar="MM", min=0.0, help="npz: hands were read off in such steps.")
-    ] = 0.0,
+        float | None,
+        typer.Option(
+            "--hand-step-mm",
+            metavar="MM",
+            min=0.0,
+            help="npz: hands were read off in such steps; 0: they were not.",
+            show_default="found in the hands",
+        ),
+    ] = None,
     printed_sign: Annotated[
         bool, typer.Option("--printed-sign", help="npz: the touching error with the sign that the paper prints.")
     ] = False,
@@ -91,7 +98,7 @@ def calibrate(
             look,
             None if pen_length_mm is None else 1e-3 * pen_length_mm,
             1e-3 * pen_radius_mm,
-            1e-3 * hand_step_mm,
+            None if hand_step_mm is None else 1e-3 * hand_step_mm,
             printed_sign,
             two_stages,
         )

@@ -99,6 +99,8 @@ def robot_at(host: str, scenario: Scenario) -> UrRtde:
     """The robot at an address, with the load that the scenario's tool is."""
     if scenario.tool == "none":
         return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
+    if scenario.tool == "pen":
+        return UrRtde(host=host, payload_kg=0.42, payload_cog_m=[0.03, 0.0, 0.02])
     return UrRtde(host=host)
 
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from weldcal.calibration.tablet.chain import HTM_NAMES
 from weldcal.calibration.tablet.detection import Look
-from weldcal.calibration.tablet.files import file_hash, load_planar, load_visit
-from weldcal.calibration.tablet.linear import LINEAR_NAMES, fit_linear
-from weldcal.calibration.tablet.planar import PLANAR_NAMES, PlanarConfig, fit_planar
+from weldcal.calibration.tablet.doubts import wrist_doubts
+from weldcal.calibration.tablet.files import file_hash, load_visit
+from weldcal.calibration.tablet.planar_files import hand_step_m, load_planar
 from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
 from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
 from weldcal.calibration.tablet.touches import TabletTouches
@@ -20,10 +20,9 @@ from weldcal.calibration.tablet.two_stage import AFFINE_NAMES, Sign
 from weldcal.calibration.tablet.wrist import WristFit, fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.tablet_planar import NAMES, best_model, fit_visit
 from weldcal.tools.tablet_report import Shown, calibration_report, marked_picture
-
-_SCALE_SIGMAS = 3.0  # a free scale farther from 1 than this, and than a quarter of a percent, is told
-_SCALE_LEAST = 2.5e-3
+from weldcal.tools.tablet_visits import ManyVisits, error_figures, fit_many
 
 
 @dataclass(frozen=True)
@@ -38,19 +37,22 @@ class TabletInputs:
     look: str = "rings"
     pen_length_m: float | None = None
     pen_radius_m: float = 0.0
-    hand_step_m: float = 0.0
+    hand_step_m: float | None = None  # None: found in the hands themselves
     printed_sign: bool = False
     two_stages: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class TabletCalibration:
-    """The result, what its report draws, the fit with full poses where it is one, and how long the work took."""
+    """The result, what its report draws, the fit with full poses where it is one, the step of the hand's readings and what the
+    file's queries miss by where it is none, and how long the work took."""
 
     result: TabletResult
     shown: Shown
-    wrist: WristFit | None
-    seconds: float
+    wrist: WristFit | None = None
+    step_m: float = 0.0
+    held_out_mm: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    seconds: float = 0.0
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet calibrate`."""
@@ -66,6 +68,8 @@ class TabletCalibration:
             "parameters": result.parameters,
             "leave_one_out_mm": float(np.mean(left_out)) if left_out else None,
             "leave_one_out_of_other_models_mm": result.other_models,
+            "held_out_mm": error_figures(self.held_out_mm),
+            "hand_step_mm": 1e3 * self.step_m,
             "X_FC": result.X_FC,
             "p_FP_mm": None if result.p_FP_m is None else [1e3 * v for v in result.p_FP_m],
             "warnings": result.warnings,
@@ -73,62 +77,62 @@ class TabletCalibration:
             "seconds": self.seconds,
         }
 
+    def write(self, folder: Path) -> None:
+        """Write the result folder, its report included."""
+        save_tablet_result(self.result, folder)
+        page = calibration_report(self.result, self.shown, self.seconds, error_figures(self.held_out_mm))
+        write_atomic(folder / "report.html", page)
 
-def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration:
-    """Calibrate from the files and write the result folder, its report included.
+
+def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | ManyVisits:
+    """Calibrate from the files and write the result folder; a file of many visits gives each of them, and all together.
 
     Raises InputError and its kin: one sentence that says what to change; nothing is written then.
     """
     if not inputs.file.is_file():
         raise InputError(f"There is no file '{inputs.file}': give the page's CSV, or an npz of planar touches.")
-    if inputs.file.suffix not in (".npz", ".csv"):
+    if inputs.file.suffix.lower() not in (".npz", ".csv"):
         raise InputError(
             f"'{inputs.file.name}' is neither .csv nor .npz: give the page's CSV, or an npz of planar touches."
         )
     start = time.perf_counter()
-    result, shown, fit = _planar(inputs) if inputs.file.suffix == ".npz" else _wrist(inputs)
-    seconds = time.perf_counter() - start
-    save_tablet_result(result, folder)
-    write_atomic(folder / "report.html", calibration_report(result, shown, seconds))
-    return TabletCalibration(result, shown, fit, seconds)
+    made = _planar(inputs) if inputs.file.suffix.lower() == ".npz" else _wrist(inputs)
+    made = replace(made, seconds=time.perf_counter() - start)
+    made.write(folder)
+    return made
 
 
-def _planar(inputs: TabletInputs) -> tuple[TabletResult, Shown, None]:
+def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
     if any(path is not None for path in (inputs.poses, inputs.camera, inputs.image, inputs.seen)):
         raise InputError(
             "An npz file holds everything: leave --poses, --camera, --image and --seen out, or give the CSV."
         )
-    touches = load_planar(inputs.file)
+    read = load_planar(inputs.file)
+    visits = read.visits
+    step_m = hand_step_m(visits) if inputs.hand_step_m is None else inputs.hand_step_m
     sign = Sign.PRINTED if inputs.printed_sign else Sign.CORRECTED
-    linear = fit_linear(touches, sign)
-    planar = fit_planar(touches, PlanarConfig(sign=sign, step_m=inputs.hand_step_m))
-    errors = {
-        name: 1e3 * float(np.linalg.norm(e, axis=1).mean())
-        for name, e in (("closed_form", linear.leave_one_out_m), ("pnp", planar.leave_one_out_m))
-    }
-    # what predicts better on the landmarks it did not see; with four landmarks there is nothing to leave out
-    best = "pnp" if not np.isfinite(errors["pnp"]) or errors["pnp"] <= errors["closed_form"] else "closed_form"
-    warnings = []
-    scale, deviation = planar.free_scale
-    if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST):
-        warnings.append(
-            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
-            "page's size with a card, or the tablet's pixels per inch."
-        )
-    fit, names = (planar, PLANAR_NAMES) if best == "pnp" else (linear, LINEAR_NAMES)
-    shown = Shown(touches.landmark_m, fit.residuals_m, tuple(str(k) for k in range(len(touches.uv_px))))
+    if len(visits) + len(read.refused) > 1:
+        if inputs.two_stages:
+            raise InputError(
+                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits; --two-stages is for a file of one."
+            )
+        return fit_many(inputs.file, read, sign, step_m)
+    found = fit_visit(visits[0], sign, step_m)
+    best, errors = best_model([found])
+    fit, touches = found.fits[best], visits[0].touches
+    shown = Shown(touches.landmark_m, found.in_page(fit.residuals_m), tuple(map(str, visits[0].rows)))
     result = TabletResult(
         model=best,
-        parameters=dict(zip(names, fit.parameters.tolist(), strict=True)),
+        parameters=dict(zip(NAMES[best], fit.parameters.tolist(), strict=True)),
         covariance=fit.covariance.tolist(),
         residual_mm=_lengths_mm(fit.residuals_m),
-        leave_one_out_mm=_lengths_mm(fit.leave_one_out_m),
+        leave_one_out_mm=_finite(found.left_out_mm(best).tolist()),
         two_stages=_two_stages(touches, sign) if inputs.two_stages else None,
         other_models={name: e for name, e in errors.items() if name != best and np.isfinite(e)},
-        warnings=tuple(warnings),
+        warnings=found.warnings,
         data_sha256={inputs.file.name: file_hash(inputs.file)},
     )
-    return result, shown, None
+    return TabletCalibration(result, shown, step_m=step_m, held_out_mm=found.held_out_mm(best))
 
 
 def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
@@ -143,7 +147,7 @@ def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
     }
 
 
-def _wrist(inputs: TabletInputs) -> tuple[TabletResult, Shown, WristFit]:
+def _wrist(inputs: TabletInputs) -> TabletCalibration:
     if inputs.poses is None or inputs.camera is None:
         raise InputError(
             "Touches in a CSV need the robot's poses (--poses FILE) and the camera's numbers (--camera FILE)."
@@ -164,11 +168,6 @@ def _wrist(inputs: TabletInputs) -> tuple[TabletResult, Shown, WristFit]:
     )
     fit = fit_wrist(visit.data, inputs.pen_length_m)
     files = (inputs.file, inputs.poses, inputs.camera, inputs.image, inputs.seen)
-    checked = (
-        ()
-        if visit.size_checked
-        else ("The page's size was not checked with a card: lengths may be wrong by percents.",)
-    )
     in_page = fit.touch_residuals_m @ fit.X_BT.rotation().matrix()[:, :2]
     picture = None if visit.picture is None else marked_picture(visit.picture, visit.found_px)
     shown = Shown(visit.data.landmark_m, in_page, visit.names, picture)
@@ -183,10 +182,10 @@ def _wrist(inputs: TabletInputs) -> tuple[TabletResult, Shown, WristFit]:
         p_FP_m=fit.p_FP.tolist(),
         p_FP_covariance=fit.pen_covariance.tolist(),
         unobservable=fit.unobservable,
-        warnings=checked,
+        warnings=(*visit.warnings, *wrist_doubts(visit.data, fit, visit.names)),
         data_sha256={path.name: file_hash(path) for path in files if path is not None},
     )
-    return result, shown, fit
+    return TabletCalibration(result, shown, fit)
 
 
 def _wrist_parameters(fit: WristFit) -> dict[str, float]:
@@ -197,9 +196,9 @@ def _wrist_parameters(fit: WristFit) -> dict[str, float]:
 
 
 def _lengths_mm(errors_m: np.ndarray) -> list[float]:
-    return _finite((1e3 * np.linalg.norm(errors_m, axis=1)).tolist())
+    return [float(v) for v in 1e3 * np.linalg.norm(errors_m, axis=1)]
 
 
-def _finite(values: list[float]) -> list[float]:
-    """The values, or an empty list where nothing could be left out."""
-    return [v for v in values if np.isfinite(v)]
+def _finite(values: list[float]) -> list[float | None]:
+    """The values, None where a landmark could not be left out; empty where none could."""
+    return [v if np.isfinite(v) else None for v in values] if np.isfinite(values).any() else []

@@ -120,7 +120,7 @@ def calibrate_visit(
         ),
         folder,
     )
-    if done.wrist is None:
+    if not isinstance(done, TabletCalibration) or done.wrist is None:
         raise RuntimeError("the files of a visit hold full poses")
     uv = find_landmarks(visit.picture.grey, tablet.columns, tablet.rows)
     told, summary = ("leave_one_out_mm", "parameters", "X_FC", "p_FP_mm", "unobservable", "warnings"), done.summary()

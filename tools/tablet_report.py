@@ -23,6 +23,7 @@ _MARK = (40, 60, 220)  # BGR
 _MODELS = {
     "wrist": "full robot poses: touches fix tablet and pen, the picture fixes the camera",
     "pnp": "the tablet's true size (PnP), then a rigid motion and the pen",
+    "pnp_free_scale": "the tablet's size (PnP) with a scale of its own, then a rigid motion and the pen",
     "closed_form": "one linear least squares of six unknowns",
 }
 _UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180.0 / np.pi)}
@@ -86,6 +87,7 @@ def miss_arrows(shown: Shown) -> bytes:
     figure = Figure(figsize=(6.4, float(np.clip(1.6 + 5.2 * ratio, 2.6, 7.0))), layout="constrained")
     axes = figure.subplots()
     axes.plot(p[:, 0], p[:, 1], "o", color="#555", markersize=4)
+    axes.plot(*(p + times * miss).T, ".", alpha=0.0)  # the arrows' tips belong to what is shown
     axes.quiver(p[:, 0], p[:, 1], *(times * miss).T, angles="xy", scale_units="xy", scale=1, color=OURS, width=0.006)
     for name, (x, y) in zip(shown.names, p, strict=True):
         axes.annotate(name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=9, color="#333")
@@ -100,14 +102,16 @@ def miss_arrows(shown: Shown) -> bytes:
 
 def landmark_rows(result: TabletResult, names: Sequence[str]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Header and a row per landmark."""
-    left = result.leave_one_out_mm or [float("nan")] * len(names)
+    left: Sequence[float | None] = result.leave_one_out_mm or [None] * len(names)
     rows: list[tuple[str, ...]] = [
         (n, fixed(r, 3), fixed(lo, 3)) for n, r, lo in zip(names, result.residual_mm, left, strict=True)
     ]
-    return ("landmark", "in the fit, mm", "left out, mm"), rows
+    return ("landmark", "fit, mm", "left out, mm"), rows
 
 
-def calibration_report(result: TabletResult, shown: Shown, seconds: float) -> str:
+def calibration_report(
+    result: TabletResult, shown: Shown, seconds: float, held_out: Mapping[str, float] | None = None
+) -> str:
     """The page of `weldcal tablet calibrate`."""
     left = [v for v in result.leave_one_out_mm if v is not None]
     mean = float(np.mean(left)) if left else float("nan")
@@ -117,6 +121,9 @@ def calibration_report(result: TabletResult, shown: Shown, seconds: float) -> st
         ("In the fit, mean", fixed(float(np.mean(result.residual_mm)), 3), "mm", "plain", "of the touches"),
         ("Landmarks", str(len(shown.names)), "", "plain", "touched and seen"),
     ]
+    if held_out is not None:
+        worst = f"largest {fixed(held_out['max'], 3)}; never used"
+        cards.insert(0, ("The file's queries, mean", fixed(held_out["mean"], 3), "mm", "good", worst))
     sentence = f"Left-out landmarks are missed by {fixed(mean, 2)} mm." if left else "Nothing could be left out."
     tone = "warn" if result.warnings or result.unobservable else "good"
     return render(

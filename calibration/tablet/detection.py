@@ -37,15 +37,23 @@ def find_landmarks(image: Grey, columns: int, rows: int, look: Look = "rings") -
 
     Raises LandmarksNotFound: not all are seen, or what is seen is no such grid.
     """
+    return arrange(*find_marks(image, columns * rows, look), columns, rows)
+
+
+def find_marks(image: Grey, most: int, look: Look = "rings") -> tuple[Array, Array | None]:
+    """Centres (k, 2) px of what looks like a landmark, of dots the `most` strongest and a few to spare; and how full the rings
+    are (k,), None for dots."""
     grey: Grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image, dtype=np.uint8)
-    if look == "rings":
-        points, full = _rings(grey)
-    else:
-        points, full = _dots(grey, columns * rows + _SPARE), None
+    return _rings(grey) if look == "rings" else (_dots(grey, most + _SPARE), None)
+
+
+def arrange(points: Array, full: Array | None, columns: int, rows: int) -> Array:
+    """The marks (k, 2) that make the page's grid, row by row from its first: (rows * columns, 2); see find_landmarks."""
     n = columns * rows
+    mark = "dot" if full is None else "ring"
     if len(points) < n:
         raise LandmarksNotFound(
-            f"{len(points)} of {n} landmarks were found; show all of the page, in focus, without glare, and let no {look[:-1]} "
+            f"{len(points)} of {n} landmarks were found; show all of the page, in focus, without glare, and let no {mark} "
             "touch the image's edge."
         )
     grid = _as_grid(points, columns, rows)

@@ -1,8 +1,7 @@
-"""Reading what a visit to the tablet left: one npz of planar touches, or the page's CSV with robot poses and an image."""
+"""Reading what a visit to the tablet left: the page's CSV with robot poses and an image."""
 
 from __future__ import annotations
 
-import csv
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,56 +11,33 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.common.yaml import yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.tablet.detection import Look, find_landmarks
+from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.errors import TabletDataError
-from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
+from weldcal.calibration.tablet.page_grid import find_page
+from weldcal.calibration.tablet.tables import Row, landmark, number, read_table
 from weldcal.calibration.tablet.wrist import WristTouches
 
 Array = NDArray[np.float64]
 
-NPZ_KEYS = (
-    "uv",
-    "depth",
-    "hand",
-    "theta_deg",
-    "delta_px",
-    "tablet_px",
-    "mm_per_px",
-    "f",
-    "c",
-    "hand_capture",
-)
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
 POSE_COLUMNS = ("landmark", "x", "y", "z", "qw", "qx", "qy", "qz")
 SEEN_COLUMNS = ("landmark", "u", "v")
 CAMERA_ROW = "camera"
 _FARTHEST_M = 5.0  # of a wrist from its base: beyond it the file is in millimetres
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV distortion."""
-
-    focal_px: Array
-    centre_px: Array
-    distortion: Array
-
-    def rays(self, uv_px: Array) -> Array:
-        """Undistorted viewing rays (n, 2) of pixels (n, 2)."""
-        K = np.array([[self.focal_px[0], 0, self.centre_px[0]], [0, self.focal_px[1], self.centre_px[1]], [0, 0, 1]])
-        return np.asarray(cv2.undistortPoints(uv_px[:, None], K, self.distortion)[:, 0], dtype=float)
+_OFF_CENTRE = 0.12  # of the image's size: a principal point farther from its middle is told
+_NAMES_OF_CAMERA = (CAMERA_ROW, "image", "picture")
 
 
 @dataclass(frozen=True)
 class WristVisit:
-    """Touches for fit_wrist, whether a card had checked the page's size, the landmarks' names, and the image (h, w) with where
-    all landmarks of the page were found in it (n, 2) px, where there is one."""
+    """Touches for fit_wrist, warnings about the files, the landmarks' names, and the image (h, w) with where all landmarks of
+    the page were found in it (n, 2) px, where there is one."""
 
     data: WristTouches
-    size_checked: bool
+    warnings: tuple[str, ...]
     names: tuple[str, ...]
     picture: NDArray[np.uint8] | None
     found_px: Array
@@ -70,55 +46,6 @@ class WristVisit:
 def file_hash(path: Path) -> str:
     """SHA-256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def load_planar(path: Path) -> TabletTouches:
-    """Touches from an npz: uv (n, 2) px, depth (n) mm, hand (n, 2) mm, theta_deg (n), delta_px (n, 2), tablet_px (n, 2),
-    mm_per_px, f (px; one number or two), c (2) px, hand_capture (3) mm.
-
-    Raises TabletDataError: unreadable, a key missing, a shape that does not fit.
-    """
-    try:
-        with np.load(_there(path), allow_pickle=False) as archive:
-            d = {key: np.asarray(archive[key], dtype=float) for key in NPZ_KEYS if key in archive.files}
-    except (ValueError, OSError, EOFError, KeyError) as error:
-        raise TabletDataError(f"'{path.name}' is no npz file of numbers.") from error
-    except Exception as error:  # zipfile has errors of its own
-        raise TabletDataError(f"'{path.name}' is no npz file of numbers.") from error
-    missing = [key for key in NPZ_KEYS if key not in d]
-    if missing:
-        raise TabletDataError(f"'{path.name}' lacks {', '.join(missing)}; docs/tablet.md lists what it must hold.")
-    if d["uv"].ndim != 2 or d["mm_per_px"].size != 1 or d["f"].size not in (1, 2):
-        raise TabletDataError(f"'{path.name}' must hold uv (n, 2), one mm_per_px and one or two f.")
-    return TabletTouches(
-        uv_px=d["uv"],
-        depth_m=1e-3 * d["depth"],
-        hand_m=1e-3 * d["hand"],
-        theta_rad=np.radians(d["theta_deg"]),
-        delta_px=d["delta_px"],
-        landmark_px=d["tablet_px"],
-        pitch_m=1e-3 * float(d["mm_per_px"].reshape(())),
-        focal_px=np.broadcast_to(d["f"].ravel(), 2).copy(),
-        centre_px=d["c"],
-        hand_capture_m=1e-3 * d["hand_capture"],
-    )
-
-
-def load_intrinsics(path: Path) -> Intrinsics:
-    """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order)."""
-    try:
-        d = yaml_load(filename=str(_there(path)))
-        numbers = [float(d[key]) for key in ("fx", "fy", "cx", "cy")]
-        distortion = np.array(d.get("distortion") or [0.0] * 5, dtype=float)
-    except TabletDataError:
-        raise
-    except Exception as error:  # unreadable in any way: the same sentence
-        raise TabletDataError(
-            f"'{path.name}' must hold fx, fy, cx and cy in pixels (and distortion, where known)."
-        ) from error
-    if not np.isfinite([*numbers, *distortion]).all() or min(numbers[:2]) <= 0.0:
-        raise TabletDataError(f"'{path.name}' holds a focal length that is not positive, or a value that is no number.")
-    return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion)
 
 
 def load_visit(
@@ -134,66 +61,113 @@ def load_visit(
     """Touches of the page's CSV, with the flange's poses and what the camera saw (an image, or positions in a CSV).
 
     ``poses``: landmark,x,y,z,qw,qx,qy,qz of X_BF in metres at each touch, and one row whose landmark is `camera` for where
-    the image was taken. Of a landmark touched twice the last touch counts. Landmarks without a pose are left out.
-    ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the file and what to change, LandmarksNotFound for the image.
+    the image was taken. Of a landmark touched twice the last touch and the last pose count. Landmarks without a pose are left
+    out and named in the warnings. ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the file and what to change,
+    LandmarksNotFound for the image.
     """
-    rows = {int(float(r["landmark"])): r for r in _table(touches, TOUCH_COLUMNS)}
-    pose_rows = {r["landmark"].strip(): r for r in _table(poses, POSE_COLUMNS)}
-    if CAMERA_ROW not in pose_rows:
-        raise TabletDataError(
-            f"'{poses.name}' lacks the row '{CAMERA_ROW}': the flange's pose when the image was taken."
-        )
-    used = [k for k in sorted(rows) if str(k) in pose_rows]
+    rows = {landmark(r, touches): r for r in read_table(touches, TOUCH_COLUMNS)}
+    if not rows:
+        raise TabletDataError(f"'{touches.name}' holds no touch.")
+    X_camera, pose_of = _poses(poses)
+    used = [k for k in sorted(rows) if k in pose_of]
     if not used:
         raise TabletDataError(f"No landmark of '{touches.name}' has a pose in '{poses.name}'; both count from 0.")
-    number = {k: {c: _number(rows[k][c], touches, c) for c in TOUCH_COLUMNS} for k in rows}
-    pitch = {number[k]["mm_per_px"] for k in used}
+    if sorted(pose_of) == [k + 1 for k in sorted(rows)]:
+        raise TabletDataError(
+            f"'{poses.name}' counts its landmarks from 1 and '{touches.name}' from 0: count both from 0."
+        )
+    values = {k: {c: number(rows[k], c, touches) for c in TOUCH_COLUMNS[1:]} for k in rows}
+    pitch = {values[k]["mm_per_px"] for k in used}
     if len(pitch) != 1 or min(pitch) <= 0.0:
         raise TabletDataError(f"'{touches.name}' mixes sizes (mm_per_px); touch all landmarks at one size of the page.")
     scale = 1e-3 * pitch.pop()
-    landmark = scale * np.array([[number[k]["landmark_x_px"], number[k]["landmark_y_px"]] for k in used])
-    touched = scale * np.array([[number[k]["touch_x_px"], number[k]["touch_y_px"]] for k in used])
+    shown = {k: np.array([v["landmark_x_px"], v["landmark_y_px"]]) for k, v in values.items()}
+    touched = scale * np.array([[values[k]["touch_x_px"], values[k]["touch_y_px"]] for k in used])
+    landmarks = scale * np.array([shown[k] for k in used])
     intrinsics = load_intrinsics(camera)
     picture, found = None, np.zeros((0, 2))
     if seen is not None:
-        positions = {int(float(r["landmark"])): r for r in _table(seen, SEEN_COLUMNS)}
-        missing = [k for k in used if k not in positions]
-        if missing:
-            raise TabletDataError(f"'{seen.name}' lacks landmark {missing[0]}.")
-        uv = np.array([[_number(positions[k][c], seen, c) for c in ("u", "v")] for k in used])
+        uv = _seen(seen, used)
     elif image is not None:
-        picture, found = _in_image(image, number, look)
+        picture = _picture(image)
+        found = find_page(picture, shown, look)
         uv = found[used]
     else:
         raise TabletDataError("Give the camera's image (--image) or where the landmarks are in it (--seen).")
-    corner = landmark.min(axis=0)
+    corner = landmarks.min(axis=0)
     data = WristTouches(
-        X_BF=tuple(_flange_pose(pose_rows[str(k)], poses) for k in used),
+        X_BF=tuple(pose_of[k] for k in used),
         touched_m=touched - corner,
-        landmark_m=landmark - corner,
-        views=((_flange_pose(pose_rows[CAMERA_ROW], poses), intrinsics.rays(uv)),),
+        landmark_m=landmarks - corner,
+        views=((X_camera, intrinsics.rays(uv)),),
         focal_px=float(intrinsics.focal_px.mean()),
         tip_radius_m=tip_radius_m,
     )
-    checked = all(rows[k].get("size_checked", "1").strip() != "0" for k in used)
-    return WristVisit(data, checked, tuple(str(k) for k in used), picture, found)
+    told = _warnings(rows, used, poses, intrinsics, picture, camera)
+    return WristVisit(data, told, tuple(str(k) for k in used), picture, found)
 
 
-def _in_image(path: Path, number: Mapping[int, Mapping[str, float]], look: Look) -> tuple[NDArray[np.uint8], Array]:
-    """The image (h, w) and positions (n, 2) of all landmarks of the page, whose columns and rows their coordinates tell."""
-    picture = cv2.imread(str(_there(path)), cv2.IMREAD_GRAYSCALE)
+def _poses(path: Path) -> tuple[RigidTransform, dict[int, RigidTransform]]:
+    """The flange where the image was taken, and at each landmark."""
+    found: dict[int, RigidTransform] = {}
+    X_camera: RigidTransform | None = None
+    for row in read_table(path, POSE_COLUMNS):
+        if row["landmark"].lower() in _NAMES_OF_CAMERA:
+            X_camera = _flange_pose(row, path)
+        else:
+            found[landmark(row, path)] = _flange_pose(row, path)
+    if X_camera is None:
+        raise TabletDataError(
+            f"'{path.name}' lacks the row '{CAMERA_ROW}': the flange's pose when the image was taken."
+        )
+    return X_camera, found
+
+
+def _seen(path: Path, used: list[int]) -> Array:
+    positions = {landmark(r, path): r for r in read_table(path, SEEN_COLUMNS)}
+    missing = [k for k in used if k not in positions]
+    if missing:
+        raise TabletDataError(f"'{path.name}' lacks landmark {missing[0]}.")
+    return np.array([[number(positions[k], c, path) for c in ("u", "v")] for k in used])
+
+
+def _picture(path: Path) -> NDArray[np.uint8]:
+    if not path.is_file():
+        raise TabletDataError(f"There is no file '{path}'.")
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if picture is None:
         raise TabletDataError(f"'{path.name}' is no image that can be read.")
-    columns = len({round(n["landmark_x_px"], 1) for n in number.values()})
-    rows = len({round(n["landmark_y_px"], 1) for n in number.values()})
-    if columns * rows != len(number) or set(number) != set(range(len(number))):
-        raise TabletDataError("The landmarks touched are not the page's whole grid; touch all, or give --seen.")
-    grey = np.asarray(picture, dtype=np.uint8)
-    return grey, find_landmarks(grey, columns, rows, look)
+    return np.asarray(picture, dtype=np.uint8)
 
 
-def _flange_pose(row: Mapping[str, str], path: Path) -> RigidTransform:
-    x, y, z, *q = (_number(row[c], path, c) for c in POSE_COLUMNS[1:])
+def _warnings(
+    rows: Mapping[int, Row],
+    used: list[int],
+    poses: Path,
+    intrinsics: Intrinsics,
+    picture: NDArray[np.uint8] | None,
+    camera: Path,
+) -> tuple[str, ...]:
+    found = []
+    if any(rows[k].get("size_checked", "1") == "0" for k in used):
+        found.append("The page's size was not checked with a card: lengths may be wrong by percents.")
+    without = [k for k in sorted(rows) if k not in used]
+    if without:
+        found.append(f"Left out, for want of a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
+    if picture is not None:
+        size = np.array(picture.shape[::-1])
+        off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size
+        if off.max() > _OFF_CENTRE:
+            found.append(
+                f"The picture has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at "
+                f"{intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these numbers seem to belong to pictures of another "
+                "size, or turned."
+            )
+    return tuple(found)
+
+
+def _flange_pose(row: Row, path: Path) -> RigidTransform:
+    x, y, z, *q = (number(row, c, path) for c in POSE_COLUMNS[1:])
     norm = float(np.linalg.norm(q))
     if abs(norm - 1.0) > 1e-2:
         raise TabletDataError(f"'{path.name}': the quaternion of '{row['landmark']}' has the length {norm:.3g}, not 1.")
@@ -202,38 +176,3 @@ def _flange_pose(row: Mapping[str, str], path: Path) -> RigidTransform:
             f"'{path.name}' must be in metres; '{row['landmark']}' is {max(abs(x), abs(y), abs(z)):.0f} away."
         )
     return RigidTransform(RotationMatrix(Quaternion(np.array(q) / norm)), [x, y, z])
-
-
-def _table(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
-    """The rows of a CSV file that has at least these columns."""
-    try:
-        text = _there(path).read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise TabletDataError(f"'{path.name}' is no CSV text.") from error
-    reader = csv.DictReader(text.splitlines())
-    missing = [c for c in columns if c not in (reader.fieldnames or ())]
-    if missing:
-        raise TabletDataError(f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}.")
-    rows = [row for row in reader if any((v or "").strip() for v in row.values() if isinstance(v, str))]
-    for row in rows:
-        if any(row.get(c) is None for c in columns):
-            raise TabletDataError(f"'{path.name}' has a row with too few columns.")
-        if "landmark" in columns and row["landmark"].strip() != CAMERA_ROW:
-            _number(row["landmark"], path, "landmark")
-    return rows
-
-
-def _number(text: str, path: Path, column: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise TabletDataError(f"'{path.name}': '{text}' in the column {column} is no number.")
-    return value
-
-
-def _there(path: Path) -> Path:
-    if not path.is_file():
-        raise TabletDataError(f"There is no file '{path}'.")
-    return path

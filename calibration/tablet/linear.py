@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import TooFewLandmarks
-from weldcal.calibration.tablet.touches import TabletTouches, check_touches
+from weldcal.calibration.tablet.touches import TabletTouches, check_touches, same_landmark
 from weldcal.calibration.tablet.two_stage import Sign
 
 Array = NDArray[np.float64]
@@ -115,6 +115,9 @@ def fit_linear(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> LinearFit
     found = solve_closed_form(rays, touches.hand_m.T, touches.theta_rad)
     if not np.isfinite(found.leave_one_out).all():
         raise TooFewLandmarks("One landmark alone fixes a part of the calibration; touch more landmarks.")
+    left_out, number = found.leave_one_out.T, same_landmark(touches.landmark_px)
+    if number.max() + 1 < n:  # a landmark touched twice: the leverages of one touch would leave the other in
+        left_out = _left_out_together(rays, touches.hand_m.T, touches.theta_rad, number)
     dof = 2 * n - UNKNOWNS
     sigma = float(np.sqrt((found.residuals**2).sum() / dof))
     flat = _design(rays, touches.theta_rad).reshape(-1, UNKNOWNS)
@@ -123,8 +126,21 @@ def fit_linear(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> LinearFit
         parameters=found.parameters,
         covariance=sigma**2 * found.normal_inverse,
         residuals_m=found.residuals.T,
-        leave_one_out_m=found.leave_one_out.T,
+        leave_one_out_m=left_out,
         sigma_m=sigma,
         scale=scale,
         condition=float(np.linalg.cond(flat / np.linalg.norm(flat, axis=0))),
     )
+
+
+def _left_out_together(rays: Array, hand: Array, theta_rad: Array, number: NDArray[np.int64]) -> Array:
+    """Left-out errors (n, 2) m where all touches of a landmark are left out with it; NaN where what is left fixes nothing."""
+    errors = np.full((rays.shape[1], 2), np.nan)
+    for k in range(number.max() + 1):
+        keep, one = number != k, number == k
+        flat = _design(rays[:, keep], theta_rad[keep]).reshape(-1, UNKNOWNS)
+        if np.linalg.matrix_rank(flat) < UNKNOWNS:
+            continue
+        x = np.linalg.lstsq(flat, hand[:, keep].reshape(-1), rcond=None)[0]
+        errors[one] = (_design(rays[:, one], theta_rad[one]) @ x - hand[:, one]).T
+    return errors

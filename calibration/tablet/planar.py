@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.optimize import minimize
-from scipy.stats import norm
+from scipy.special import log_ndtr
 
+from weldcal.calibration.tablet.errors import CollinearLandmarks, LandmarksNotFound
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
-from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches, check_touches
+from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches, check_touches, same_landmark
 from weldcal.calibration.tablet.two_stage import Sign
 
 Array = NDArray[np.float64]
@@ -116,13 +117,18 @@ def refine_rounded(start: Array, points_m: Array, hand_m: Array, theta_rad: Arra
         p = parameters(y)
         e = hand_over(p, points_m, theta_rad) - hand_m
         near, far = (half - np.abs(e)) / noise, (-half - np.abs(e)) / noise
-        log_near = norm.logcdf(near)
-        log_p = log_near + np.log1p(-np.exp(norm.logcdf(far) - log_near))
-        slope = (np.exp(norm.logpdf(near) - log_p) - np.exp(norm.logpdf(far) - log_p)) / noise * np.sign(e)
+        log_near = log_ndtr(near)
+        log_p = log_near + np.log1p(-np.exp(log_ndtr(far) - log_near))
+        slope = (np.exp(_log_density(near) - log_p) - np.exp(_log_density(far) - log_p)) / noise * np.sign(e)
         J = _jacobian(p, points_m, theta_rad)[:, :, free]
         return -float(log_p.sum()), np.asarray((slope[:, :, None] * J).sum(axis=(0, 1)) * unit)
 
     return parameters(np.asarray(minimize(objective, np.zeros(len(unit)), jac=True, method="BFGS").x))
+
+
+def _log_density(x: Array) -> Array:
+    """Of the normal distribution."""
+    return np.asarray(-0.5 * x * x - 0.5 * np.log(2.0 * np.pi))
 
 
 def fit_planar(touches: TabletTouches, config: PlanarConfig | None = None, *, leave_one_out: bool = True) -> PlanarFit:
@@ -136,11 +142,15 @@ def fit_planar(touches: TabletTouches, config: PlanarConfig | None = None, *, le
     n = len(touches.uv_px)
     X_CT, parameters = _fit(touches, config)
     left_out = np.full((n, 2), np.nan)
-    if leave_one_out and n > MIN_LANDMARKS:
-        for i in range(n):
-            keep = np.arange(n) != i
-            one = touches.pick(~keep)
-            left_out[i] = (_predict(*_fit(touches.pick(keep), config), one, config.sign) - one.hand_m)[0]
+    number = same_landmark(touches.landmark_px)
+    if leave_one_out and number.max() + 1 > MIN_LANDMARKS:
+        for k in range(number.max() + 1):
+            one = touches.pick(number == k)
+            try:
+                found = _fit(touches.pick(number != k), config)
+            except (CollinearLandmarks, LandmarksNotFound):  # this landmark alone spans the plane
+                continue
+            left_out[number == k] = _predict(*found, one, config.sign) - one.hand_m
     touched = _touched(touches, config.sign)
     error = hand_over(parameters, touched, touches.theta_rad) - touches.hand_m
     unknowns = 6 if config.free_scale else 5

@@ -26,7 +26,10 @@ def tablet_pose(rays: Array, landmark_m: Array) -> RigidTransform:
     centred, rays = points - middle, np.ascontiguousarray(rays, dtype=float)
     best: tuple[float, RigidTransform] | None = None
     for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP):
-        _, turns, shifts, _ = cv2.solvePnPGeneric(centred, rays, np.eye(3), None, flags=method)
+        try:
+            _, turns, shifts, _ = cv2.solvePnPGeneric(centred, rays, np.eye(3), None, flags=method)
+        except cv2.error:  # rays that are all one, or NaN
+            continue
         for start in zip(turns, shifts, strict=True):
             if not np.isfinite(start).all():
                 continue

@@ -29,16 +29,17 @@ PARENT, CHILD = "flange", "camera_optical_frame"
 class TabletResult:
     """All that tablet.yaml holds.
 
-    ``model``: closed_form, pnp (planar, an upright pen) or wrist (full poses); ``parameters`` by name, m and rad, and
-    their ``covariance`` in that order. Only for wrist: ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the
-    flange side about the camera's origin), ``p_FP_m`` and its covariance (3, 3).
+    ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name, m and
+    rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be left out. Only for wrist:
+    ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's origin), ``p_FP_m`` and
+    its covariance (3, 3).
     """
 
     model: str
     parameters: dict[str, float]
     covariance: list[list[float]]
     residual_mm: list[float]
-    leave_one_out_mm: list[float]
+    leave_one_out_mm: list[float | None]
     X_FC: RigidTransform | None = None
     X_FC_covariance: list[list[float]] | None = None
     p_FP_m: list[float] | None = None

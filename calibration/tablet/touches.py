@@ -94,12 +94,23 @@ def check_touches(touches: TabletTouches) -> None:
 
 def check_layout(landmarks: Array) -> None:
     """Raise TooFewLandmarks or CollinearLandmarks for landmarks (n, 2) in any unit."""
-    n = len(landmarks)
+    n = int(same_landmark(landmarks).max(initial=-1)) + 1
     if n < MIN_LANDMARKS:
-        raise TooFewLandmarks(f"{n} landmarks are too few; touch at least {MIN_LANDMARKS}, better all nine.")
+        raise TooFewLandmarks(
+            f"{n} landmarks are too few{' (a landmark counts once)' if n < len(landmarks) else ''}; touch at least {MIN_LANDMARKS}, "
+            "better all nine."
+        )
     spread = np.linalg.svd(landmarks - landmarks.mean(axis=0), compute_uv=False)
     if spread[1] <= _THIN * spread[0]:
         raise CollinearLandmarks("All landmarks lie on one line; touch landmarks that span an area.")
+
+
+def same_landmark(landmarks: Array) -> NDArray[np.int64]:
+    """A number (n,) from 0 for each of the landmarks (n, 2), the same for touches of the same one."""
+    if len(landmarks) == 0:
+        return np.zeros(0, dtype=np.int64)
+    extent = max(float(np.ptp(landmarks, axis=0).max()), 1e-12)
+    return np.unique(np.round(landmarks / extent, 6), axis=0, return_inverse=True)[1].ravel()
 
 
 def check_turns(theta_rad: Array) -> None:

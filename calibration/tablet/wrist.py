@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 _OPEN_PRIOR_M = 1.0  # of the pen's tip where nothing is known: far wider than any pen
 _KNOWN_PRIOR_M = 0.5e-3  # of a pen length that a person measured
 _UNSURE_M = 5e-3  # a pen's tip worse than this is not known
+_LEAN = 3.0  # degrees of freedom that the scatter of all touches counts for
 _TOUCH_FLOOR_M, _PIXEL_FLOOR = 1e-6, 1e-3  # keep exact data from dividing by zero
 
 
@@ -83,13 +84,11 @@ def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_on
     X_BT, p_FP = _start(data, pen_length_m)
     X_BF0, rays = data.views[0]
     X_FC = X_BF0.inverse() @ X_BT @ tablet_pose(rays, data.landmark_m).inverse()
-    sigma_t, sigma_p, freedom = 0.3e-3, 0.3, 1.0
+    sigma_t, sigma_p = np.full(3, 0.3e-3), 0.3
     result, covariance = (X_BT, p_FP, X_FC), np.eye(15)
     for _ in range(3):
         result, covariance, touch, pixel = _refine(data, result, sigma_t, sigma_p, pen_length_m)
-        # nine unknowns are the touches', six the images'
-        freedom = max(touch.size - 9, 1)
-        sigma_t = max(float(np.sqrt((touch**2).sum() / freedom)), _TOUCH_FLOOR_M)
+        sigma_t = _touch_sigmas(touch @ result[0].rotation().matrix())
         sigma_p = max(float(np.sqrt((pixel**2).sum() / max(pixel.size - 6, 1))), _PIXEL_FLOOR)
     X_BT, p_FP, X_FC = result
     pen_covariance = covariance[6:9, 6:9]
@@ -99,9 +98,24 @@ def fit_wrist(data: WristTouches, pen_length_m: float | None = None, *, leave_on
             keep = np.arange(len(left_out)) != i
             left_out[i] = _missed(fit_wrist(data.pick(keep), pen_length_m, leave_one_out=False), data, i)
     return WristFit(
-        X_FC, p_FP, X_BT, covariance[9:, 9:], pen_covariance, touch, pixel, left_out, sigma_t, sigma_p,
+        X_FC, p_FP, X_BT, covariance[9:, 9:], pen_covariance, touch, pixel, left_out, float(np.sqrt((sigma_t**2).mean())), sigma_p,
         _open_directions(p_FP, pen_covariance, _axis_spread(data.X_BF)),
     )  # fmt: skip
+
+
+def _touch_sigmas(touch_T: Array) -> Array:
+    """Scatter (3,) m of touch residuals (n, 3) in the tablet's frame: in its plane as the glass feels, across it as the arm stands.
+
+    Nine unknowns are the touches', six of them in the plane. Few touches say little of each: both lean to what all say.
+    """
+    n = len(touch_T)
+    free, squares = (
+        np.array([2.0 * n - 6.0, n - 3.0]),
+        np.array([(touch_T[:, :2] ** 2).sum(), (touch_T[:, 2] ** 2).sum()]),
+    )
+    pooled = squares.sum() / max(free.sum(), 1.0)
+    along, across = np.sqrt((squares + _LEAN * pooled) / (free + _LEAN))
+    return np.maximum([along, along, across], _TOUCH_FLOOR_M)
 
 
 def seen_point(fit: WristFit, X_BF: RigidTransform, ray: Array) -> Array:
@@ -159,11 +173,12 @@ def _start(data: WristTouches, pen_length_m: float | None) -> tuple[RigidTransfo
 def _refine(
     data: WristTouches,
     start: tuple[RigidTransform, Array, RigidTransform],
-    sigma_t: float,
+    sigma_t: Array,
     sigma_p: float,
     pen_length_m: float | None,
 ) -> tuple[tuple[RigidTransform, Array, RigidTransform], Array, Array, Array]:
     """Least squares over (X_BT, p_FP, X_FC); returns them, their covariance (15, 15) and both kinds of residuals."""
+    R_BT = start[0].rotation().matrix()
     touched = np.c_[data.touched_m, np.full(len(data.touched_m), -data.tip_radius_m)]
     landmarks = np.c_[data.landmark_m, np.zeros(len(data.landmark_m))]
     spread = np.array([_OPEN_PRIOR_M] * 2 + [_OPEN_PRIOR_M if pen_length_m is None else _KNOWN_PRIOR_M])
@@ -185,7 +200,7 @@ def _refine(
     def residuals(x: Array) -> Array:
         touch, pixel = parts(x)
         pen = (start[1] + x[6:9] - expected) / spread
-        return np.concatenate([touch.ravel() / sigma_t, pixel.ravel() / sigma_p, pen])
+        return np.concatenate([(touch @ R_BT / sigma_t).ravel(), pixel.ravel() / sigma_p, pen])
 
     unit = np.r_[np.full(3, 1e-2), np.full(6, 1e-3), np.full(3, 1e-2), np.full(3, 1e-3)]
     found = least_squares(residuals, np.zeros(15), x_scale=unit, method="lm", xtol=1e-12, ftol=1e-12)

@@ -159,6 +159,30 @@ def test_landmarks_that_do_not_fit_cannot_be_shown(browser: Browser) -> None:
     assert browser.run("return document.getElementById('touch').disabled") is True
 
 
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (844, 390), (768, 1024)])
+def test_on_a_full_screen_no_button_lies_over_a_landmark(browser: Browser, width: int, height: int) -> None:
+    """A pen that pressed Back instead of the last landmark would end the visit; a ring at the frame is none to the camera."""
+    opened(browser, 1.0)
+    browser.devtools(
+        "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+    )
+    browser.run(
+        "const [a, d] = layout().most; document.getElementById('across').value = a; document.getElementById('down').value = d;"
+        "document.getElementById('across').dispatchEvent(new Event('input'))"
+    )
+    assert "9 landmarks fit" in browser.text()
+    assert browser.run("return document.documentElement.scrollWidth") == width
+    landmarks = enter(browser)
+    for x, y in landmarks:
+        press(browser, "pen", x, y)
+    assert [row["landmark"] for row in touches(browser)] == [str(k) for k in range(9)]
+    bar = float(str(browser.run("return document.getElementById('bar').getBoundingClientRect().top")))
+    reach = 7.0 * PX_PER_MM  # ring of 8 mm and 3 mm of white
+    assert landmarks[:, 1].max() + reach <= bar + 0.5
+    assert (landmarks.min(axis=0) >= reach - 0.5).all()
+    assert landmarks[:, 0].max() + reach <= width + 0.5
+
+
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[TabletServer]:
     """The real server on a free port of loopback."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import re
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,9 +17,12 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from tests.unit.tablet_image import grid, picture, project
+from weldcal.calibration.tablet.doubts import wrist_doubts
 from weldcal.calibration.tablet.errors import TabletDataError
-from weldcal.calibration.tablet.files import load_planar
+from weldcal.calibration.tablet.files import WristVisit, load_visit
+from weldcal.calibration.tablet.planar_files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
+from weldcal.calibration.tablet.wrist import fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.tablet_paper import published_touches
@@ -157,9 +162,6 @@ def test_positions_in_the_image_do_as_well_as_the_image(visit: Path, tmp_path: P
     ],
 )
 def test_a_mistake_is_one_sentence_and_writes_nothing(visit: Path, tmp_path: Path, change: Any, sentence: str) -> None:
-    import re
-    import shutil
-
     folder = tmp_path / "files"
     shutil.copytree(visit, folder)
     change(folder)
@@ -203,7 +205,7 @@ def test_an_npz_that_is_none_is_told(tmp_path: Path, npz: Path) -> None:
     with pytest.raises(TabletDataError, match="no npz file"):
         load_planar(broken)
     np.savez(tmp_path / "part.npz", uv=np.zeros((4, 2)))
-    with pytest.raises(TabletDataError, match="lacks depth, hand"):
+    with pytest.raises(TabletDataError, match="lacks hand, theta_deg"):
         load_planar(tmp_path / "part.npz")
 
 
@@ -213,3 +215,133 @@ def test_a_result_that_is_none_is_told(tmp_path: Path) -> None:
     (tmp_path / "tablet.yaml").write_text("schema: 7\n")
     with pytest.raises(InputError, match="no tablet calibration of schema 1"):
         load_tablet_result(tmp_path)
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(path.read_text().splitlines()))
+
+
+def _comma(folder: Path) -> None:
+    """As a spreadsheet of a country with a decimal comma writes it, with a byte order mark."""
+    for name in ("touches.csv", "poses.csv"):
+        text = (folder / name).read_text().replace(",", ";").replace(".", ",")
+        (folder / name).write_text("\ufeff" + text.replace("\n", "\r\n"), encoding="utf-8")
+
+
+def _header(folder: Path) -> None:
+    _edit(folder / "poses.csv", "landmark,x,y,z", "Landmark, X, Y, Z")
+    _edit(folder / "poses.csv", "camera", "Camera")
+
+
+def _backwards(folder: Path) -> None:
+    for name in ("touches.csv", "poses.csv"):
+        write(folder / name, [dict(reversed(list(r.items()))) for r in reversed(_rows(folder / name))])
+
+
+def _turned_page(folder: Path) -> None:
+    rows = _rows(folder / "touches.csv")
+    for row in rows:
+        for what in ("landmark", "touch"):
+            x, y = float(row[f"{what}_x_px"]), float(row[f"{what}_y_px"])
+            row[f"{what}_x_px"], row[f"{what}_y_px"] = str(900.0 - y), str(x)
+    write(folder / "touches.csv", rows)
+
+
+ROS = "camera_matrix: {rows: 3, cols: 3, data: [617.7, 0, 316.5, 0, 617.7, 242.3, 0, 0, 1]}\ndistortion_coefficients: {data: [0, 0, 0, 0]}\n"
+OPENCV = (
+    "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+    "   data: [ 617.7, 0., 316.5, 0., 617.7, 242.3, 0., 0., 1. ]\n"
+)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        _comma,
+        _header,
+        _backwards,
+        _turned_page,
+        lambda f: (f / "camera.yaml").write_text(ROS),
+        lambda f: (f / "camera.yaml").write_text(OPENCV),
+        lambda f: write(
+            f / "touches.csv", _rows(f / "touches.csv")[:6]
+        ),  # the third row is in the picture all the same
+        lambda f: write(f / "touches.csv", _rows(f / "touches.csv")[:8]),
+    ],
+)
+def test_the_same_visit_in_another_dress_is_the_same(visit: Path, tmp_path: Path, change: Any) -> None:
+    folder = tmp_path / "files"
+    shutil.copytree(visit, folder)
+    change(folder)
+    plain, other = (_loaded(f, image=f / "picture.png") for f in (visit, folder))
+    assert other.warnings == ()
+    n = len(other.names)
+    assert list(other.names) == list(plain.names)[:n]
+    np.testing.assert_allclose(other.data.views[0][1], plain.data.views[0][1][:n], atol=1e-9)
+    for X, Y in zip(other.data.X_BF, plain.data.X_BF[:n], strict=True):
+        assert X.IsNearlyEqualTo(Y, 1e-9)
+    for found, said in ((other.data.landmark_m, plain.data.landmark_m), (other.data.touched_m, plain.data.touched_m)):
+        np.testing.assert_allclose(_distances(found), _distances(said[:n]), atol=1e-9)
+
+
+def _loaded(folder: Path, **seen: Path) -> WristVisit:
+    return load_visit(folder / "touches.csv", folder / "poses.csv", folder / "camera.yaml", **seen)  # type: ignore[arg-type]
+
+
+def _distances(points: np.ndarray) -> np.ndarray:
+    """Between all pairs, whichever way the page is turned."""
+    return np.asarray(np.linalg.norm(points[:, None] - points[None], axis=2))
+
+
+def _shifted(folder: Path, column: str, by: float) -> None:
+    rows = _rows(folder / "poses.csv")
+    write(folder / "poses.csv", [{**r, column: float(r[column]) + by * (r["landmark"] == "4")} for r in rows])
+
+
+@pytest.mark.parametrize(
+    ("change", "warning"),
+    [
+        (lambda f: _shifted(f, "x", 0.01), "without landmark 4 to 0.*: touch it again"),
+        (lambda f: _edit(f / "poses.csv", "qw,qx,qy,qz", "qx,qy,qz,qw"), "with the quaternions' w where x is written"),
+        (lambda f: _edit(f / "touches.csv", str(MM_PER_PX), str(1.03 * MM_PER_PX)), "differ by -[23].. % in length"),
+        (lambda f: _edit(f / "camera.yaml", "cx: 316.5", "cx: 200.0"), "principal point of 'camera.yaml'"),
+        (
+            lambda f: write(f / "poses.csv", [r for r in _rows(f / "poses.csv") if r["landmark"] != "2"]),
+            "for want of a pose",
+        ),
+    ],
+)
+def test_what_looks_wrong_with_full_poses_is_told(visit: Path, tmp_path: Path, change: Any, warning: str) -> None:
+    folder = tmp_path / "files"
+    shutil.copytree(visit, folder)
+    change(folder)
+    loaded = _loaded(
+        folder, **({"image": folder / "picture.png"} if "principal" in warning else {"seen": folder / "seen.csv"})
+    )
+    told = (*loaded.warnings, *wrist_doubts(loaded.data, fit_wrist(loaded.data, leave_one_out=False), loaded.names))
+    assert re.search(warning, " ".join(told)), told
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda f: _edit(f / "touches.csv", "\n1,", "\n1.5,"), "whole numbers from 0, not '1.5'"),
+        (
+            lambda f: write(
+                f / "poses.csv",
+                [{**r, "landmark": r["landmark"] if r["landmark"] == "camera" else int(r["landmark"]) + 1} for r in _rows(f / "poses.csv")],
+            ),
+            "counts its landmarks from 1",
+        ),
+        (lambda f: write(f / "touches.csv", [{**r, "landmark": 2 * int(r["landmark"]) % 9} for r in _rows(f / "touches.csv")]), "make no grid"),
+        (lambda f: (f / "touches.csv").write_text((f / "touches.csv").read_text().splitlines()[0]), "holds no touch"),
+        (lambda f: (f / "camera.yaml").write_text("K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\nD: [1, 2, 3]\n"), "OpenCV knows 4, 5"),
+    ],
+)  # fmt: skip
+def test_files_that_contradict_each_other_are_refused(visit: Path, tmp_path: Path, change: Any, sentence: str) -> None:
+    folder = tmp_path / "files"
+    shutil.copytree(visit, folder)
+    change(folder)
+    code, said, _ = run(*csv_options(folder), "--image", folder / "picture.png", "--out", tmp_path / "out")
+    assert code == 1
+    assert re.search(sentence, said["reason"]), said["reason"]

@@ -1,0 +1,115 @@
+"""What looks wrong with touches from full robot poses: their size, one landmark, the order of numbers; told, never mended."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.tablet.touches import MIN_LANDMARKS
+from weldcal.calibration.tablet.wrist import WristFit, WristTouches
+
+Array = NDArray[np.float64]
+
+_SCALE_SIGMAS, _SCALE_LEAST = 3.0, 2.5e-3
+_BAD_TOUCH_M, _BAD_PIXEL = 1.5e-3, 2.0  # residuals above these are no noise
+_LEAST_TO_DOUBT = 6  # landmarks
+_BETTER = 0.4  # what a change must leave of the residuals to be told
+
+
+def wrist_doubts(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Sentences for the result's warnings; `names` of the landmarks."""
+    found = []
+    scale, deviation = touched_scale(data)
+    if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST) and deviation < 0.02:
+        found.append(
+            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
+            "page's size with a card, or mm_per_px."
+        )
+    touch = float(np.sqrt((fit.touch_residuals_m**2).sum(axis=1).mean()))
+    if touch > _BAD_TOUCH_M and not found:
+        found.append(_why_touches(data, touch, names))
+    pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
+    if pixel > _BAD_PIXEL:
+        found.append(
+            f"The picture shows the landmarks {pixel:.1f} px from where the fit has them: check the camera's numbers, its distortion, "
+            "and that picture and page belong together."
+        )
+    return tuple(found)
+
+
+def touched_scale(data: WristTouches) -> tuple[float, float]:
+    """How much farther the hand moved than the tablet says, by touches alone: (value, standard deviation).
+
+    R p_FP + p_BF = x a + y b + p_BT is linear in a, b (3,), p_BT and p_FP; a and b are as long as the scale. Infinite deviation
+    where the touches are too few for it, or leave the pen open.
+    """
+    n = len(data.X_BF)
+    unknowns = 12
+    if 3 * n <= unknowns:
+        return 1.0, np.inf
+    A, b = np.zeros((n, 3, unknowns)), np.zeros((n, 3))
+    for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
+        A[k, :, 0:3], A[k, :, 3:6], A[k, :, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
+        A[k, :, 9:12] = -X.rotation().matrix()
+        b[k] = X.translation()
+    flat = A.reshape(-1, unknowns)
+    unit = 1.0 / np.maximum(np.linalg.norm(flat, axis=0), 1e-12)
+    flat = flat * unit
+    # an upright pen leaves its own length open, which no scale in the plane asks for
+    N = np.linalg.pinv(flat.T @ flat, rcond=1e-10)
+    v = N @ (flat.T @ b.reshape(-1))
+    e = flat @ v - b.reshape(-1)
+    sigma2 = float(e @ e) / max(3 * n - np.linalg.matrix_rank(flat, tol=1e-5), 1)
+    v, N = v * unit, sigma2 * N * np.outer(unit, unit)
+    area = np.cross(v[0:3], v[3:6])
+    scale = float(np.sqrt(np.linalg.norm(area)))
+    if not scale > 0.0:
+        return 1.0, np.inf
+    z = area / np.linalg.norm(area)
+    J = np.concatenate([np.cross(v[3:6], z), np.cross(z, v[0:3])]) / (2.0 * scale)
+    return scale, float(np.sqrt(max(J @ N[:6, :6] @ J, 0.0)))
+
+
+def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> str:
+    """The likeliest cause of touches that do not fit, in a sentence."""
+    plain = f"The touches fit to {1e3 * left_m:.1f} mm only"
+    if len(names) >= _LEAST_TO_DOUBT:
+        without = [_misfit(data.pick(np.arange(len(names)) != k)) for k in range(len(names))]
+        worst = int(np.argmin(without))
+        if without[worst] < _BETTER * left_m:
+            return f"{plain}, without landmark {names[worst]} to {1e3 * without[worst]:.2f}: touch it again, or leave it out."
+    changed = {
+        "the quaternions' w where z is written": tuple(_rolled(X, 1) for X in data.X_BF),
+        "the quaternions' w where x is written": tuple(_rolled(X, -1) for X in data.X_BF),
+        "poses that are inverted: they are of the flange in the base": tuple(X.inverse() for X in data.X_BF),
+    }
+    for what, poses in changed.items():
+        left = _misfit(dc.replace(data, X_BF=poses))
+        if left < _BETTER * left_m:
+            return f"{plain}, to {1e3 * left:.2f} mm with {what}. Check the file."
+    return f"{plain}: check that poses and touches belong to the same landmarks, and that the tablet did not move."
+
+
+def _misfit(data: WristTouches) -> float:
+    """Rms distance (m) that the best affine plane and pen leave between touches and hands; infinite where they are too few."""
+    n = len(data.X_BF)
+    if n < MIN_LANDMARKS + 1:
+        return np.inf
+    flat = np.zeros((3 * n, 12))
+    for k, (X, (x, y)) in enumerate(zip(data.X_BF, data.touched_m, strict=True)):
+        rows = slice(3 * k, 3 * k + 3)
+        flat[rows, 0:3], flat[rows, 3:6], flat[rows, 6:9] = x * np.eye(3), y * np.eye(3), np.eye(3)
+        flat[rows, 9:12] = -X.rotation().matrix()
+    b = np.concatenate([X.translation() for X in data.X_BF])
+    e = flat @ np.linalg.lstsq(flat, b, rcond=1e-8)[0] - b
+    return float(np.sqrt(e @ e / n))
+
+
+def _rolled(X: RigidTransform, places: int) -> RigidTransform:
+    """The pose whose quaternion's numbers stand so many places off their columns w, x, y, z."""
+    wxyz = np.roll(X.rotation().ToQuaternion().wxyz(), places)
+    return RigidTransform(RotationMatrix(Quaternion(wxyz)), X.translation())

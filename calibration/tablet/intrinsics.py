@@ -1,0 +1,72 @@
+"""A camera's numbers from YAML: fx, fy, cx, cy by name, or the camera matrix as ROS and OpenCV write it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.yaml import yaml_load
+
+from weldcal.calibration.tablet.errors import TabletDataError
+
+Array = NDArray[np.float64]
+_COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
+_MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficients", "D", "d", "distortion")
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Pinhole camera: focal lengths and principal point (px, centre of the first pixel at (0, 0)), OpenCV distortion."""
+
+    focal_px: Array
+    centre_px: Array
+    distortion: Array
+
+    def rays(self, uv_px: Array) -> Array:
+        """Undistorted viewing rays (n, 2) of pixels (n, 2)."""
+        K = np.array([[self.focal_px[0], 0, self.centre_px[0]], [0, self.focal_px[1], self.centre_px[1]], [0, 0, 1]])
+        return np.asarray(cv2.undistortPoints(uv_px[:, None], K, self.distortion)[:, 0], dtype=float)
+
+
+def load_intrinsics(path: Path) -> Intrinsics:
+    """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and
+    distortion_coefficients (D) as lists or with their `data`. Raises TabletDataError."""
+    if not path.is_file():
+        raise TabletDataError(f"There is no file '{path}'.")
+    try:
+        d = _document(path)
+        numbers = [float(d[key]) for key in ("fx", "fy", "cx", "cy")] if "fx" in d else _from_matrix(d)
+        found: Any = next((d[key] for key in _DISTORTION if d.get(key) is not None), [])
+        distortion = np.ravel(np.array(_data(found), dtype=float))
+    except Exception as error:  # unreadable in any way: the same sentence
+        raise TabletDataError(
+            f"'{path.name}' must hold fx, fy, cx and cy in pixels, or camera_matrix (and distortion, where known)."
+        ) from error
+    if distortion.size not in (0, *_COUNTS):
+        counts = ", ".join(map(str, _COUNTS))
+        raise TabletDataError(f"'{path.name}': distortion holds {distortion.size} numbers; OpenCV knows {counts}.")
+    if not np.isfinite([*numbers, *distortion]).all() or min(numbers[:2]) <= 0.0:
+        raise TabletDataError(f"'{path.name}' holds a focal length that is not positive, or a value that is no number.")
+    return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
+
+
+def _document(path: Path) -> dict[str, Any]:
+    text = path.read_text(encoding="utf-8-sig")
+    if not text.startswith("%YAML:"):
+        return dict(yaml_load(data=text))
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)  # OpenCV's own dialect
+    nodes = {key: storage.getNode(key) for key in (*_MATRIX, *_DISTORTION)}
+    return {key: node.mat().ravel().tolist() for key, node in nodes.items() if not node.empty()}
+
+
+def _data(value: Any) -> Any:
+    return value["data"] if isinstance(value, dict) else value
+
+
+def _from_matrix(d: dict[str, Any]) -> list[float]:
+    K = np.array(_data(next(d[key] for key in _MATRIX if key in d)), dtype=float).reshape(3, 3)
+    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])]

@@ -1,0 +1,168 @@
+"""Planar touches of one visit or of many: every model that fits them, the one that predicts best, and what looks wrong."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.tablet.linear import LINEAR_NAMES, LinearFit, fit_linear
+from weldcal.calibration.tablet.planar import PLANAR_NAMES, PlanarConfig, PlanarFit, fit_planar
+from weldcal.calibration.tablet.planar_files import PlanarVisit
+from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
+from weldcal.calibration.tablet.two_stage import Sign
+from weldcal.models.errors import InputError, WeldcalError
+
+Array = NDArray[np.float64]
+PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"
+NAMES = {PNP: PLANAR_NAMES, FREE: PLANAR_NAMES, LINEAR: LINEAR_NAMES}
+
+_SCALE_SIGMAS = 3.0  # a free scale farther from 1 than this, and than a quarter of a percent, is told
+_SCALE_LEAST = 2.5e-3
+_OTHER_UNIT = 5.0  # lengths that differ by more than this factor are in different units
+_BETTER = 0.4  # what a changed sign must leave of the residuals to be told
+_BAD_M = 2e-3  # residuals above this are no noise
+_LEAST_TO_DOUBT = 6  # landmarks, so that five still check each other when one is doubted
+_LEAST_DOUBTED_M = 0.5e-3  # residuals below this are nobody's mistake
+
+
+@dc.dataclass(frozen=True, eq=False)
+class VisitFits:
+    """The fits of one visit by model, and the warnings about it; `step_m` of the hand's readings, 0 where it is fine."""
+
+    visit: PlanarVisit
+    fits: dict[str, PlanarFit | LinearFit]
+    warnings: tuple[str, ...]
+    step_m: float
+
+    def in_page(self, hand_m: Array) -> Array:
+        """Differences of hands (n, 2) m as they lie on the page."""
+        phi = self.fits[PNP].parameters[0]
+        return np.asarray(hand_m @ np.array([[np.cos(phi), np.sin(phi)], [np.sin(phi), -np.cos(phi)]]))
+
+    def left_out_mm(self, model: str) -> Array:
+        """What each left-out landmark misses by, (n,) mm; NaN where it could not be left out."""
+        return np.asarray(1e3 * np.linalg.norm(self.fits[model].leave_one_out_m, axis=1))
+
+    def held_out_mm(self, model: str) -> Array:
+        """What the queries miss by, (q,) mm; empty where there are none."""
+        queries, touches = self.visit.queries, self.visit.touches
+        if queries is None:
+            return np.zeros(0)
+        rays = (queries.uv_px - touches.centre_px) / touches.focal_px
+        hand = self.fits[model].hand_to_touch(rays, queries.theta_rad)
+        return np.asarray(1e3 * np.linalg.norm(hand - queries.hand_m, axis=1))
+
+
+def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool = True) -> VisitFits:
+    """Fit every model; `thorough` leaves landmarks out of the interval fit too, else of least squares (twenty times faster).
+
+    Raises what check_touches and tablet_pose raise, and InputError where lengths are in different units.
+    """
+    touches = visit.touches
+    fits: dict[str, PlanarFit | LinearFit] = {}
+    config = PlanarConfig(sign=sign, step_m=step_m)
+    planar = _fit_planar(touches, config, thorough)
+    _same_units(planar)
+    fits[PNP], fits[LINEAR] = planar, fit_linear(touches, sign)
+    scale, deviation = planar.free_scale
+    warnings = []
+    if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST):
+        fits[FREE] = _fit_planar(touches, dc.replace(config, free_scale=True), thorough)
+        warnings.append(
+            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
+            "page's size with a card, or the tablet's pixels per inch."
+        )
+    if visit.left_out:
+        rows = ", ".join(map(str, visit.left_out))
+        warnings.append(f"Left out, for want of finite numbers: landmark {rows}.")
+    odd = _other_signs(touches, sign, planar.sigma_m) + _odd_landmarks(visit, planar, config)
+    if planar.sigma_m > _BAD_M and not odd:
+        odd = [
+            f"The touches fit to {1e3 * planar.sigma_m:.1f} mm only: check that uv, hand, theta_deg, delta_px and tablet_px hold the "
+            "landmarks in one order."
+        ]
+    warnings += odd
+    return VisitFits(visit, fits, tuple(warnings), step_m)
+
+
+def best_model(visits: Sequence[VisitFits]) -> tuple[str, dict[str, float]]:
+    """The model that misses left-out landmarks least, over all visits, and every model's mean miss (mm; NaN: nothing left out).
+
+    A scale is only freed where every visit asks for it. Only landmarks that every model could do without are compared; with
+    four there are none, and it is PnP then.
+    """
+    models = [m for m in (PNP, LINEAR, FREE) if all(m in v.fits for v in visits)]
+    left = {m: np.concatenate([v.left_out_mm(m) for v in visits]) for m in models}
+    common = np.isfinite(np.array(list(left.values()))).all(axis=0)
+    errors = {m: float(left[m][common].mean()) if common.any() else float("nan") for m in models}
+    return min(models, key=lambda m: errors[m] if common.any() else 0.0), errors
+
+
+def _fit_planar(touches: TabletTouches, config: PlanarConfig, thorough: bool) -> PlanarFit:
+    if thorough or config.step_m == 0.0:
+        return fit_planar(touches, config)
+    squares = fit_planar(touches, dc.replace(config, step_m=0.0))
+    return dc.replace(fit_planar(touches, config, leave_one_out=False), leave_one_out_m=squares.leave_one_out_m)
+
+
+def _same_units(planar: PlanarFit) -> None:
+    scale = planar.free_scale[0]
+    if not 1.0 / _OTHER_UNIT < scale < _OTHER_UNIT:
+        raise InputError(
+            f"The hand moved {scale:.3g} times as far as the tablet's landmarks lie apart: write hand and hand_capture in "
+            "millimetres, and mm_per_px in millimetres per pixel of tablet_px."
+        )
+
+
+def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str]:
+    """What would fit far better if a sign were otherwise, in sentences."""
+    flip = np.array([1.0, -1.0])
+    extent = touches.landmark_px.max(axis=0) + touches.landmark_px.min(axis=0)
+    turned = {
+        "theta_deg counted the other way: the hand's turn is positive as Eq. 7 of the paper has it": dc.replace(
+            touches, theta_rad=-touches.theta_rad
+        ),
+        "delta_px reversed: it is the landmark minus the touched point": dc.replace(
+            touches, delta_px=-touches.delta_px
+        ),
+        "tablet_px counted up the page: y goes down it, as the image's does": dc.replace(
+            touches,
+            landmark_px=touches.landmark_px * flip + [0.0, extent[1]],
+            delta_px=touches.delta_px * flip,
+        ),
+    }
+    found = []
+    for what, other in turned.items():
+        if sign is Sign.PRINTED and what.startswith("delta_px"):
+            continue
+        left = fit_planar(other, PlanarConfig(sign=sign), leave_one_out=False).sigma_m
+        if left < _BETTER * sigma_m:
+            found.append(
+                f"The touches fit to {1e3 * left:.2f} mm instead of {1e3 * sigma_m:.2f} with {what}. Check the file."
+            )
+    return found
+
+
+def _odd_landmarks(visit: PlanarVisit, planar: PlanarFit, config: PlanarConfig) -> list[str]:
+    """A landmark without which all the others fit far better: touched, or read, wrongly."""
+    touches, number = visit.touches, same_landmark(visit.touches.landmark_px)
+    if number.max() + 1 < _LEAST_TO_DOUBT:
+        return []
+    squares = dc.replace(config, step_m=0.0)
+    left = []
+    for k in range(number.max() + 1):
+        try:
+            left.append(fit_planar(touches.pick(number != k), squares, leave_one_out=False).sigma_m)
+        except WeldcalError:  # it alone spans the plane, or turns the hand
+            left.append(np.inf)
+    worst = int(np.argmin(left))
+    if left[worst] > _BETTER * planar.sigma_m or planar.sigma_m < _LEAST_DOUBTED_M:
+        return []
+    row = visit.rows[int(np.nonzero(number == worst)[0][0])]
+    return [
+        f"Without landmark {row} the others fit to {1e3 * left[worst]:.2f} mm instead of {1e3 * planar.sigma_m:.2f}: touch it again, "
+        "or leave it out."
+    ]
