@@ -15,9 +15,11 @@ from pydrake.geometry import (
     DepthRenderCamera,
     GeometryInstance,
     MakePhongIllustrationProperties,
+    PerceptionProperties,
     RenderCameraCore,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
@@ -36,6 +38,7 @@ class RenderedScanner:
     height: int | None = 616
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.95])  # nominal X_BC
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, -90.0])
+    mounted_on: str = "base"  # or flange, or a link of the arm: shoulder ... wrist_2; the pose above is in its frame
     mounting_translation_mm: float = (
         15.0  # the true pose differs from the nominal one by this much, drawn from the seed
     )
@@ -132,9 +135,25 @@ class DepthSensor(LeafSystem):
         output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
-def _show_housing(world: SimulatedWorld, X_BC: RigidTransform) -> None:
-    """The scanner's body where it truly stands: for the viewer only, so that it does not see itself."""
+def _carrier(world: SimulatedWorld, mounted_on: str) -> RigidBody | None:
+    """The body that carries the scanner; None: it stands still in the base."""
+    if mounted_on == "base":
+        return None
+    return world.plant.GetBodyByName(mounted_on if mounted_on == "flange" else f"{mounted_on}_link", world.arm)
+
+
+def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBody | None) -> None:
+    """The scanner's body where it truly stands: for viewers only (not in the scanner's own scene), so that it does not see itself."""
     scene_graph = world.scene_graph
+    if carrier is not None:
+        plant = world.plant
+        size = Box(0.26, 0.07, 0.08)  # a short one and its bracket
+        housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), size, "scanner_housing")
+        housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 1.0])))
+        housing.set_perception_properties(PerceptionProperties())
+        frame = plant.GetBodyFrameIdOrThrow(carrier.index())
+        scene_graph.RegisterGeometry(plant.get_source_id(), frame, housing)
+        return
     source = scene_graph.RegisterSource("scanner_housing")
     housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), Box(0.41, 0.08, 0.09), "scanner_housing")
     housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 1.0])))
@@ -142,7 +161,10 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform) -> None:
 
 
 def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
-    """Stand a depth camera in the world at its true pose (known to `cheat.X_BC` alone) and add the scanner behind it."""
+    """Stand a depth camera on its carrier at its true pose (known to `cheat.*` alone) and add the scanner behind it.
+
+    Returns the true pose of the scanner in the frame of what carries it: X_BC, X_FC or X_LC.
+    """
     world = build.simulated_world()
     preset = config.scanner()
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
@@ -151,7 +173,8 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     )
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
     k = drake_intrinsics(preset)
-    _show_housing(world, X_BC)
+    carrier = _carrier(world, config.mounted_on)
+    _show_housing(world, X_BC, carrier)
     view = world.scanner_view
     core = RenderCameraCore(
         view.renderer,
@@ -161,7 +184,8 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     )
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
     colour = ColorRenderCamera(core, False)
-    sensor = build.builder.AddSystem(RgbdSensor(view.scene_graph.world_frame_id(), X_BC, colour, camera))
+    parent = view.scene_graph.world_frame_id() if carrier is None else view.frames[carrier.index()]
+    sensor = build.builder.AddSystem(RgbdSensor(parent, X_BC, colour, camera))
     sensor.set_name("scanner_depth")
     scanner = build.builder.AddSystem(DepthSensor(preset, int(build.rng.integers(2**31)), config.exposure_s))
     scanner.set_name("scanner")
