@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State
 
+from weldcal.calibration.base_circle_fit import fit_base_circle
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.handeye.fit import inverse_information
 from weldcal.calibration.mounting_poses import MountingPose, information, prior, work_point
@@ -20,6 +21,7 @@ from weldcal.calibration.mounting_scene import FLANGE, MountingScene
 from weldcal.calibration.rigid import skew
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.mounting_messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.pose_recorder import PoseHistory
@@ -34,7 +36,7 @@ class MountingFitConfig:
 
     standard: FlangeStandard
     guess_radius_m: float
-    min_coverage: float
+    foot: bool  # the ring of the base mounting, whose far side its column hides
     minimum_scans: int
     required_error_m: float
 
@@ -142,9 +144,9 @@ def find_circle(
     X_CR = belief.seen(q, q_2)
     radius = config.guess_radius_m + 0.5 * config.standard.outer_m
     guess = FlangeGuess(X_CR.translation(), radius, X_CR.rotation().matrix()[:, 2])
-    return fit_flange(
-        points_C, config.standard, guess=guess, config=FlangeFitConfig(min_coverage=config.min_coverage)
-    )
+    if config.foot:
+        return fit_base_circle(points_C, config.standard, guess)
+    return fit_flange(points_C, config.standard, guess=guess, config=LIVE_FIT)
 
 
 def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: int = 0) -> HandEyeResult:

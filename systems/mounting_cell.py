@@ -34,7 +34,8 @@ Array = NDArray[np.float64]
 
 RECORDING_FPS = 8.0
 SPARE = 12  # poses beyond those that are visited: the next best one is named among them
-FLANGE_COVERAGE, FOOT_COVERAGE = 0.85, 0.40  # share of the edge; the column hides the far side of its own foot
+FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
+"""Configurations that look at the circle of the base mounting; the others look at a flange."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +71,7 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, Fl
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")
     carrier = scenario.scanner.mounted_on
     link = {"base": 0, "flange": FLANGE}.get(carrier, 1 + LINKS.index(carrier) if carrier in LINKS else 0)
-    foot = c.configuration in ("eye_in_hand", "eye_on_arm_target_on_base")
-    circle = base_circle(scenario.arm) if foot else None
+    circle = base_circle(scenario.arm) if c.configuration in FOOT else None
     standard = get_flange(scenario.flange) if circle is None else circle.standard
     second = job.second_arm
     scene = MountingScene(
@@ -130,7 +130,7 @@ def make_mounting_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | Non
     fit = MountingFitConfig(
         standard,
         c.guess_radius_mm * 1e-3,
-        FLANGE_COVERAGE if standard.bore_depth_m == get_flange(scenario.flange).bore_depth_m else FOOT_COVERAGE,
+        c.configuration in FOOT,
         c.minimum_scans,
         c.required_error_mm * 1e-3,
     )
