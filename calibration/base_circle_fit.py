@@ -100,7 +100,9 @@ def _upward(window: Array, normal: Array) -> Mask:
         return np.asarray(np.abs(n @ normal) > np.cos(_UPWARD_RAD) * np.linalg.norm(n, axis=2))
 
 
-def _parallel_plane(points: Array, normal: Array, standard: FlangeStandard, config: BaseCircleConfig) -> PlaneFit | None:
+def _parallel_plane(
+    points: Array, normal: Array, standard: FlangeStandard, config: BaseCircleConfig
+) -> PlaneFit | None:
     """The best supported plane of about the guessed normal."""
     if len(points) < config.min_points:
         return None
@@ -224,7 +226,11 @@ def _refine(
         center = view.plane.point + view.axes @ circle.center
         view = _look(window, plane)
         start = CircleFit(
-            (center - view.plane.point) @ view.axes, standard.outer_radius_m, circle.covariance, circle.rms, circle.inliers
+            (center - view.plane.point) @ view.axes,
+            standard.outer_radius_m,
+            circle.covariance,
+            circle.rms,
+            circle.inliers,
         )
         pitch = _pitch(window, view)
         with np.errstate(invalid="ignore"):
@@ -269,4 +275,6 @@ def _held(fit: CircleFit, radius_m: float, sigma_m: float) -> CircleFit:
     gain = C[:, 2] / (C[2, 2] + sigma_m**2)
     change = gain * (radius_m - fit.radius)
     held = C - np.outer(gain, C[2])
-    return CircleFit(fit.center + change[:2], fit.radius + float(change[2]), 0.5 * (held + held.T), fit.rms, fit.inliers)
+    return CircleFit(
+        fit.center + change[:2], fit.radius + float(change[2]), 0.5 * (held + held.T), fit.rms, fit.inliers
+    )

@@ -85,12 +85,14 @@ def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: Mou
     return (*chosen, *aside, *others)
 
 
-def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: float, sigma_rad: float) -> Array:
+def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
     """What sightings of the circle at some poses would tell (k, m + 3, m + 3): of the free unknowns, in the order of the
-    solver, and of a constant bias of the centre in its own frame."""
+    solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,) along the
+    circle's own axes."""
     sightings = [scene.sighting(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses]
     lin = linearise(scene.problem(sightings), scene.state, np.zeros(3))
-    Jd = np.concatenate([lin.Jd, np.broadcast_to(np.eye(3), (len(poses), 3, 3))], axis=2) / sigma_m
+    Jd = np.concatenate([lin.Jd, np.broadcast_to(np.eye(3), (len(poses), 3, 3))], axis=2)
+    Jd = Jd / np.broadcast_to(sigma_m, (3,))[:, None]
     Jw = np.concatenate([lin.Jw, np.zeros((len(poses), 3, 3))], axis=2) / sigma_rad
     return np.asarray(np.swapaxes(Jd, 1, 2) @ Jd + np.swapaxes(Jw, 1, 2) @ Jw)
 
@@ -167,9 +169,7 @@ def _pool(
     return pool, why
 
 
-def _by_view(
-    scene: MountingScene, plan: MountingPlan, rng: np.random.Generator
-) -> tuple[Array, Array | None] | str:
+def _by_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> tuple[Array, Array | None] | str:
     """Draw how the scanner sees the circle, and ask for the joints."""
     X_CR = _random_view(scene, plan, rng)
     if X_CR is None:
@@ -177,19 +177,16 @@ def _by_view(
     q_2 = None
     if scene.q_home_2 is not None:
         q_2 = scene.q_home_2 + rng.uniform(-plan.spread_rad, plan.spread_rad, 6)
-    if scene.configuration == "eye_on_base":
-        X_BF = scene.X_LC @ X_CR @ scene.X_HR.inverse()
-    else:
-        X_BF = scene.circle([], q_2) @ (scene.X_LC @ X_CR).inverse()
+    X_LR = scene.X_LC @ X_CR
+    on_base = scene.configuration == "eye_on_base"
+    X_BF = X_LR @ scene.X_HR.inverse() if on_base else scene.circle([], q_2) @ X_LR.inverse()
     q = nearest_solution(scene.arm, X_BF, scene.q_home)
     if q is None:
         return "it is out of the arm's reach"
     return q, q_2
 
 
-def _by_joints(
-    scene: MountingScene, plan: MountingPlan, rng: np.random.Generator
-) -> tuple[Array, Array | None] | str:
+def _by_joints(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> tuple[Array, Array | None] | str:
     """Draw the joints between scanner and circle; the others stay at home."""
     q = scene.q_home.copy()
     if scene.configuration == "eye_on_arm_target_on_base":
@@ -197,7 +194,9 @@ def _by_joints(
         q[1 : scene.link] += rng.uniform(-plan.spread_rad, plan.spread_rad, scene.link - 1)
     else:
         q[scene.link : 5] += rng.uniform(-plan.spread_rad, plan.spread_rad, 5 - scene.link)
-        q[5] += rng.uniform(-np.pi / 2, np.pi / 2)
+        q[5] += 2.5 * rng.uniform(
+            -plan.spread_rad, plan.spread_rad
+        )  # the flange's own axis: it costs nothing of the view
     if not ((q >= scene.arm.position_lower) & (q <= scene.arm.position_upper)).all():
         return "a joint is at its limit"
     return q, None
@@ -226,9 +225,7 @@ def _random_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Genera
     return RigidTransform(R @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi)), p)
 
 
-def _refuse(
-    scene: MountingScene, bodies: Bodies, plan: MountingPlan, q: Array, q_2: Array | None
-) -> str | None:
+def _refuse(scene: MountingScene, bodies: Bodies, plan: MountingPlan, q: Array, q_2: Array | None) -> str | None:
     """Why this posture will not do, or None."""
     if float(np.abs(q - scene.q_home).max()) > plan.max_travel_rad:
         return "the joints would have to travel too far from home"
@@ -272,7 +269,7 @@ def _greedy(scene: MountingScene, pool: Sequence[MountingPose], plan: MountingPl
     order: list[int] = []
     left = list(range(len(pool)))
     while left:
-        values = np.linalg.slogdet(total + gains[left])[1] - 0.0
+        values = np.linalg.slogdet(total + gains[left])[1]
         best = left[int(np.argmax(values))]
         order.append(best)
         left.remove(best)

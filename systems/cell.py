@@ -189,6 +189,8 @@ def make_cell(
     Raises:
         InputError, UnreachableScanner: the scenario cannot be done; nothing has been written or moved.
     """
+    if scenario.mounting is not None:
+        raise InputError("This scenario is a mounting job: run it with weldcal hand-eye live or weldcal demo.")
     station = make_station(scenario, seed, robot)
     try:
         check_way_home(scenario, station)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from weldcal.calibration.base_circle_fit import fit_base_circle
@@ -19,6 +20,7 @@ from weldcal.calibration.handeye.fit import inverse_information
 from weldcal.calibration.mounting_poses import MountingPose, information, prior, work_point
 from weldcal.calibration.mounting_scene import FLANGE, MountingScene
 from weldcal.calibration.rigid import skew
+from weldcal.calibration.stated_noise import information_of, with_stated_noise
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.flange_estimator import LIVE_FIT
@@ -27,7 +29,10 @@ from weldcal.systems.mounting_messages import KeptAside, MountingState, Mounting
 from weldcal.systems.pose_recorder import PoseHistory
 
 Array = NDArray[np.float64]
-FEWEST = 4  # sightings before anything is solved
+
+FIT_SHARE = (
+    1.25  # errors of the fits over their own sigma (which takes a scan's noise for independent), rms in simulated scans
+)
 
 
 @dc.dataclass(frozen=True)
@@ -117,10 +122,11 @@ def digest(
         return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
     if job.purpose == "verify":
         return dc.replace(status, kept_aside=(*status.kept_aside, compare(job.label, fit, belief, q, q_2)))
-    pose = MountingPose(q, q_2, belief.seen(q, q_2))
-    seen = SeenCircle(job.label, pose, scene.sighting(q, q_2, fit.center_C, fit.normal_C), fit.coverage)
+    X_CR = belief.seen(q, q_2)
+    sighting = scene.sighting(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
+    seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), sighting, fit.coverage)
     status = dc.replace(status, seen=(*status.seen, seen), message="")
-    if len(status.seen) < FEWEST:
+    if len(status.seen) < fewest(scene):
         return status
     try:
         result = solve_mounting(scene, status.seen)
@@ -149,17 +155,32 @@ def find_circle(
     return fit_flange(points_C, config.standard, guess=guess, config=LIVE_FIT)
 
 
+def own_covariance(fit: FlangeFit, X_CR: RigidTransform) -> Array:
+    """Covariance (6, 6) [rotation; translation] of a fitted circle in its own axes; an arc places its centre unequally well."""
+    R = X_CR.rotation().matrix()
+    out = np.zeros((6, 6))
+    out[:3, :3] = fit.normal_sigma**2 * np.eye(3)
+    out[3:, 3:] = R.T @ fit.center_covariance @ R
+    return FIT_SHARE**2 * out
+
+
+def fewest(scene: MountingScene) -> int:
+    """Sightings before anything is solved: six numbers of position more than are sought, or their noise would go unseen."""
+    return 2 + 2 * (len(scene.mounting.unknowns) - len(scene.known))
+
+
 def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: int = 0) -> HandEyeResult:
     """The unknown poses from all sightings, the belief as one start among the closed forms. Raises as solve_problem."""
-    mounting = scene.mounting
-    return solve_problem(
-        scene.problem([s.sighting for s in seen]),
+    mounting, problem = scene.mounting, scene.problem([s.sighting for s in seen])
+    result = solve_problem(
+        problem,
         scene.state,
         config=HandEyeConfig(folds=folds),
         equation=mounting.equation,
         starts=(scene.state,),
         labels=mounting.labels,
     )
+    return with_stated_noise(problem, scene.state, result)
 
 
 def sigma_of_work(scene: MountingScene, result: HandEyeResult) -> float:
@@ -181,13 +202,13 @@ def next_best(
     """Of the planned poses (all within reach, in sight and clear) the one not yet visited that would shrink the error at the
     work point most; None where all were visited."""
     size = len(result.joint_covariance)
-    sigma, turn = max(result.sigma_translation, 1e-6), max(float(np.nan_to_num(result.sigma_rotation_rad)), 1e-6)
+    own = np.median([np.diag(_covariance_of(s)) for s in seen], axis=0)
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None
-    taken = information(belief, [s.pose for s in seen], sigma, turn)[:, :size, :size].sum(axis=0)
-    taken = taken + prior(belief)[:size, :size]
-    more = information(belief, left, sigma, turn)[:, :size, :size]
+    problem = belief.problem([s.sighting for s in seen]).pick(result.inliers)
+    taken = information_of(problem, belief.state)[0] + prior(belief)[:size, :size]
+    more = information(belief, left, np.sqrt(own[3:]), float(np.sqrt(own[0])))[:, :size, :size]
     J = np.hstack([-skew(belief.X_LC.rotation().matrix() @ work_point(belief)), np.eye(3)])
 
     def at_work(total: Array) -> float:
@@ -195,4 +216,10 @@ def next_best(
 
     after = [at_work(taken + m) for m in more]
     best = left[int(np.argmin(after))]
-    return NextBest(best.q, best.q_2, belief.frames(best.q)[FLANGE], at_work(taken), min(after))
+    now = sigma_of_work(belief, result)
+    return NextBest(best.q, best.q_2, belief.frames(best.q)[FLANGE], now, now * min(after) / at_work(taken))
+
+
+def _covariance_of(seen: SeenCircle) -> Array:
+    C = seen.sighting.covariance
+    return np.zeros((6, 6)) if C is None else C

@@ -33,6 +33,7 @@ from weldcal.welding.guard import SlewLimits
 Array = NDArray[np.float64]
 
 RECORDING_FPS = 8.0
+LIMITER_PERIOD_S = 0.004  # nothing is touched: half the rate of a weld will do
 SPARE = 12  # poses beyond those that are visited: the next best one is named among them
 FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
 """Configurations that look at the circle of the base mounting; the others look at a flange."""
@@ -100,6 +101,7 @@ def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),
         spread_rad=np.deg2rad(job.spread_deg),
+        max_travel_rad=np.deg2rad(job.travel_deg),
         table_z_m=c.table_z_m,
         margin_m=c.clearance_m,
         candidates=visited + SPARE,
@@ -148,7 +150,7 @@ def make_mounting_cell(scenario: Scenario, seed: int = 0, meshcat: Meshcat | Non
         factor = scenario.job.speed_factor
         mover = builder.AddSystem(FlangeMover(MOVE_SPEED * factor, MOVE_ACCELERATION * factor))
         limits = SlewLimits(speed=0.6 * arm.velocity_limit, acceleration=0.5 * arm.acceleration_limit, jerk=JERK_LIMIT)
-        limiter = builder.AddSystem(SlewLimiter(limits))
+        limiter = builder.AddSystem(SlewLimiter(limits, LIMITER_PERIOD_S))
         for system, name in ((recorder, "pose_recorder"), (mover, "flange_mover"), (limiter, "slew_limiter")):
             system.set_name(name + suffix)
         measured = out(f"{prefix}.position_measured")

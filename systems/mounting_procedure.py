@@ -55,8 +55,7 @@ class MountingProcedure(LeafSystem):
         self._home, self._timeout_s = home, timeout_s
         self._settled = [self.DeclareVectorInputPort(n, 1) for n in ("settled_goal", "settled_goal_2")]
         self._robots = [
-            self.DeclareAbstractInputPort(n, AbstractValue.Make(UrStatus()))
-            for n in ("robot_status", "robot_status_2")
+            self.DeclareAbstractInputPort(n, AbstractValue.Make(UrStatus())) for n in ("robot_status", "robot_status_2")
         ]
         self._status = self.DeclareAbstractInputPort("status", AbstractValue.Make(MountingStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(MountingState()))

@@ -43,6 +43,7 @@ class MountingJob:
     target_known: bool = True  # the drawing says where the circle sits; false: that is sought too
     second_arm: SecondArm | None = None
     spread_deg: float = 35.0  # how far joints may go from home where a joint, not a view, is what is chosen
+    travel_deg: float = 126.0  # and where it follows from the view: shorter moves, but poses that tell less
 
 
 def check_mounting(

@@ -165,6 +165,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
         X_BP=X_BP,
         second=second,
         foot=None if scenario.mounting is None else base_circle(scenario.arm),
+        time_step_s=0.002 if scenario.mounting is None else 0.004,  # nothing is touched in a mounting job
     )
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot)
     if second is not None:
@@ -173,7 +174,8 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     X_LC = apply_driver_config(scenario.scanner, build)
     apply_driver_config(scenario.finger_camera, build)
     on_base = isinstance(scenario.scanner, NoDevice) or scenario.scanner.mounted_on == "base"
-    truth = Truth(X_LC if on_base else None, X_BP, real, X_LC, None if second is None else second.X_BD)
+    X_BD = None if second is None else second.X_BD
+    truth = Truth(X_LC if on_base else None, X_BP, real, X_LC=X_LC, X_BD=X_BD)
     _export(build, truth)
     diagram = builder.Build()
     diagram.set_name("station")

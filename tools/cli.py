@@ -11,6 +11,7 @@ import typer
 from weldcal.tools import cli_hand_eye, console
 from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
+from weldcal.tools.cli_mounting import benchmark_mountings, live
 from weldcal.tools.cli_profiler import profiler
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
@@ -37,7 +38,9 @@ benchmarks.command("tablet")(benchmark_tablet)
 benchmarks.command("seam-planning")(seam_planning)
 mount_flange(benchmarks)
 app.add_typer(cli_hand_eye.hand_eye, name="hand-eye")
+cli_hand_eye.hand_eye.command("live")(live)
 benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
+benchmarks.command("mountings")(benchmark_mountings)
 app.add_typer(profiler, name="profiler")
 
 OutOption = Annotated[
@@ -92,6 +95,7 @@ CorrectionOption = Annotated[
     ),
 ]
 RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
+DEMO_SCENARIO = "s_groove"
 ScenarioOption = Annotated[
     str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
 ]
@@ -122,7 +126,10 @@ def weldcal(
 
 @app.command(short_help="The whole story in simulation, with a report at the end.")
 def demo(
-    scenario: ScenarioOption = "s_groove",
+    name: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help="The same as --scenario.", show_default=False)
+    ] = None,
+    scenario: ScenarioOption = DEMO_SCENARIO,
     out: OutOption = None,
     seed: SeedOption = 0,
     browser: BrowserOption = True,
@@ -135,8 +142,13 @@ def demo(
     debug: DebugOption = False,
 ) -> None:
     """The whole story: calibrate, verify, scan the workpiece, plan, weld, retract; with a report at the end."""
+    if name is not None:
+        if scenario not in (DEMO_SCENARIO, name):
+            raise typer.BadParameter("give the scenario once, by itself or with --scenario")
+        scenario = name
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.demo import DemoOptions, run_demo
+        from weldcal.tools.demo import DemoOptions
+        from weldcal.tools.procedures import run_procedure
 
         options = DemoOptions(
             scenario=scenario,
@@ -150,7 +162,7 @@ def demo(
             speed_factor=speed_factor,
         )
         with console.progress_bar("demo") as progress:
-            result = run_demo(options, progress)
+            result = run_procedure(options, progress)
     finish("demo", result.summary(), result.folder, json_wanted=json)
 
 
@@ -210,7 +222,8 @@ def calibrate(
             if report.algorithm1 is not None:
                 rows["Algorithm 1"] = report.algorithm1.sentence
         else:
-            from weldcal.tools.demo import DemoOptions, run_calibration_live
+            from weldcal.tools.demo import DemoOptions
+            from weldcal.tools.procedures import calibrate_live
 
             assert scenario is not None
             folder = out or fresh_folder("calibrate", scenario, seed)
@@ -223,7 +236,7 @@ def calibrate(
                 pace=pace,
                 speed_factor=speed_factor,
             )
-            summary = run_calibration_live(options, progress).calibration_summary()
+            summary = calibrate_live(options, progress)
     finish("calibrate", summary, folder, json_wanted=json, rows=rows)
 
 

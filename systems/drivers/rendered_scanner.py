@@ -17,6 +17,7 @@ from pydrake.geometry import (
     MakePhongIllustrationProperties,
     PerceptionProperties,
     RenderCameraCore,
+    Rgba,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.tree import RigidBody
@@ -149,8 +150,11 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBod
         plant = world.plant
         size = Box(0.26, 0.07, 0.08)  # a short one and its bracket
         housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), size, "scanner_housing")
-        housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 1.0])))
-        housing.set_perception_properties(PerceptionProperties())
+        grey = np.array([0.18, 0.20, 0.23, 1.0])
+        seen = PerceptionProperties()
+        seen.AddProperty("phong", "diffuse", Rgba(*grey))
+        housing.set_illustration_properties(MakePhongIllustrationProperties(grey))
+        housing.set_perception_properties(seen)
         frame = plant.GetBodyFrameIdOrThrow(carrier.index())
         scene_graph.RegisterGeometry(plant.get_source_id(), frame, housing)
         return

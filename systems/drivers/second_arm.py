@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import Box
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import MultibodyPlant
@@ -45,6 +46,8 @@ def add_second_arm(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance), placed.X_BD)
     for name, p, d in zip(placed.arm.joint_names, stiffness, damping, strict=True):
         plant.GetJointActuatorByName(name, instance).set_controller_gains(PdControllerGains(p=p, d=d))
+    top, grey = RigidTransform([0.0, 0.0, -0.02]), np.array([0.36, 0.38, 0.40, 1.0])
+    plant.RegisterVisualGeometry(plant.world_body(), placed.X_BD @ top, Box(0.5, 0.5, 0.04), "second_table", grey)
     return instance
 
 
