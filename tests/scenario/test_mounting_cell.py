@@ -27,13 +27,13 @@ from weldcal.tools.procedures import kind_of
 # few poses near home, a coarse image, a controller at a quarter of its rate: seconds instead of a minute
 QUICK = "robot: !SimulatedUr {control_period_s: 0.008}\n"
 SHORT = {
-    "eye_in_hand": (560, 5, "mounting: {travel_deg: 45.0}"),
+    "eye_in_hand": (560, 5, "mounting: {travel_deg: 40.0}"),
     "eye_on_arm": (412, 5, "mounting: {spread_deg: 18.0}"),
     "eye_on_arm_base": (560, 5, "mounting: {spread_deg: 20.0}"),
     "co_manipulation": (
         560,
         6,
-        "mounting: {travel_deg: 40.0, spread_deg: 10.0}\nrobot_2: !SimulatedUr {control_period_s: 0.008}",
+        "mounting: {travel_deg: 30.0, spread_deg: 8.0}\nrobot_2: !SimulatedUr {control_period_s: 0.008}",
     ),
 }
 SEED = 1
