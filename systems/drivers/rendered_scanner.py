@@ -45,7 +45,9 @@ class RenderedScanner:
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
     field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
-    mounted_on: str = "base"  # or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
+    mounted_on: str = (
+        "base"  # or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
+    )
 
     def scanner(self) -> ScannerPreset:
         """The scanner with the resolution and the field of view that are asked for; pixels stay as square as they were."""
