@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,17 +52,19 @@ class MountingPlan:
 
 @dataclass(frozen=True, eq=False)
 class MountingPose:
-    """A pose to visit: joints (6,) rad of the first and, where there is one, the second arm; X_CR that is expected."""
+    """A pose to visit: joints (6,) rad of the first and, where there is one, the second arm; X_CR that is expected.
+    ``via_home``: the straight way from the pose before it is not free, the one through home is."""
 
     q: Array
     q_2: Array | None
     X_CR: RigidTransform
+    via_home: bool = False
 
 
 def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
     """Plan ``n`` poses, most telling first (greedy, D-optimal in the unknowns), then ``kept_aside`` drawn at random, then all
-    others that would do. Each of the first n + kept_aside is reached from the one before, the second arm going first, and
-    has a free way home. Deterministic for ``plan.seed``.
+    others that would do. Each of the first n + kept_aside has a free way from home, the second arm going first, and is
+    reached on it or from the pose before (the first one kept aside from home). Deterministic for ``plan.seed``.
 
     Raises:
         UnreachableScanner: one sentence that names the commonest obstacle.
@@ -72,16 +74,15 @@ def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: Mou
     pool, why = _pool(scene, bodies, plan, rng)
     order = _greedy(scene, pool, plan)
     chosen = _chain(bodies, [pool[i] for i in order], n, plan)
-    rest = [pool[i] for i in order if not any(pool[i] is c for c in chosen)]
-    shuffled = [rest[i] for i in rng.permutation(len(rest))]
-    aside = _chain(bodies, shuffled, kept_aside, plan, chosen[-1:])
+    rest = [pool[i] for i in order if not any(pool[i].q is c.q for c in chosen)]
+    aside = _chain(bodies, [rest[i] for i in rng.permutation(len(rest))], kept_aside, plan)
     if len(chosen) < n or len(aside) < kept_aside:
         reason = why.most_common(1)[0][0] if why else "the poses found lie too close together"
         raise UnreachableScanner(
             f"Only {len(chosen) + len(aside)} of {n + kept_aside} poses show the circle to the scanner, most often because "
             f"{reason}; mount the scanner elsewhere, correct its guessed pose, or choose another home_deg."
         )
-    others = [p for p in rest if not any(p is a for a in aside)]
+    others = [p for p in rest if not any(p.q is a.q for a in aside)]
     return (*chosen, *aside, *others)
 
 
@@ -130,20 +131,17 @@ def _way(
     return bodies.clear(between, end, plan.table_z_m, plan.step_rad)
 
 
-def _chain(
-    bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan, before: Sequence[MountingPose] = ()
-) -> list[MountingPose]:
-    """The first n poses, each reached from the one before it (the first from home) and with a free way home."""
+def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
+    """The first n poses with a free way from home (the way home is the same backwards), each reached from the one before it
+    where that is free too."""
     home = (bodies.scene.q_home, bodies.scene.q_home_2)
     kept: list[MountingPose] = []
     for pose in poses:
         if len(kept) == n:
             break
-        last = kept[-1:] or list(before)
-        way = _way(bodies, _at(last[0]) if last else home, _at(pose), plan)
-        # the way home is the way from home, backwards: the first arm leaves first
-        if way and (not last or _way(bodies, home, _at(pose), plan)):
-            kept.append(pose)
+        if _way(bodies, home, _at(pose), plan):
+            direct = not kept or _way(bodies, _at(kept[-1]), _at(pose), plan)
+            kept.append(replace(pose, via_home=not direct))
     return kept
 
 

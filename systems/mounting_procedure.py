@@ -116,6 +116,8 @@ class MountingProcedure(LeafSystem):
         route: tuple[tuple[int, Array], ...] = ((0, pose.q),)
         if pose.q_2 is not None:
             route = ((1, pose.q_2), *route)
+        if pose.via_home:
+            route = (*self._homeward(), *route)
         return _go(replace(s, visit=k, purpose="verify" if aside else "calibrate"), route, label, now)
 
     def _homeward(self) -> tuple[tuple[int, Array], ...]:

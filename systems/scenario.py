@@ -226,6 +226,7 @@ def check_scenario(scenario: Scenario) -> None:
         scenario.calibration.configuration,
         scenario.mounting,
         "base" if isinstance(scenario.scanner, NoDevice) else scenario.scanner.mounted_on,
+        simulated=isinstance(scenario.robot, SimulatedUr),
         second_robot=not isinstance(scenario.robot_2, NoDevice),
         weld=scenario.job.weld,
     )

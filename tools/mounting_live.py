@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -164,7 +165,8 @@ def run_mounting_live(scenario: Scenario, options: DemoOptions, progress: Progre
     meshcat = Meshcat(MeshcatParams(host="localhost", port=None)) if options.browser else None
     cell = make_mounting_cell(scenario, options.seed, meshcat)
     progress("visit the poses", 0.1)
-    run = run_mounting_cell(cell, meshcat)
+    with closing(cell.station):
+        run = run_mounting_cell(cell, meshcat)
     progress("write", 0.9)
     result = None
     if run.status.result is not None:

@@ -149,6 +149,7 @@ def test_what_does_not_belong_together_is_refused_before_any_work(tmp_path: Path
     refused("eye_in_hand", "calibration: {configuration: eye_in_foot}", "configuration must be one of")
     refused("calibrate_only", "robot_2: !SimulatedUr {}", "second robot belongs to co_manipulation")
     refused("co_manipulation", "robot_2: !NoDevice {}", "robot_2")
+    refused("eye_in_hand", "robot: !UrRtde {host: 192.168.1.10}", "simulated arms only")
     refused("eye_on_arm", "mounting: {spread_deg: -3.0}", "positive")
     with pytest.raises(InputError, match="runs on the arms of its scenario"):
         run_mounting_live(short("eye_on_arm"), DemoOptions("eye_on_arm", tmp_path, robot="emulated"), lambda *_: None)
