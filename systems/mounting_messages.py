@@ -70,7 +70,7 @@ class NextBest:
         p = 1e3 * self.X_BF.translation()
         return (
             f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would take the "
-            f"sigma of a scanned point from {1e3 * self.sigma_before_m:.3f} to {1e3 * self.sigma_after_m:.3f} mm."
+            f"sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to {1e3 * self.sigma_after_m:.4f} mm."
         )
 
 

@@ -21,8 +21,9 @@ from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
 from weldcal.calibration.handeye.mountings import Mounting
 from weldcal.calibration.mounting_poses import work_point
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.mounting_calibrator import solve_mounting
-from weldcal.systems.mounting_cell import MountingRun, make_mounting_cell, run_mounting_cell
+from weldcal.systems.mounting_cell import FOOT, MountingRun, make_mounting_cell, run_mounting_cell
 from weldcal.systems.scenario import Scenario, check_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions
@@ -126,12 +127,27 @@ class MountingReport:
             }
         return out | {"simulated_seconds": self.run.seconds, "seconds": self.seconds}
 
+    def given(self) -> tuple[str, ...]:
+        """What was not sought: where the circle sits, and which link carries the scanner."""
+        scene, scenario = self.run.cell.scene, self.run.cell.scenario
+        out = []
+        for letter in scene.known:
+            u = self.mounting.unknowns[letter]
+            circle = (
+                "the circle of the base mounting" if scenario.calibration.configuration in FOOT else "the flange itself"
+            )
+            out.append(f"{u.symbol} is known: the target M is {circle}, where the robot's drawing puts it.")
+        if "arm" in scene.configuration and not isinstance(scenario.scanner, NoDevice):
+            out.append(f"The arm link L is the {scenario.scanner.mounted_on.replace('_', ' ')}.")
+        return tuple(out)
+
     def text(self) -> str:
         """What a person reads: the direction in words, the sketch, numbers, and what was never seen."""
         status = self.run.status
         if self.result is None:
             return f"{self.mounting.name}: {self.state}. {self.reason}"
         lines = [HandEyeReport(self.result, self.mounting, (), None, (), self.seconds).text(), ""]
+        lines += [f"given        {sentence}" for sentence in self.given()]
         aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.kept_aside)
         if aside:
             lines.append(f"kept aside   {aside} mm at poses the calibration never saw")

@@ -25,16 +25,12 @@ def mounting_report(report: MountingReport, picture: bytes) -> str:
         sigma = np.sqrt(np.diag(result.covariance[k])) if result is not None else np.zeros(6)
         rpy = np.degrees(X.rotation().ToRollPitchYaw().vector())
         e = errors.get(u.symbol)
-        unknowns.append(
-            (
-                u.sentence,
-                ", ".join(fixed(1e3 * v, 3) for v in X.translation()),
-                _spread(1e3 * sigma[3:], 3, 1e3),
-                ", ".join(fixed(v, 4) for v in rpy),
-                _spread(np.degrees(sigma[:3]), 4, 57.3),
-                "–" if e is None else f"{fixed(e.mm, 3)} / {fixed(e.deg, 4)}",
-            )
-        )
+        off = "" if e is None else f" (off the truth by {fixed(e.mm, 3)} mm and {fixed(e.deg, 4)} deg; simulation)"
+        lengths = zip(("x, mm", "y, mm", "z, mm"), 1e3 * X.translation(), 1e3 * sigma[3:], strict=True)
+        angles = zip(("roll, deg", "pitch, deg", "yaw, deg"), rpy, np.degrees(sigma[:3]), strict=True)
+        cells = [(name, fixed(v, 3), _spread(s, 3, 1e3)) for name, v, s in lengths]
+        cells += [(name, fixed(v, 4), _spread(s, 4, 57.3)) for name, v, s in angles]
+        unknowns.append((u.sentence[0].upper() + u.sentence[1:] + off, cells))
     rows = []
     for i, s in enumerate(status.seen):
         used = result is None or bool(result.inliers[i])
@@ -52,6 +48,7 @@ def mounting_report(report: MountingReport, picture: bytes) -> str:
         equation=mounting.equation,
         source=mounting.source,
         sketch=mounting.sketch,
+        given=report.given(),
         state=report.state,
         reason=report.reason,
         description=report.run.cell.scenario.description,
@@ -78,8 +75,8 @@ def mounting_report(report: MountingReport, picture: bytes) -> str:
     )
 
 
-def _spread(sigma: np.ndarray, digits: int, certain: float) -> str:
-    return ", ".join("open" if v > certain else fixed(float(v), digits) for v in sigma)
+def _spread(sigma: float, digits: int, certain: float) -> str:
+    return "open" if sigma > certain else fixed(float(sigma), digits)
 
 
 def _growth(report: MountingReport) -> bytes:
