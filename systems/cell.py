@@ -191,6 +191,8 @@ def make_cell(
     """
     if scenario.tablet is not None:
         raise InputError("This scenario is a visit to a tablet: run it with weldcal tablet demo or weldcal demo.")
+    if scenario.mounting is not None:
+        raise InputError("This scenario is a mounting job: run it with weldcal hand-eye live or weldcal demo.")
     station = make_station(scenario, seed, robot)
     try:
         check_way_home(scenario, station)

@@ -17,6 +17,7 @@ from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated_tablet import SimulatedTablet
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.mounting_scenario import MountingJob, check_mounting
 from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
 from weldcal.welding.laws import get_law
@@ -52,8 +53,9 @@ class ErrorConfig:
 class CalibrationConfig:
     """The calibration job: which feature, which poses, when to stop."""
 
+    configuration: str = "eye_on_base"  # or eye_in_hand, eye_on_arm_target_on_flange, ..._on_base, co_manipulation
     feature: str = "tool_ring"  # tool_ring: the ring on the welding tool; flange: the bare flange
-    mounting_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BC as measured with a tape
+    mounting_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BC (X_FC, X_LC) as measured with a tape
     guess_radius_mm: float = 60.0  # how far the feature may be from where the guess puts it
     theta_max_deg: float = 25.0  # between the feature's normal and the line of sight
     required_error_mm: float = 0.10  # e_required, on the estimate's own error at the work point
@@ -156,12 +158,14 @@ class Scenario:
     flange: str = "iso9409-1-50-4-m6"  # of the arm
     tool: str = "welding"  # welding, pen or none
     robot: SimulatedUr | UrRtde | NoDevice = dc.field(default_factory=SimulatedUr)
+    robot_2: SimulatedUr | NoDevice = dc.field(default_factory=NoDevice)
     scanner: RenderedScanner | NoDevice = dc.field(default_factory=RenderedScanner)
     finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
     wrist_camera: RenderedWristCamera | NoDevice = dc.field(default_factory=NoDevice)
     digitizer: SimulatedTablet | NoDevice = dc.field(default_factory=NoDevice)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
+    mounting: MountingJob | None = None
     workpiece: WorkpieceConfig | None = None
     planning: PlanningConfig = dc.field(default_factory=PlanningConfig)
     welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
@@ -228,6 +232,14 @@ def check_scenario(scenario: Scenario) -> None:
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
         )
     check_numbers(scenario)
+    check_mounting(
+        scenario.calibration.configuration,
+        scenario.mounting,
+        "base" if isinstance(scenario.scanner, NoDevice) else scenario.scanner.mounted_on,
+        simulated=isinstance(scenario.robot, SimulatedUr),
+        second_robot=not isinstance(scenario.robot_2, NoDevice),
+        weld=scenario.job.weld,
+    )
     scenario.welding.process.process()
     scenario.planning.planning_method()
     if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:

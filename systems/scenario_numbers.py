@@ -20,13 +20,14 @@ POSITIVE = {
         "bend_radius_mm",
     ),
     *("maximum_time_s", "control_period_s", "following_error_rad"),
-    *("pace", "velocity_share"),
+    *("pace", "velocity_share", "spread_deg", "travel_deg"),
     *("rate_hz", "focal_px", "field_of_view_deg", "width", "height", "recording_fps", "cloud_points"),
 }
 NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "verification_scans", "payload_kg"),
     *("repeatability_mm", "work_radius_mm"),
     *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
+    *("placement_translation_mm", "placement_rotation_deg"),
 }
 LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "start_m": 3, "home_deg": 6, "payload_cog_m": 3}
 

@@ -14,12 +14,14 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.base_circles import base_circle
 from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.second_arm import PlacedArm, apply_second_robot, place_second_arm
 from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.tablet_world import tablet_fittings
@@ -36,6 +38,8 @@ class Truth(Message):
     X_BP: RigidTransform | None
     workpiece: Workpiece | None  # the part as it really is
     tablet: TabletTruth | None = None  # camera and pen on the wrist and the tablet on the table
+    X_LC: RigidTransform | None = None  # the scanner on what carries it, where that is not the base
+    X_BD: RigidTransform | None = None  # the second arm's base
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -152,6 +156,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     cad, real, X_BP = _workpieces(scenario, rng)
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
     visit = tablet_fittings(scenario, rng)
+    second = _second_arm(scenario, rng)
     builder = DiagramBuilder()
     world = build_world(
         builder,
@@ -163,18 +168,35 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
         workpiece=real,
         X_BP=X_BP,
         fittings=() if visit is None else (visit,),
+        second=second,
+        foot=None if scenario.mounting is None else base_circle(scenario.arm),
+        time_step_s=0.002 if scenario.mounting is None else 0.004,  # nothing is touched in a mounting job
     )
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, visit)
+    if second is not None:
+        apply_second_robot(scenario.robot_2, second, build, apply_driver_config)
     apply_driver_config(scenario.robot, build)
-    X_BC = apply_driver_config(scenario.scanner, build)
+    X_LC = apply_driver_config(scenario.scanner, build)
     apply_driver_config(scenario.finger_camera, build)
     apply_driver_config(scenario.wrist_camera, build)
     apply_driver_config(scenario.digitizer, build)
-    truth = Truth(X_BC, X_BP, real, None if visit is None else visit.truth)
+    on_base = isinstance(scenario.scanner, NoDevice) or scenario.scanner.mounted_on == "base"
+    X_BD = None if second is None else second.X_BD
+    seen = None if visit is None else visit.truth
+    truth = Truth(X_LC if on_base else None, X_BP, real, seen, X_LC=X_LC, X_BD=X_BD)
     _export(build, truth)
     diagram = builder.Build()
     diagram.set_name("station")
     return Station(diagram, robot, tool, cad, truth, world)
+
+
+def _second_arm(scenario: Scenario, rng: np.random.Generator) -> PlacedArm | None:
+    """The second arm where it truly stands; nothing is drawn from the seed where there is none."""
+    config = None if scenario.mounting is None else scenario.mounting.second_arm
+    if config is None:
+        return None
+    off = random_pose_error(rng, 1e-3 * config.placement_translation_mm, np.deg2rad(config.placement_rotation_deg))
+    return place_second_arm(config, off)
 
 
 def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:

@@ -12,6 +12,7 @@ from weldcal.tools import cli_hand_eye, console
 from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
 from weldcal.tools.benchmarks.cli_profiler import profiler as benchmark_profiler
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
+from weldcal.tools.cli_mounting import benchmark_mountings, live
 from weldcal.tools.cli_profiler import profiler
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
@@ -38,7 +39,9 @@ benchmarks.command("tablet")(benchmark_tablet)
 benchmarks.command("seam-planning")(seam_planning)
 mount_flange(benchmarks)
 app.add_typer(cli_hand_eye.hand_eye, name="hand-eye")
+cli_hand_eye.hand_eye.command("live")(live)
 benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
+benchmarks.command("mountings")(benchmark_mountings)
 app.add_typer(profiler, name="profiler")
 benchmarks.command("profiler")(benchmark_profiler)
 
@@ -230,7 +233,8 @@ def calibrate(
             if report.algorithm1 is not None:
                 rows["Algorithm 1"] = report.algorithm1.sentence
         else:
-            from weldcal.tools.demo import DemoOptions, run_calibration_live
+            from weldcal.tools.demo import DemoOptions
+            from weldcal.tools.procedures import calibrate_live
 
             assert scenario is not None
             folder = out or fresh_folder("calibrate", scenario, seed)
@@ -243,7 +247,7 @@ def calibrate(
                 pace=pace,
                 speed_factor=speed_factor,
             )
-            summary = run_calibration_live(options, progress).calibration_summary()
+            summary = calibrate_live(options, progress)
     finish("calibrate", summary, folder, json_wanted=json, rows=rows)
 
 

@@ -64,6 +64,7 @@ NAMES = {
     "tilt_deg": "tilt error",
     "torch_speed_cv": "torch speed variation",
     "peak_omega": "peak turning rate (rad/s)",
+    "next_pose": "next best pose",
     "wall_seconds": "seconds",
 }
 """What a person calls a number of the JSON object, where its key says it too briefly."""

@@ -14,6 +14,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.next_scan import next_scan
 from weldcal.systems.scenario import PoseConfig, Scenario, check_scenario, load_scenario
 from weldcal.tools.outcome import (
     CalibrationError,
@@ -132,6 +133,8 @@ class DemoResult:
                 "warnings": list(estimate.warnings),
                 "unobservable": list(estimate.unobservable),
             }
+        advice = next_scan(self.status, self.run.cell.poses, work_point(self.run.cell.scenario))
+        found["next_pose"] = None if advice is None else advice.sentence()
         return found
 
 

@@ -8,7 +8,8 @@ from typing import Protocol
 
 from weldcal.systems.scenario import Scenario, load_scenario
 from weldcal.tools.console import Progress
-from weldcal.tools.demo import DemoOptions, run_scenario
+from weldcal.tools.demo import DemoOptions, run_calibration_live, run_scenario
+from weldcal.tools.mounting_live import run_mounting_live
 from weldcal.tools.tablet_demo import run_tablet_demo
 
 
@@ -27,6 +28,7 @@ Runner = Callable[[Scenario, DemoOptions, Progress], Outcome]
 JOB = "job"
 PROCEDURES: dict[str, tuple[Callable[[Scenario], bool], Runner]] = {
     "tablet": (lambda scenario: scenario.tablet is not None, run_tablet_demo),
+    "mounting": (lambda scenario: scenario.mounting is not None, run_mounting_live),
 }
 
 
@@ -49,3 +51,11 @@ def run_procedure(options: DemoOptions, progress: Progress) -> Outcome:
     """
     scenario = load_scenario(options.scenario)
     return runner_of(scenario)(scenario, options, progress)
+
+
+def calibrate_live(options: DemoOptions, progress: Progress) -> dict[str, object]:
+    """The JSON object of `calibrate --scenario`: a mounting by its own procedure, else the calibration of the job alone."""
+    scenario = load_scenario(options.scenario)
+    if kind_of(scenario) == "mounting":
+        return run_mounting_live(scenario, options, progress).summary()
+    return run_calibration_live(options, progress).calibration_summary()

@@ -105,7 +105,7 @@ def add_picture_scene(
 
     def frame_of(body: BodyIndex) -> FrameId:
         if body not in frames:
-            frames[body] = scene.RegisterFrame(source, GeometryFrame(plant.get_body(body).name()))
+            frames[body] = scene.RegisterFrame(source, GeometryFrame(str(plant.get_body(body).scoped_name())))
         return frames[body]
 
     if mount is not None:

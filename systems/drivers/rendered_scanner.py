@@ -15,9 +15,12 @@ from pydrake.geometry import (
     DepthRenderCamera,
     GeometryInstance,
     MakePhongIllustrationProperties,
+    PerceptionProperties,
     RenderCameraCore,
+    Rgba,
 )
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
@@ -42,6 +45,9 @@ class RenderedScanner:
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
     field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
+    mounted_on: str = (
+        "base"  # or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
+    )
 
     def scanner(self) -> ScannerPreset:
         """The scanner with the resolution and the field of view that are asked for; pixels stay as square as they were."""
@@ -132,9 +138,28 @@ class DepthSensor(LeafSystem):
         output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
-def _show_housing(world: SimulatedWorld, X_BC: RigidTransform) -> None:
-    """The scanner's body where it truly stands: for the viewer only, so that it does not see itself."""
+def _carrier(world: SimulatedWorld, mounted_on: str) -> RigidBody | None:
+    """The body that carries the scanner; None: it stands still in the base."""
+    if mounted_on == "base":
+        return None
+    return world.plant.GetBodyByName(mounted_on if mounted_on == "flange" else f"{mounted_on}_link", world.arm)
+
+
+def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBody | None) -> None:
+    """The scanner's body where it truly stands: for viewers only (not in the scanner's own scene), so that it does not see itself."""
     scene_graph = world.scene_graph
+    if carrier is not None:
+        plant = world.plant
+        size = Box(0.26, 0.07, 0.08)  # a short one and its bracket
+        housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), size, "scanner_housing")
+        grey = np.array([0.18, 0.20, 0.23, 1.0])
+        seen = PerceptionProperties()
+        seen.AddProperty("phong", "diffuse", Rgba(*grey))
+        housing.set_illustration_properties(MakePhongIllustrationProperties(grey))
+        housing.set_perception_properties(seen)
+        frame = plant.GetBodyFrameIdOrThrow(carrier.index())
+        scene_graph.RegisterGeometry(plant.get_source_id(), frame, housing)
+        return
     source = scene_graph.RegisterSource("scanner_housing")
     housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), Box(0.41, 0.08, 0.09), "scanner_housing")
     housing.set_illustration_properties(MakePhongIllustrationProperties(np.array([0.18, 0.20, 0.23, 1.0])))
@@ -142,7 +167,10 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform) -> None:
 
 
 def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
-    """Stand a depth camera in the world at its true pose (known to `cheat.X_BC` alone) and add the scanner behind it."""
+    """Stand a depth camera on its carrier at its true pose (known to `cheat.*` alone) and add the scanner behind it.
+
+    Returns the true pose of the scanner in the frame of what carries it: X_BC, X_FC or X_LC.
+    """
     world = build.simulated_world()
     preset = config.scanner()
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
@@ -151,7 +179,8 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     )
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
     k = drake_intrinsics(preset)
-    _show_housing(world, X_BC)
+    carrier = _carrier(world, config.mounted_on)
+    _show_housing(world, X_BC, carrier)
     view = world.scanner_view
     core = RenderCameraCore(
         view.renderer,
@@ -161,7 +190,8 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     )
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
     colour = ColorRenderCamera(core, False)
-    sensor = build.builder.AddSystem(RgbdSensor(view.scene_graph.world_frame_id(), X_BC, colour, camera))
+    parent = view.scene_graph.world_frame_id() if carrier is None else view.frames[carrier.index()]
+    sensor = build.builder.AddSystem(RgbdSensor(parent, X_BC, colour, camera))
     sensor.set_name("scanner_depth")
     scanner = build.builder.AddSystem(DepthSensor(preset, int(build.rng.integers(2**31)), config.exposure_s))
     scanner.set_name("scanner")

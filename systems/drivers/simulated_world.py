@@ -44,11 +44,13 @@ from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.drivers.picture_scene import PictureScene, add_picture_scene
+from weldcal.systems.drivers.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
 from weldcal.welding.deformation import TagModel, tag_cells
@@ -83,6 +85,7 @@ class SimulatedWorld(Message):
     tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
     finger_view: PictureScene | None
+    second: ModelInstanceIndex | None = None  # the second arm of a co-manipulation
 
 
 class Fittings(Protocol):
@@ -243,11 +246,14 @@ def build_world(
     X_BP: RigidTransform | None,
     fittings: Sequence[Fittings] = (),
     time_step_s: float = 0.002,
+    second: PlacedArm | None = None,
+    foot: BaseCircle | None = None,
 ) -> SimulatedWorld:
     """Build the plant with everything the station needs; the arm stands at `q_start` and hangs in its implicit joint servos.
 
     A robot's driver says where they pull it: the simulated controller, or a real arm whose shadow this one then is.
     Frame: the world is the robot base B. `workpiece` is the real part (it may differ from its CAD), placed at X_BP.
+    `second` is another arm; `foot` the ring of the base mounting, drawn as round as a scan can tell.
     """
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
@@ -261,7 +267,13 @@ def build_world(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     _add_flange(plant, instance, flange)
     tool_instance, tip_joints = (None, ()) if tool is None else _add_tool(plant, instance, tool, tool.tip_radius_m / 2)
+    second_arm = None if second is None else add_second_arm(plant, second, JOINT_STIFFNESS, JOINT_DAMPING)
+    if second_arm is not None:
+        _add_flange(plant, second_arm, flange)
     world_body = plant.world_body()
+    if foot is not None:
+        ring = mesh_shape(flange_mesh(foot.standard, foot.standard.bore_depth_m), "foot.obj")
+        _show(plant, plant.GetBodyByName("base", instance), foot.X_BR, ring, "base_circle", STEEL)
     _show(plant, world_body, RigidTransform([0.45, 0.0, table_z_m - 0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
     if workpiece is not None and X_BP is not None:
         _show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
@@ -280,7 +292,10 @@ def build_world(
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):
         raise RuntimeError("the six joint servos of the arm are not in place")
     plant.SetDefaultPositions(instance, q_start)
-    compensate_gravity(builder, plant, [m for m in (instance, tool_instance, *fitted) if m is not None])
+    if second_arm is not None and second is not None:
+        plant.SetDefaultPositions(second_arm, second.q_start)
+    moved = [m for m in (instance, tool_instance, second_arm, *fitted) if m is not None]
+    compensate_gravity(builder, plant, moved)
     if tool_instance is not None:
         rest = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
         rest.set_name("tip_at_rest")
@@ -302,4 +317,6 @@ def build_world(
             apart=DiagramBuilder(),  # drawn in a thread of its own
             background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
         )
-    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view)
+    return SimulatedWorld(
+        plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, second_arm
+    )

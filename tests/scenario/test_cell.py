@@ -136,6 +136,7 @@ def test_a_live_calibration_reports_what_the_offline_one_does(tmp_path: Path) ->
     assert finished.returncode == 0, finished.stderr
     keys = "state n_used refused X_BC covariance scanner_correction held_out_mm tilt_deg outliers warnings unobservable seconds"
     assert set(keys.split()) <= set(finished.summary)
+    assert "joints [" in finished.summary["next_pose"]  # a pose that was planned and not visited
 
 
 def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:

@@ -47,6 +47,10 @@ from weldcal.systems.messages import (
     Scan,
     UrStatus,
 )
+from weldcal.systems.mounting_calibrator import MountingCalibrator, MountingFitConfig
+from weldcal.systems.mounting_cell import mounting_scene
+from weldcal.systems.mounting_messages import MountingState, MountingStatus
+from weldcal.systems.mounting_procedure import MountingProcedure
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.process_switch import ProcessSwitch
@@ -102,6 +106,12 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
     TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(load_scenario("tablet"), the_arm())),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
+    MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
+    MountingCalibrator: lambda: MountingCalibrator(
+        mounting_scene(load_scenario("eye_on_arm"), the_arm())[0],
+        MountingFitConfig(get_flange("tool-ring-63"), 0.06, False, 6, 1e-4),
+        (),
+    ),
     TabletDigitizer: lambda: TabletDigitizer(
         SimulatedTablet(), 5256.0, {GeometryId.get_new_id(), GeometryId.get_new_id()}, X, 0
     ),
@@ -121,6 +131,24 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "descent": 6,
         "trigger": 1,
         "state": TabletState,
+    },
+    MountingProcedure: {
+        "settled_goal": 1,
+        "settled_goal_2": 1,
+        "robot_status": UrStatus,
+        "robot_status_2": UrStatus,
+        "status": MountingStatus,
+        "job": JobCommand,
+        "job_2": JobCommand,
+        "trigger": 1,
+        "state": MountingState,
+    },
+    MountingCalibrator: {
+        "scan": Scan,
+        "state": MountingState,
+        "history": PoseHistory,
+        "history_2": PoseHistory,
+        "status": MountingStatus,
     },
     WristCamera: {"trigger": 1, "color_image": ImageRgba8U, "depth_image": ImageDepth32F, "picture": WristPicture},
     TabletDigitizer: {"contact_results": ContactResults, "touch": TabletTouch},

@@ -29,6 +29,10 @@ robot: !SimulatedUr
   control_period_s: 0.004
   following_error_rad: 0.1
   repeatability_mm: 0.05
+robot_2: !SimulatedUr
+  control_period_s: 0.008
+  following_error_rad: 0.2
+  repeatability_mm: 0.04
 scanner: !RenderedScanner
   preset: azure_kinect
   width: 320
@@ -39,6 +43,7 @@ scanner: !RenderedScanner
   mounting_translation_mm: 5.0
   mounting_rotation_deg: 0.5
   exposure_s: 0.05
+  mounted_on: flange
 finger_camera: !RenderedFingerCamera
   width: 320
   height: 240
@@ -81,7 +86,19 @@ tablet:
   turn_deg: 20.0
   tilt_deg: 10.0
 home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
+mounting:
+  target_known: false
+  spread_deg: 20.0
+  travel_deg: 60.0
+  second_arm:
+    arm: ur10e
+    xyz_m: [1.8, 0.1, 0.02]
+    rpy_deg: [1.0, 2.0, 170.0]
+    placement_translation_mm: 10.0
+    placement_rotation_deg: 0.5
+    home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
 calibration:
+  configuration: co_manipulation
   feature: flange
   mounting_guess: {xyz_m: [0.6, 0.1, 1.0], rpy_deg: [170.0, 2.0, -85.0]}
   guess_radius_mm: 40.0

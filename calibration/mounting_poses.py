@@ -1,0 +1,275 @@
+"""Poses for a calibration in any mounting: within reach, in sight, clear, and the ones that tell most about the unknowns."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.errors import UnreachableScanner
+from weldcal.calibration.handeye.problem import linearise
+from weldcal.calibration.handeye.scaled import inverse_information
+from weldcal.calibration.handeye.se3 import exp_rotation
+from weldcal.calibration.mounting_scene import FLANGE, Bodies, MountingScene
+from weldcal.calibration.rigid import skew
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import jacobian, sigma_min
+
+Array = NDArray[np.float64]
+
+_PRIOR = (0.2, 0.2)  # what is believed of an unknown pose before the first scan: rad and m, per axis
+_BIAS_M = 1e-3  # and of a constant error of the circle's centre in its own frame
+
+
+@dataclass(frozen=True)
+class MountingPlan:
+    """Limits (m, rad) and how the poses are weighed.
+
+    ``theta_max_rad``: between the circle's normal and the line of sight. ``image_margin``: share of the image, and of the
+    working range, kept free at each side for an uncertain belief. ``spread_rad``: how far a joint may go from home where
+    joints are drawn. ``max_travel_rad``: farthest any joint goes from home.
+    """
+
+    seed: int = 0
+    theta_max_rad: float = float(np.radians(30.0))
+    image_margin: float = 0.08
+    spread_rad: float = float(np.radians(35.0))
+    max_travel_rad: float = 2.2
+    table_z_m: float = 0.0
+    margin_m: float = 0.03
+    gap_m: float = 0.015
+    min_sigma: float = 0.05
+    candidates: int = 60
+    max_trials: int = 6000
+    sigma_position_m: float = 1e-4
+    sigma_normal_rad: float = 1e-3
+    step_rad: float = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class MountingPose:
+    """A pose to visit: joints (6,) rad of the first and, where there is one, the second arm; X_CR that is expected.
+    ``via_home``: the straight way from the pose before it is not free, the one through home is."""
+
+    q: Array
+    q_2: Array | None
+    X_CR: RigidTransform
+    via_home: bool = False
+
+
+def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
+    """Plan ``n`` poses, most telling first (greedy, D-optimal in the unknowns), then ``kept_aside`` drawn at random, then all
+    others that would do. Each of the first n + kept_aside has a free way from home, the second arm going first, and is
+    reached on it or from the pose before (the first one kept aside from home). Deterministic for ``plan.seed``.
+
+    Raises:
+        UnreachableScanner: one sentence that names the commonest obstacle.
+    """
+    rng = np.random.default_rng(plan.seed)
+    bodies = Bodies(scene)
+    pool, why = _pool(scene, bodies, plan, rng)
+    order = _greedy(scene, pool, plan)
+    chosen = _chain(bodies, [pool[i] for i in order], n, plan)
+    rest = [pool[i] for i in order if not any(pool[i].q is c.q for c in chosen)]
+    aside = _chain(bodies, [rest[i] for i in rng.permutation(len(rest))], kept_aside, plan)
+    if len(chosen) < n or len(aside) < kept_aside:
+        reason = why.most_common(1)[0][0] if why else "the poses found lie too close together"
+        raise UnreachableScanner(
+            f"Only {len(chosen) + len(aside)} of {n + kept_aside} poses show the circle to the scanner, most often because "
+            f"{reason}; mount the scanner elsewhere, correct its guessed pose, or choose another home_deg."
+        )
+    others = [p for p in rest if not any(p.q is a.q for a in aside)]
+    return (*chosen, *aside, *others)
+
+
+def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
+    """What sightings of the circle at some poses would tell (k, m + 3, m + 3): of the free unknowns, in the order of the
+    solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,) along the
+    circle's own axes."""
+    sightings = [scene.sighting(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses]
+    lin = linearise(scene.problem(sightings), scene.state, np.zeros(3))
+    Jd = np.concatenate([lin.Jd, np.broadcast_to(np.eye(3), (len(poses), 3, 3))], axis=2)
+    Jd = Jd / np.broadcast_to(sigma_m, (3,))[:, None]
+    Jw = np.concatenate([lin.Jw, np.zeros((len(poses), 3, 3))], axis=2) / sigma_rad
+    return np.asarray(np.swapaxes(Jd, 1, 2) @ Jd + np.swapaxes(Jw, 1, 2) @ Jw)
+
+
+def prior(scene: MountingScene) -> Array:
+    """What is believed before the first scan (m + 3, m + 3)."""
+    unknowns = len(scene.mounting.unknowns) - len(scene.known)
+    each = [1.0 / _PRIOR[0] ** 2] * 3 + [1.0 / _PRIOR[1] ** 2] * 3
+    return np.diag(each * unknowns + [1.0 / _BIAS_M**2] * 3)
+
+
+def sigma_at_work(scene: MountingScene, total: Array) -> float:
+    """Predicted standard deviation (3-D, m) of a point at the scanner's best distance, in the frame that carries it."""
+    C = inverse_information(total)[:6, :6]
+    J = np.hstack([-skew(scene.X_LC.rotation().matrix() @ work_point(scene)), np.eye(3)])
+    return float(np.sqrt(max(float(np.trace(J @ C @ J.T)), 0.0)))
+
+
+def work_point(scene: MountingScene) -> Array:
+    """p_CWork (3,) m: on the scanner's axis at its best distance."""
+    return np.array([0.0, 0.0, scene.scanner.optimum_m])
+
+
+def _at(pose: MountingPose) -> tuple[Array, Array | None]:
+    return pose.q, pose.q_2
+
+
+def _way(
+    bodies: Bodies, start: tuple[Array, Array | None], end: tuple[Array, Array | None], plan: MountingPlan
+) -> bool:
+    """Whether one arm after the other, the second first, gets from start to end, and back home in the opposite order."""
+    between = (start[0], end[1])
+    if bodies.scene.two and not bodies.clear(start, between, plan.table_z_m, plan.step_rad):
+        return False
+    return bodies.clear(between, end, plan.table_z_m, plan.step_rad)
+
+
+def _chain(bodies: Bodies, poses: Sequence[MountingPose], n: int, plan: MountingPlan) -> list[MountingPose]:
+    """The first n poses with a free way from home (the way home is the same backwards), each reached from the one before it
+    where that is free too."""
+    home = (bodies.scene.q_home, bodies.scene.q_home_2)
+    kept: list[MountingPose] = []
+    for pose in poses:
+        if len(kept) == n:
+            break
+        if _way(bodies, home, _at(pose), plan):
+            direct = not kept or _way(bodies, _at(kept[-1]), _at(pose), plan)
+            kept.append(replace(pose, via_home=not direct))
+    return kept
+
+
+def _pool(
+    scene: MountingScene, bodies: Bodies, plan: MountingPlan, rng: np.random.Generator
+) -> tuple[list[MountingPose], Counter[str]]:
+    pool: list[MountingPose] = []
+    why: Counter[str] = Counter()
+    draw = _by_joints if "arm" in scene.configuration else _by_view
+    for _ in range(plan.max_trials):
+        if len(pool) >= plan.candidates:
+            break
+        drawn = draw(scene, plan, rng)
+        if isinstance(drawn, str):
+            why[drawn] += 1
+            continue
+        q, q_2 = drawn
+        reason = _refuse(scene, bodies, plan, q, q_2)
+        if reason is None:
+            pool.append(MountingPose(q, q_2, scene.seen(q, q_2)))
+        else:
+            why[reason] += 1
+    return pool, why
+
+
+def _by_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> tuple[Array, Array | None] | str:
+    """Draw how the scanner sees the circle, and ask for the joints."""
+    X_CR = _random_view(scene, plan, rng)
+    if X_CR is None:
+        return "the circle does not fit into the scanner's field of view"
+    q_2 = None
+    if scene.q_home_2 is not None:
+        q_2 = scene.q_home_2 + rng.uniform(-plan.spread_rad, plan.spread_rad, 6)
+    X_LR = scene.X_LC @ X_CR
+    on_base = scene.configuration == "eye_on_base"
+    X_BF = X_LR @ scene.X_HR.inverse() if on_base else scene.circle([], q_2) @ X_LR.inverse()
+    q = nearest_solution(scene.arm, X_BF, scene.q_home)
+    if q is None:
+        return "it is out of the arm's reach"
+    return q, q_2
+
+
+def _by_joints(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> tuple[Array, Array | None] | str:
+    """Draw the joints between scanner and circle; the others stay at home."""
+    q = scene.q_home.copy()
+    if scene.configuration == "eye_on_arm_target_on_base":
+        # the first joint turns scanner and all about the circle's own axis: it shows nothing new
+        q[1 : scene.link] += rng.uniform(-plan.spread_rad, plan.spread_rad, scene.link - 1)
+    else:
+        q[scene.link : 5] += rng.uniform(-plan.spread_rad, plan.spread_rad, 5 - scene.link)
+        q[5] += 2.5 * rng.uniform(
+            -plan.spread_rad, plan.spread_rad
+        )  # the flange's own axis: it costs nothing of the view
+    if not ((q >= scene.arm.position_lower) & (q <= scene.arm.position_upper)).all():
+        return "a joint is at its limit"
+    return q, None
+
+
+def _random_view(scene: MountingScene, plan: MountingPlan, rng: np.random.Generator) -> RigidTransform | None:
+    s, r = scene.scanner, scene.radius_m
+    span = plan.image_margin * (s.far_m - s.near_m)
+    z = rng.uniform(s.near_m + span, s.far_m - span)
+    place = []
+    for f, c, size in ((s.fx, s.cx, s.width), (s.fy, s.cy, s.height)):
+        free = plan.image_margin * size
+        low, high = (free - c) / f * z + r, (size - 1 - free - c) / f * z - r
+        if low >= high:
+            return None
+        place.append(rng.uniform(low, high))
+    p = np.array([*place, z])
+    sight = -p / np.linalg.norm(p)
+    tilt = float(np.arccos(rng.uniform(np.cos(plan.theta_max_rad), 1.0)))
+    side = np.cross(sight, [1.0, 0.0, 0.0])
+    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ (side / np.linalg.norm(side))
+    normal = exp_rotation(tilt * side) @ sight
+    x = np.cross([0.0, 1.0, 0.0], normal)
+    x /= np.linalg.norm(x)
+    R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
+    return RigidTransform(R @ RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi)), p)
+
+
+def _refuse(scene: MountingScene, bodies: Bodies, plan: MountingPlan, q: Array, q_2: Array | None) -> str | None:
+    """Why this posture will not do, or None."""
+    if float(np.abs(q - scene.q_home).max()) > plan.max_travel_rad:
+        return "the joints would have to travel too far from home"
+    frames = scene.frames(q)
+    frames_2 = None if q_2 is None else scene.frames_2(q_2)
+    X_BR = scene.circle(frames, q_2)
+    X_CR = (frames[scene.link] @ scene.X_LC).InvertAndCompose(X_BR)
+    if not _in_view(scene, plan, X_CR):
+        return "the circle would be out of the scanner's sight"
+    # an arm that looks at itself need not be free to move on in every direction
+    if scene.link in (0, FLANGE) and sigma_min(jacobian(scene.arm, q)) < plan.min_sigma:
+        return "the arm would stand in a singularity"
+    if bodies.lowest(frames, frames_2) < plan.table_z_m + plan.margin_m:
+        return "the table is in the way"
+    if bodies.gap(frames, frames_2) < plan.gap_m:
+        return "the arm or its scanner would touch something"
+    return "an arm hides the circle from the scanner" if bodies.hidden(frames, frames_2, X_BR) else None
+
+
+def _in_view(scene: MountingScene, plan: MountingPlan, X_CR: RigidTransform) -> bool:
+    s, r = scene.scanner, scene.radius_m
+    p, n = np.asarray(X_CR.translation()), X_CR.rotation().matrix()[:, 2]
+    span = plan.image_margin * (s.far_m - s.near_m)
+    if not s.near_m + span < p[2] < s.far_m - span:
+        return False
+    if float(-n @ p) / float(np.linalg.norm(p)) < np.cos(plan.theta_max_rad) - 1e-9:
+        return False
+    for k, (f, c, size) in enumerate(((s.fx, s.cx, s.width), (s.fy, s.cy, s.height))):
+        free = plan.image_margin * size
+        if not (free - c) / f * p[2] + r <= p[k] <= (size - 1 - free - c) / f * p[2] - r:
+            return False
+    return True
+
+
+def _greedy(scene: MountingScene, pool: Sequence[MountingPose], plan: MountingPlan) -> list[int]:
+    """All poses of the pool, each the one that adds most to those before it."""
+    if not pool:
+        return []
+    gains = information(scene, pool, plan.sigma_position_m, plan.sigma_normal_rad)
+    total = prior(scene)
+    order: list[int] = []
+    left = list(range(len(pool)))
+    while left:
+        values = np.linalg.slogdet(total + gains[left])[1]
+        best = left[int(np.argmax(values))]
+        order.append(best)
+        left.remove(best)
+        total = total + gains[best]
+    return order

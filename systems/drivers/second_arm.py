@@ -1,0 +1,73 @@
+"""A second arm in the simulated world: another model in the one plant, where its base truly stands, with a driver of its own."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Box
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
+
+from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.arms.urdf import arm_urdf
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.mounting_scenario import SecondArm
+
+SECOND = "ur10e_2"
+"""Prefix of its ports, as `ur10e` is the first one's."""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class PlacedArm:
+    """An arm, where its base truly stands in the first one's (X_BD), and where it starts (6,) rad."""
+
+    arm: ArmModel
+    X_BD: RigidTransform
+    q_start: NDArray[np.float64]
+
+
+def place_second_arm(config: SecondArm, off: RigidTransform) -> PlacedArm:
+    """The arm as it stands, ``off`` from its drawing (turned in its own frame, moved in the first base's)."""
+    drawn = config.pose()
+    X_BD = RigidTransform(drawn.rotation() @ off.rotation(), drawn.translation() + off.translation())
+    return PlacedArm(load_arm(config.arm), X_BD, np.deg2rad(config.home_deg))
+
+
+def add_second_arm(
+    plant: MultibodyPlant, placed: PlacedArm, stiffness: tuple[float, ...], damping: tuple[float, ...]
+) -> ModelInstanceIndex:
+    """Add the arm to a plant that is not finalised, in joint servos as the first one's."""
+    (instance,) = Parser(plant).AddModelsFromString(arm_urdf(placed.arm, SECOND), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance), placed.X_BD)
+    for name, p, d in zip(placed.arm.joint_names, stiffness, damping, strict=True):
+        plant.GetJointActuatorByName(name, instance).set_controller_gains(PdControllerGains(p=p, d=d))
+    top, grey = RigidTransform([0.0, 0.0, -0.02]), np.array([0.36, 0.38, 0.40, 1.0])
+    plant.RegisterVisualGeometry(plant.world_body(), placed.X_BD @ top, Box(0.5, 0.5, 0.04), "second_table", grey)
+    return instance
+
+
+def apply_second_robot(config: Any, placed: PlacedArm, build: StationBuild, apply: Any) -> None:
+    """Let the driver that knows one arm drive the second: it is handed a world whose arm this is, and its ports are renamed."""
+    world = build.simulated_world()
+    assert world.second is not None
+    own = dc.replace(
+        build,
+        arm=placed.arm,
+        tool=None,
+        q_start=placed.q_start,
+        world=dc.replace(world, arm=world.second),
+        inputs={},
+        outputs={},
+    )
+    before = {id(s) for s in build.builder.GetSystems()}
+    apply(config, own)
+    for system in build.builder.GetSystems():
+        if id(system) not in before:
+            system.set_name(system.get_name().replace("ur10e", SECOND))
+    build.inputs |= {name.replace("ur10e", SECOND): port for name, port in own.inputs.items()}
+    build.outputs |= {name.replace("ur10e", SECOND): port for name, port in own.outputs.items()}

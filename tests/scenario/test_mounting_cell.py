@@ -1,0 +1,239 @@
+"""Every mounting live, in few poses: the scanner (and the second arm) is found where the simulation truly put it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.analysis import Simulator
+
+from weldcal.models.errors import InputError
+from weldcal.systems.messages import UrStatus
+from weldcal.systems.mounting_calibrator import solve_mounting
+from weldcal.systems.mounting_cell import MountingRun, make_mounting_cell, mounting_scene, run_mounting_cell
+from weldcal.systems.mounting_messages import MountingState, MountingStatus
+from weldcal.systems.mounting_procedure import MountingProcedure
+from weldcal.systems.scenario import Scenario, load_scenario
+from weldcal.tools.demo import DemoOptions
+from weldcal.tools.mounting_live import MountingReport, run_mounting_live
+from weldcal.tools.procedures import kind_of
+
+# few poses near home, a coarse image, a controller at a quarter of its rate: seconds instead of a minute
+QUICK = "robot: !SimulatedUr {control_period_s: 0.008}\n"
+SHORT = {
+    "eye_in_hand": (560, 5, "mounting: {travel_deg: 40.0}"),
+    "eye_on_arm": (412, 5, "mounting: {spread_deg: 18.0}"),
+    "eye_on_arm_base": (560, 5, "mounting: {spread_deg: 20.0}"),
+    "co_manipulation": (
+        560,
+        6,
+        "mounting: {travel_deg: 30.0, spread_deg: 8.0}\nrobot_2: !SimulatedUr {control_period_s: 0.008}",
+    ),
+}
+SEED = 1
+
+
+def short(name: str) -> Scenario:
+    width, scans, extra = SHORT[name]
+    scanner = f"scanner: !RenderedScanner {{width: {width}, height: {3 * width // 4}, exposure_s: 0.02}}\n"
+    count = f"calibration: {{minimum_scans: {scans}, maximum_scans: {scans}, verification_scans: 1}}\n"
+    return load_scenario(name, QUICK + scanner + count + extra)
+
+
+@cache
+def finished(name: str) -> MountingRun:
+    return run_mounting_cell(make_mounting_cell(short(name), SEED))
+
+
+@pytest.mark.parametrize("name", list(SHORT))
+def test_what_is_sought_is_found_where_it_truly_is(name: str) -> None:
+    run = finished(name)
+    result = run.status.result
+    assert run.state.phase == "done", run.state.reason
+    assert result is not None, run.status.message
+    assert set(result.poses) == set(run.cell.truth) == ({"X", "Y"} if name == "co_manipulation" else {"X"})
+    assert result.unobservable == ()
+    for letter, truth in run.cell.truth.items():
+        assert result.normalised_error(letter, truth) < result.region(0.9973)  # three sigma
+        # a pixel is about a millimetre; an edge of hundreds of them places a centre to a tenth of one
+        assert np.linalg.norm(result.poses[letter].translation() - truth.translation()) < 3e-4
+    # the tape measure was off by 8 mm and more
+    assert np.linalg.norm(run.cell.scene.X_LC.translation() - run.cell.truth["X"].translation()) > 7e-3
+
+
+@pytest.mark.parametrize("name", list(SHORT))
+def test_a_pose_kept_aside_is_where_the_calibration_expects_it(name: str) -> None:
+    (aside,) = finished(name).status.kept_aside
+    assert aside.error_m < 3e-4
+    assert np.degrees(aside.tilt_rad) < 0.1
+
+
+@pytest.mark.parametrize("name", list(SHORT))
+def test_the_next_best_pose_is_new_and_would_help(name: str) -> None:
+    run = finished(name)
+    best = run.status.next_best
+    assert best is not None
+    assert best.sigma_after_m < best.sigma_before_m
+    assert min(np.abs(best.q - s.pose.q).max() for s in run.status.seen) > np.radians(0.5)
+    assert run.cell.scene.seen(best.q, best.q_2).translation()[2] > 0.3  # before the scanner
+
+
+def test_a_circle_of_unknown_place_leaves_its_turn_about_its_own_normal_open_and_nothing_else() -> None:
+    run = finished("eye_in_hand")
+    scene = replace(run.cell.scene, target_known=False)
+    result = solve_mounting(scene, run.status.seen)
+    (name,) = result.unobservable
+    assert name == "rotation about (+0.00, +0.00, +1.00): pose of the target in the base frame: X_BM"
+    assert result.normalised_error("X", run.cell.truth["X"]) < result.region(0.9973)
+    assert result.covariance["Y"][2, 2] > 1.0  # rad^2: not a confident number
+    assert np.linalg.norm(result.Y.translation() - scene.X_HR.translation()) < 1e-3
+
+
+def test_the_first_joint_shows_the_foot_no_other_side() -> None:
+    """The base circle turns about the first joint's own axis: a scanner on the arm sees the same, wherever that joint is."""
+    scene, _ = mounting_scene(short("eye_on_arm_base"), finished("eye_on_arm_base").cell.scene.arm)
+    q = scene.q_home
+    turned = q + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    a, b = scene.seen(q), scene.seen(turned)
+    assert np.linalg.norm(a.translation() - b.translation()) < 1e-9
+    assert np.linalg.norm(a.rotation().matrix()[:, 2] - b.rotation().matrix()[:, 2]) < 1e-9
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> MountingReport:
+    """The command's own way from the same run to files."""
+    from weldcal.tools import mounting_live
+
+    run = finished("eye_on_arm")
+    folder = tmp_path_factory.mktemp("live")
+    made = MountingReport(run, solve_mounting(run.cell.scene, run.status.seen, folds=3), folder, 1.0)
+    mounting_live.write_mounting(made, None)
+    return made
+
+
+def test_the_result_says_its_direction_in_words(report: MountingReport) -> None:
+    text = report.text()
+    assert "pose of the camera in the arm link frame: X_LC" in text
+    assert "base B --X_BL(robot)--> link L ==X_LC==> camera C" in text
+    assert "next best pose: joints [" in text
+    assert "kept aside" in text
+    assert "X_FM is known: the target M is the flange itself" in text
+    assert "The arm link L is the forearm." in text
+    summary: dict[str, Any] = report.summary()
+    assert summary["state"] == "done"
+    assert summary["X_is"] == "pose of the camera in the arm link frame: X_LC"
+    assert summary["truth"]["X_LC"]["mm"] < 0.3
+
+
+def test_the_result_folder_is_whole(report: MountingReport) -> None:
+    names = {p.name for p in report.folder.iterdir()}
+    assert {"hand_eye.yaml", "X_LC.urdf.xacro", "sightings.csv", "station.png", "report.html", "scenario.yaml"} <= names
+    assert (report.folder / "station.png").read_bytes()[:4] == b"\x89PNG"
+    assert len((report.folder / "sightings.csv").read_text().splitlines()) == 1 + len(report.run.status.seen)
+    page = (report.folder / "report.html").read_text()
+    assert "pose of the camera in the arm link frame: X_LC" in page
+    assert "Next best pose" in page
+
+
+def test_what_does_not_belong_together_is_refused_before_any_work(tmp_path: Path) -> None:
+    def refused(name: str, overrides: str, match: str) -> None:
+        with pytest.raises(InputError, match=match):
+            load_scenario(name, overrides)
+
+    refused("eye_in_hand", "scanner: !RenderedScanner {mounted_on: forearm}", "mounted_on flange, not 'forearm'")
+    refused("eye_in_hand", "scanner: !RenderedScanner {mounted_on: roof}", "mounted_on must be one of")
+    refused("eye_in_hand", "calibration: {configuration: eye_in_foot}", "configuration must be one of")
+    refused("calibrate_only", "robot_2: !SimulatedUr {}", "second robot belongs to co_manipulation")
+    refused("co_manipulation", "robot_2: !NoDevice {}", "robot_2")
+    refused("eye_in_hand", "robot: !UrRtde {host: 192.168.1.10}", "simulated arms only")
+    refused("eye_on_arm", "mounting: {spread_deg: -3.0}", "positive")
+    with pytest.raises(InputError, match="runs on the arms of its scenario"):
+        run_mounting_live(short("eye_on_arm"), DemoOptions("eye_on_arm", tmp_path, robot="emulated"), lambda *_: None)
+    assert not any(tmp_path.iterdir())
+    assert kind_of(load_scenario("eye_in_hand")) == "mounting"
+    assert kind_of(load_scenario("calibrate_only")) == "job"
+
+
+@dataclass(eq=False)
+class Alone:
+    """The procedure of two arms by itself: every goal it sets is reached at once, every scan digested at once."""
+
+    simulator: Simulator
+    procedure: MountingProcedure
+
+    def tell(self, **inputs: Any) -> None:
+        for name, value in inputs.items():
+            self.procedure.GetInputPort(name).FixValue(self.simulator.get_mutable_context(), value)
+
+    @property
+    def state(self) -> MountingState:
+        state: MountingState = self.procedure.GetOutputPort("state").Eval(self.simulator.get_context())
+        return state
+
+    def run(self, until: str, most_s: float = 5.0) -> list[tuple[str, str, int]]:
+        """(phase, label, arm) of every state on the way."""
+        log: list[tuple[str, str, int]] = []
+        while self.state.phase != until and self.simulator.get_context().get_time() < most_s:
+            s = self.state
+            if s.phase == "move":
+                self.tell(**{"settled_goal_2" if s.moving else "settled_goal": [s.goal_id]})
+            self.tell(status=AbstractValue.Make(MountingStatus(sequence=s.trigger)))
+            entry = (s.phase, s.label, s.moving)
+            if not log or log[-1] != entry:
+                log.append(entry)
+            self.simulator.AdvanceTo(self.simulator.get_context().get_time() + 0.01)
+        return log
+
+
+@pytest.fixture
+def alone() -> Alone:
+    cell = finished("co_manipulation").cell
+    procedure = MountingProcedure(cell.plan[:3], 2, 1, (cell.scene.q_home, cell.scene.q_home_2))
+    made = Alone(Simulator(procedure), procedure)
+    ready = AbstractValue.Make(UrStatus())
+    made.tell(settled_goal=[0.0], settled_goal_2=[0.0], robot_status=ready, robot_status_2=ready)
+    made.tell(status=AbstractValue.Make(MountingStatus()))
+    return made
+
+
+def test_one_arm_moves_at_a_time_and_the_way_home_is_the_way_back(alone: Alone) -> None:
+    log = alone.run("done")
+    assert alone.state.phase == "done"
+    assert [e for e in log if e[0] == "move"] == [
+        ("move", "pose01", 1),
+        ("move", "pose01", 0),
+        ("move", "pose02", 1),
+        ("move", "pose02", 0),
+        ("move", "", 0),
+        ("move", "", 1),
+        ("move", "aside01", 1),
+        ("move", "aside01", 0),
+        ("move", "", 0),
+        ("move", "", 1),
+    ]
+    assert alone.state.trigger == 3
+
+
+def test_a_fault_of_either_arm_holds_the_procedure_with_its_own_words(alone: Alone) -> None:
+    alone.run("scan")
+    stopped = UrStatus(safety_mode="PROTECTIVE_STOP", fault="The second one stopped.")
+    alone.tell(robot_status_2=AbstractValue.Make(stopped))
+    alone.simulator.AdvanceTo(alone.simulator.get_context().get_time() + 0.05)
+    assert (alone.state.phase, alone.state.reason) == ("held", "The second one stopped.")
+    for name in ("job", "job_2"):
+        assert alone.procedure.GetOutputPort(name).Eval(alone.simulator.get_context()).mode == "hold"
+
+
+def test_a_second_base_is_drawn_from_the_seed_and_the_first_world_stays_as_it_was() -> None:
+    truth = finished("co_manipulation").cell.station.truth
+    assert truth.X_BC is None
+    assert truth.X_BD is not None
+    drawn = finished("co_manipulation").cell.scene.X_BD
+    assert isinstance(drawn, RigidTransform)
+    assert np.linalg.norm(truth.X_BD.translation() - drawn.translation()) == pytest.approx(0.015)

@@ -1,0 +1,95 @@
+"""The report of a live calibration in any mounting: the station, what was found in which direction, and how sure it is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from weldcal.calibration.result import software_version
+from weldcal.tools.report.pictures import OURS, error_bars, svg
+from weldcal.tools.report.render import fixed, render
+
+if TYPE_CHECKING:
+    from weldcal.tools.mounting_live import MountingReport
+
+
+def mounting_report(report: MountingReport, picture: bytes) -> str:
+    """The whole report as one self-contained HTML text."""
+    status, mounting, result = report.run.status, report.mounting, report.result
+    aside = np.array([1e3 * k.error_m for k in status.kept_aside])
+    unknowns, errors = [], report.truth_errors()
+    for k, X in {} if result is None else result.poses.items():
+        u = mounting.unknowns[k]
+        sigma = np.sqrt(np.diag(result.covariance[k])) if result is not None else np.zeros(6)
+        rpy = np.degrees(X.rotation().ToRollPitchYaw().vector())
+        e = errors.get(u.symbol)
+        off = "" if e is None else f" (off the truth by {fixed(e.mm, 3)} mm and {fixed(e.deg, 4)} deg; simulation)"
+        lengths = zip(("x, mm", "y, mm", "z, mm"), 1e3 * X.translation(), 1e3 * sigma[3:], strict=True)
+        angles = zip(("roll, deg", "pitch, deg", "yaw, deg"), rpy, np.degrees(sigma[:3]), strict=True)
+        cells = [(name, fixed(v, 3), _spread(s, 3, 1e3)) for name, v, s in lengths]
+        cells += [(name, fixed(v, 4), _spread(s, 4, 57.3)) for name, v, s in angles]
+        unknowns.append((u.sentence[0].upper() + u.sentence[1:] + off, cells))
+    rows = []
+    for i, s in enumerate(status.seen):
+        used = result is None or bool(result.inliers[i])
+        mm = "–" if result is None else fixed(1e3 * float(result.translation[i]), 3)
+        deg = "–" if result is None else fixed(float(np.degrees(result.rotation_rad[i])), 4)
+        rows.append((s.label, "used" if used else "left out", mm, deg, fixed(100 * s.coverage, 0)))
+    rows += [
+        (k.label, "kept aside", fixed(1e3 * k.error_m, 3), fixed(float(np.degrees(k.tilt_rad)), 4), "–")
+        for k in status.kept_aside
+    ]
+    return render(
+        "mounting.html.j2",
+        name=mounting.name,
+        words=mounting.words,
+        equation=mounting.equation,
+        source=mounting.source,
+        sketch=mounting.sketch,
+        given=report.given(),
+        state=report.state,
+        reason=report.reason,
+        description=report.run.cell.scenario.description,
+        picture=picture,
+        unknowns=unknowns,
+        aside_mm=float(np.median(aside)) if len(aside) else None,
+        n_aside=len(aside),
+        expected_mm=1e3 * status.sigma_work_m,
+        work_mm=report.work_error_mm(),
+        distance_mm=1e3 * report.run.cell.scene.scanner.optimum_m,
+        n_used=len(status.seen),
+        n_scans=status.sequence,
+        unobservable=() if result is None else result.unobservable,
+        warnings=() if result is None else result.warnings,
+        refused=status.refused,
+        next_best=None if status.next_best is None else status.next_best.sentence(),
+        growth=_growth(report) if len(status.history) > 1 else None,
+        bars=error_bars([k.label for k in status.kept_aside], aside, np.ones(len(aside), bool), "error, mm")
+        if len(aside)
+        else None,
+        rows=rows,
+        seconds=report.run.seconds,
+        software=software_version(),
+    )
+
+
+def _spread(sigma: float, digits: int, certain: float) -> str:
+    return "open" if sigma > certain else fixed(float(sigma), digits)
+
+
+def _growth(report: MountingReport) -> bytes:
+    """Expected error of a point at the work distance after every scan."""
+    n, sigma = np.array(report.run.status.history).T
+    required = report.run.cell.scenario.calibration.required_error_mm
+    figure = Figure(figsize=(8.2, 2.8), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(n, 1e3 * sigma, "o-", color=OURS, markersize=5)
+    axes.axhline(required, color="#a8402f", linewidth=1, linestyle=":")
+    axes.annotate(f"required {required:.2f}", (n[0], required), fontsize=9, va="bottom", color="#a8402f")
+    axes.set_yscale("log")
+    axes.set_xticks(n)
+    axes.set_xlabel("scans")
+    axes.set_ylabel("expected error, mm")
+    return svg(figure, axes)
