@@ -11,9 +11,11 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job
 from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.welding.laws import get_law
 from weldcal.welding.planning import PlanningMethod
@@ -152,6 +154,8 @@ class Scenario:
     robot: SimulatedUr | UrRtde | NoDevice = dc.field(default_factory=SimulatedUr)
     scanner: RenderedScanner | NoDevice = dc.field(default_factory=RenderedScanner)
     finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
+    profiler: RenderedProfiler | NoDevice = dc.field(default_factory=NoDevice)
+    profiler_job: ProfilerJob | None = None
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
@@ -240,6 +244,12 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
+    check_profiler_job(
+        scenario.profiler_job,
+        has_profiler=not isinstance(scenario.profiler, NoDevice),
+        has_groove=scenario.workpiece is not None,
+        tool=scenario.tool,
+    )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
     if scenario.workpiece is not None and scenario.workpiece.bend_radius_mm and scenario.workpiece.located_by == "scan":

@@ -19,6 +19,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.profiler_world import ProfilerFixture, ProfilerTruth
+from weldcal.systems.drivers.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
@@ -33,6 +36,7 @@ class Truth(Message):
     X_BC: RigidTransform | None
     X_BP: RigidTransform | None
     workpiece: Workpiece | None  # the part as it really is
+    profiler: ProfilerTruth | None = None
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -126,7 +130,7 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
 
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
-    `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
+    `finger_camera.image`, `.capture_time`; with a profiler in `profiler.trigger`, out `profiler.profile`, `torch.touch`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
     `query_object`.
 
     Raises:
@@ -148,6 +152,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
+    fixture = _fixture(scenario, rng, real, X_BP)
     builder = DiagramBuilder()
     world = build_world(
         builder,
@@ -158,12 +163,14 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
         table_z_m=scenario.calibration.table_z_m,
         workpiece=real,
         X_BP=X_BP,
+        profiler=fixture,
     )
-    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot)
+    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, fixture)
     apply_driver_config(scenario.robot, build)
     X_BC = apply_driver_config(scenario.scanner, build)
     apply_driver_config(scenario.finger_camera, build)
-    truth = Truth(X_BC, X_BP, real)
+    apply_driver_config(scenario.profiler, build)
+    truth = Truth(X_BC, X_BP, real, None if fixture is None else fixture.truth)
     _export(build, truth)
     diagram = builder.Build()
     diagram.set_name("station")
@@ -201,6 +208,17 @@ def _workpieces(
         rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
     )
     return cad, real, spec.pose_guess.pose() @ placed
+
+
+def _fixture(
+    scenario: Scenario, rng: np.random.Generator, real: Workpiece | None, X_BP: RigidTransform | None
+) -> ProfilerFixture | None:
+    """What the profiler looks at, where there is one."""
+    p, job = scenario.profiler, scenario.profiler_job
+    if not isinstance(p, RenderedProfiler) or job is None:
+        return None
+    error = 1e-3 * p.mounting_translation_mm, float(np.deg2rad(p.mounting_rotation_deg))
+    return draw_fixture(drawn_pose(p), *error, job, rng, scenario.calibration.table_z_m, real, X_BP)
 
 
 def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:

@@ -47,6 +47,7 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.drivers.picture_scene import PictureScene, add_picture_scene
+from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair, add_fixture
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
 from weldcal.welding.deformation import TagModel, tag_cells
@@ -78,6 +79,7 @@ class SimulatedWorld(Message):
     tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
     finger_view: PictureScene | None
+    touch_pair: TouchPair | None = None
 
 
 def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
@@ -228,6 +230,7 @@ def build_world(
     table_z_m: float,
     workpiece: Workpiece | None,
     X_BP: RigidTransform | None,
+    profiler: ProfilerFixture | None = None,
     time_step_s: float = 0.002,
 ) -> SimulatedWorld:
     """Build the plant with everything the station needs; the arm stands at `q_start` and hangs in its implicit joint servos.
@@ -238,7 +241,7 @@ def build_world(
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
             time_step=time_step_s,
-            contact_model="hydroelastic",
+            contact_model="hydroelastic" if profiler is None else "point",
             discrete_contact_approximation="lagged",  # with `sap` the tip's rest position depends on the sliding speed
         ),
         builder,
@@ -247,6 +250,7 @@ def build_world(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     _add_flange(plant, instance, flange)
     tool_instance, tip_joints = (None, ()) if tool is None else _add_tool(plant, instance, tool, tool.tip_radius_m / 2)
+    touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, table_z_m)
     world_body = plant.world_body()
     _show(plant, world_body, RigidTransform([0.45, 0.0, table_z_m - 0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
     if workpiece is not None and X_BP is not None:
@@ -254,9 +258,10 @@ def build_world(
         rigid = ProximityProperties()
         AddContactMaterial(friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=rigid)
         AddRigidHydroelasticProperties(resolution_hint=0.002, properties=rigid)
-        plant.RegisterCollisionGeometry(
-            world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
-        )
+        if profiler is None:
+            plant.RegisterCollisionGeometry(
+                world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
+            )
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
         servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
@@ -282,4 +287,4 @@ def build_world(
             only=("tag_print", "tag_white"),
             background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
         )
-    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view)
+    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, touch_pair)

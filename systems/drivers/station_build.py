@@ -12,6 +12,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 
 if TYPE_CHECKING:
+    from weldcal.systems.drivers.profiler_world import ProfilerFixture
     from weldcal.systems.drivers.simulated_world import SimulatedWorld
 
 
@@ -52,6 +53,7 @@ class StationBuild:
     rng: np.random.Generator
     world: SimulatedWorld | None = None
     robot: PreparedRobot | None = None
+    profiler: ProfilerFixture | None = None
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
 
