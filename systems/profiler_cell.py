@@ -27,6 +27,7 @@ from weldcal.systems.station import Station, make_station
 from weldcal.welding.guard import SlewLimits
 
 Array = NDArray[np.float64]
+CONTROL_PERIOD_S = 0.004
 LOG_PERIOD_S = 0.02
 RECORDING_FPS = 8.0
 
@@ -103,7 +104,7 @@ def _make(scenario: Scenario, station: Station, seed: int, meshcat: Meshcat | No
     arbiter = builder.AddSystem(CommandArbiter())
     arbiter.set_name("command_arbiter")
     limits = SlewLimits(speed=0.6 * arm.velocity_limit, acceleration=0.5 * arm.acceleration_limit, jerk=JERK_LIMIT)
-    limiter = builder.AddSystem(SlewLimiter(limits))
+    limiter = builder.AddSystem(SlewLimiter(limits, CONTROL_PERIOD_S))
     limiter.set_name("slew_limiter")
     job, position = procedure.GetOutputPort("job"), error.GetOutputPort("position")
     for source, system, port in (

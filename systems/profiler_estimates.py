@@ -15,7 +15,7 @@ from weldcal.calibration.profiler.edge_model import EdgeState, measurement_covar
 from weldcal.calibration.profiler.errors import FeatureNotFound
 from weldcal.calibration.profiler.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, choose_model, sphere_joint
+from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
@@ -27,7 +27,10 @@ Array = NDArray[np.float64]
 SMOOTHING_M = 0.004  # waves of a seam shorter than about six times this are taken for noise
 FAR_SIGMAS = 4.0  # of the scatter about the smooth seam: a point beyond is left out
 TRIALS = 3  # rounds of leaving points out
-REVOLVED = 4.0  # sigmas of a sample within which it is taken for one of the arc
+ARC_SIGMAS = 4.0  # of a sample, within which it is taken for one of the arc
+WINDOW_M = 0.012  # beyond the field and the sphere's radius: further away is another thing
+NEAREST_PERCENT = 3.0  # of a profile's depths: spikes towards the sensor are fewer
+WIDER_M = 0.5e-3  # a circle may be larger than the sphere by the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +92,10 @@ def feature_sigmas(p: RenderedProfiler, z_m: float) -> Array:
 def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
     """What is known before of the sphere's measurements: what a whole profile is off by counts with the robot's error."""
     return SphereSigmas(
-        sensor_m=1e-3 * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0))),
-        robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, p.jitter_mm)),
+        # samples are noisy in z alone, and the arc's normals lean by up to 60 degrees or so from it
+        sensor_m=1e-3 * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0))) * np.sqrt(0.5 + 0.75 * np.sqrt(3) / np.pi / 2),
+        # what a whole profile is off by lies in two of three axes
+        robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, np.sqrt(2.0 / 3.0) * p.jitter_mm)),
         touch_m=1e-3 * job.robot_sigma_mm,
     )
 
@@ -107,7 +112,7 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     lost = 0
     for one in taken:
         try:
-            point, _ = extract_edge(one.points, "bar", "left")
+            point, _ = extract_edge(_one_background(one.points, 1e-3 * job.straightedge.width_mm), "bar", "left")
         except FeatureNotFound:
             lost += 1
             continue
@@ -126,6 +131,15 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
 
 
+def _one_background(points: Array, behind_m: float) -> Array:
+    """The profile with all that lies further behind its nearest face put at one depth: of post and table, no edges."""
+    p = points[np.isfinite(points).all(axis=1)]
+    if not len(p):
+        return p
+    nearest = float(np.percentile(p[:, 1], NEAREST_PERCENT))
+    return np.column_stack([p[:, 0], np.minimum(p[:, 1], nearest + behind_m)])
+
+
 def _in_flange(e: EdgeEstimate, points: Array) -> Array:
     return np.asarray(np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ e.rotation.T + e.translation)
 
@@ -137,8 +151,9 @@ def find_sphere(
     taken: tuple[Taken, ...],
     touches: tuple[Array, ...] = (),
     tip: Array | None = None,
+    first: SphereEstimate | None = None,
 ) -> SphereFound:
-    """X_FS by the sphere's profiles, with touches (joints (6,) each) the torch's tip as well; without them a first guess.
+    """X_FS by the sphere's profiles; with touches (joints (6,) each) the torch's tip as well, from the first estimate on.
 
     Raises:
         WeldcalError: the scans do not show the sphere, or do not tell enough; see sphere_joint.
@@ -147,19 +162,23 @@ def find_sphere(
     arcs: dict[str, tuple[list[Array], list[Array]]] = {"scan": ([], []), "held_out": ([], [])}
     lost = 0
     for one in taken:
+        window = one.points[one.points[:, 1] < 1e-3 * job.far_mm + radius + WINDOW_M]  # of what stands behind, nothing
         try:
-            mask, _, _ = find_arc(one.points, radius, tolerance_m=REVOLVED * sigmas.sensor_m)
+            mask, circle, _ = find_arc(window, radius, tolerance_m=ARC_SIGMAS * sigmas.sensor_m)
         except FeatureNotFound:
             lost += 1
             continue
+        if circle[2] > radius + WIDER_M:  # a run of samples that is no cut of this sphere: a face, or another thing's edge
+            lost += 1
+            continue
         arcs[one.kind][0].append(one.q)
-        arcs[one.kind][1].append(one.points[mask])
+        arcs[one.kind][1].append(window[mask])
     felt = flange_poses(arm, list(touches)) if touches else None
     data = SphereData(flange_poses(arm, arcs["scan"][0]), arcs["scan"][1], radius, felt, tip if touches else None)
     model: Model = "rigid"
+    e = sphere_joint(data, model, sigmas, first)
     if touches:
-        model, _ = choose_model(data, sigmas)
-    e = sphere_joint(data, model, sigmas)
+        model, e = _better_model(data, sigmas, e)
     others = flange_poses(arm, arcs["held_out"][0])
     rms = []
     for R, t, arc in zip(others.rotation, others.translation, arcs["held_out"][1], strict=True):
@@ -168,8 +187,28 @@ def find_sphere(
     return SphereFound(e, data, model, lost, np.array(rms))
 
 
-def find_seam(arm: ArmModel, estimate: SphereEstimate, up: Array, taken: tuple[Taken, ...], every_m: float) -> SeamFound:
-    """The groove's root in B by what was calibrated, its points left out that are far from their neighbours, smoothed.
+def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate) -> tuple[Model, SphereEstimate]:
+    """Rigid or affine, whichever foretells scans left out better by more than a fiftieth, and its estimate."""
+    names: tuple[Model, ...] = ("rigid", "affine")
+    estimates = {name: sphere_joint(data, name, sigmas, rigid) for name in names}
+    errors = {}
+    for name in names:
+        off = []
+        for k, arc in enumerate(data.profiles):
+            e = sphere_joint(data.without(k), name, sigmas, estimates[name])
+            at = e.points_F(arc) @ data.poses.rotation[k].T + data.poses.translation[k] - e.center
+            off.append(float(np.mean((np.linalg.norm(at, axis=1) - data.radius_m) ** 2)))
+        errors[name] = float(np.sqrt(np.mean(off)))
+    best: Model = "affine" if errors["affine"] < 0.98 * errors["rigid"] else "rigid"
+    return best, estimates[best]
+
+
+def find_seam(
+    arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[Taken, ...], every_m: float
+) -> SeamFound:
+    """The groove's root in B by what was calibrated: points of all passes brought together along the drawn seam, smoothed.
+
+    Points that lie far from their neighbours are left out.
 
     Raises:
         WeldcalError: too few profiles show a groove.
@@ -187,9 +226,11 @@ def find_seam(arm: ArmModel, estimate: SphereEstimate, up: Array, taken: tuple[T
             f"Only {len(points)} of {len(taken)} profiles show the groove: check where the workpiece lies."
         )
     p = np.array(points)
+    place = np.round(drawn.project(p) / every_m).astype(int)
+    up = drawn.ups[0]
     smoothing = SMOOTHING_M**4 / every_m
     kept = np.ones(len(p), bool)
-    curve = SeamCurve.from_points(p, up, smoothing)
+    curve = SeamCurve.from_points(_means(p, place), up, smoothing)
     for _ in range(TRIALS):
         s = curve.project(p)
         off = np.linalg.norm(p - curve.position(s), axis=1)
@@ -198,8 +239,13 @@ def find_seam(arm: ArmModel, estimate: SphereEstimate, up: Array, taken: tuple[T
         if (new == kept).all():
             break
         kept = new
-        curve = SeamCurve.from_points(p[kept], up, smoothing)
+        curve = SeamCurve.from_points(_means(p[kept], place[kept]), up, smoothing)
     return SeamFound(p, kept, curve, lost)
+
+
+def _means(p: Array, place: NDArray[np.int_]) -> Array:
+    """The mean point (m, 3) of each place, in their order."""
+    return np.array([p[place == k].mean(axis=0) for k in np.unique(place)])
 
 
 def pose_sigmas(error: RigidTransform, covariance: Array) -> tuple[Array, float]:

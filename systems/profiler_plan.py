@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,8 @@ CANDIDATES = 160
 FIRST = 5  # poses at random, before the planner has anything to add to
 CAP_RAD = np.radians(55.0)  # of the sphere that is touched, from its top
 SIDE_RAD = np.radians(62.0)  # largest angle between torch and the sphere's normal at a touch
-LEAN_RAD = np.radians(20.0)
-TURN_RAD = np.radians(35.0)
+LEAN_RAD = np.radians(25.0)
+TURN_RAD = np.radians(60.0)
 STATION_M = 0.004  # between joint positions along a pass
 RAMP_S = 0.5  # to a pass's speed and from it
 
@@ -60,8 +61,16 @@ class JointPath(Message):
             s, ds = float(self.s[-1]) - 0.5 * v * left * left / RAMP_S, v * left / RAMP_S
         else:
             s, ds = v * (t - 0.5 * RAMP_S), v
-        curve = CubicSpline(self.s, self.q)
-        return np.asarray(curve(s)), np.asarray(curve(s, 1)) * ds, float(s)
+        return np.asarray(self.curve(s)), np.asarray(self.curve(s, 1)) * ds, float(s)
+
+    @cached_property
+    def curve(self) -> CubicSpline:
+        """q over s."""
+        return CubicSpline(self.s, self.q)
+
+    def backwards(self) -> JointPath:
+        """The same way from its end."""
+        return JointPath(self.s[-1] - self.s[::-1], self.q[::-1].copy(), self.speed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +168,12 @@ def plan_pass(room: Room, q_from: Array) -> list[Goal]:
     for p, t in zip(top, tangents, strict=True):
         x = np.cross(t, up)
         flange.append(RigidTransform(RotationMatrix(np.column_stack([x, np.cross(-up, x), -up])), p) @ X_SF)
-    return _along(room, q_from, flange, top, 1e-3 * stage.pass_mm_s, "pass")
+    goals = _along(room, q_from, flange, top, 1e-3 * stage.pass_mm_s, "pass")
+    for _ in range(stage.passes - 1):
+        assert goals[-1].path is not None
+        back = goals[-1].path.backwards()
+        goals.append(Goal("pass", back.q[0], path=back))
+    return goals
 
 
 def plan_torch(room: Room, q_from: Array, curve: SeamCurve) -> list[Goal]:

@@ -11,7 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.models.arms.kinematics import jacobian
+from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
 from weldcal.systems.messages import JobCommand, Message, UrStatus
@@ -29,6 +29,7 @@ from weldcal.systems.profiler_estimates import (
 )
 from weldcal.systems.profiler_plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
 from weldcal.systems.profiler_room import Room
+from weldcal.welding.seam import SeamCurve
 
 Array = NDArray[np.float64]
 DWELL_S = 0.15  # at rest before a profile is taken
@@ -48,6 +49,7 @@ class ProfilerState(Message):
     goals: tuple[Goal, ...] = ()  # the first is the one at hand
     sequence: int = 0  # of the newest profile that was asked for
     seen: int = 0  # of the newest one that came
+    before: int = 0  # profiles there had been when the pass began
     felt: int = 0  # touches there had been when the descent began
     taken: tuple[Taken, ...] = ()
     touches: tuple[Array, ...] = ()
@@ -160,7 +162,8 @@ class ProfilerProcedure(LeafSystem):
             touch: TorchTouch = self._touch.Eval(context)
             return replace(s, phase="descend", since=now, felt=touch.sequence)
         if kind in ("pass", "torch"):
-            return replace(s, phase="run", since=now, torch_from_s=now if kind == "torch" else s.torch_from_s)
+            torch = now if kind == "torch" else s.torch_from_s
+            return replace(s, phase="run", since=now, before=s.sequence, torch_from_s=torch)
         return self._go_on(s, q, now)
 
     def _collected(self, s: ProfilerState, context: Context) -> ProfilerState:
@@ -195,20 +198,14 @@ class ProfilerProcedure(LeafSystem):
         if s.goals[0].kind == "pass":
             s = self._collected(s, context)
             every = self._room.job.seam.every_mm / self._room.job.seam.pass_mm_s
-            due = int((now - s.since) / every) + 1
-            taken_before = s.sequence - (len(self._room_scans(s)))
-            if s.seen == s.sequence and due > s.sequence - taken_before and now - s.since < path.duration:
+            due = s.before + int((now - s.since) / every) + 1
+            if s.seen == s.sequence and s.sequence < due and now - s.since < path.duration:
                 s = replace(s, sequence=s.sequence + 1)
         if now - s.since > path.duration + 0.2 and s.seen == s.sequence:
             if s.goals[0].kind == "torch":
                 s = replace(s, torch_until_s=now)
             return self._go_on(s, q, now)
         return s
-
-    @staticmethod
-    def _room_scans(s: ProfilerState) -> tuple[Taken, ...]:
-        """Profiles of this pass, the one on its way included."""
-        return s.taken if s.seen == s.sequence else (*s.taken, s.taken[-1]) if s.taken else ()
 
     def _go_on(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
         if len(s.goals) > 1:
@@ -246,8 +243,6 @@ class ProfilerProcedure(LeafSystem):
 
     @staticmethod
     def _raised(room: Room, q: Array) -> Array:
-        from weldcal.models.arms.kinematics import forward_kinematics
-
         up = room.joints(RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(room.arm, q), q)
         return room.q_home if up is None else up
 
@@ -260,9 +255,11 @@ class ProfilerProcedure(LeafSystem):
         if s.step == "sphere":
             first = find_sphere(room.arm, p, room.job, s.taken)
             known = room.known(X_FS=first.estimate.X_FS, center=first.estimate.center)
-            return replace(s, sphere_scans=s.taken, room=known)
+            return replace(s, sphere_scans=s.taken, sphere=first, room=known)
         if s.step == "touch":
-            sphere = find_sphere(room.arm, p, room.job, s.sphere_scans, s.touches, room.p_FTip)
+            assert s.sphere is not None
+            before = s.sphere.estimate
+            sphere = find_sphere(room.arm, p, room.job, s.sphere_scans, s.touches, room.p_FTip, before)
             e = sphere.estimate
             assert e.tip is not None
             X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
@@ -270,8 +267,9 @@ class ProfilerProcedure(LeafSystem):
         if s.step == "pass":
             assert s.sphere is not None
             assert room.X_BP is not None
-            up = room.X_BP.rotation().matrix()[:, 2].copy()
-            seam = find_seam(room.arm, s.sphere.estimate, up, s.taken, 1e-3 * room.job.seam.every_mm)
+            assert room.cad is not None
+            drawn = SeamCurve.from_points(np.asarray(room.cad.seam_P)[::4]).transformed(room.X_BP)
+            seam = find_seam(room.arm, s.sphere.estimate, drawn, s.taken, 1e-3 * room.job.seam.every_mm)
             return replace(s, seam=seam, seam_scans=s.taken)
         return s
 

@@ -32,18 +32,9 @@ class RobotError(LeafSystem):
         self._position = self.DeclareVectorInputPort("position_measured", 6)
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self.DeclareVectorOutputPort("position", 6, self._add)
-        self._known: dict[int, np.ndarray] = {}
 
     def _add(self, context: Context, output: BasicVector) -> None:
         job: JobCommand = self._job.Eval(context)
-        output.SetFromVector(self._position.Eval(context) + self._error(job))
-
-    def _error(self, job: JobCommand) -> np.ndarray:
-        """Of this goal; remembered, which changes no answer: it follows from the seed and the goal alone."""
-        if job.q_goal is None:
-            return np.zeros(6)
-        if job.goal_id not in self._known:
-            shift = self._sigma_m * np.random.default_rng([self._seed, job.goal_id]).standard_normal(3)
-            twist = np.concatenate([np.zeros(3), shift])
-            self._known[job.goal_id] = np.linalg.solve(jacobian(self._arm, job.q_goal), twist)
-        return self._known[job.goal_id]
+        q = np.array(self._position.Eval(context))
+        shift = self._sigma_m * np.random.default_rng([self._seed, job.goal_id]).standard_normal(3)
+        output.SetFromVector(q + np.linalg.solve(jacobian(self._arm, q), np.concatenate([np.zeros(3), shift])))

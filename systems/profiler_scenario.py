@@ -53,10 +53,10 @@ class EdgeStage:
 class SphereStage:
     """Scans and touches of the sphere."""
 
-    scans: int = 20
-    held_out: int = 4
-    touches: int = 16
-    tilt_deg: float = 22.0
+    scans: int = 28
+    held_out: int = 6
+    touches: int = 24
+    tilt_deg: float = 26.0
     descent_mm_s: float = 6.0
     gap_mm: float = 10.0  # of the tip above the sphere, as thought, where the descent begins
     deepest_mm: float = 10.0  # below where the sphere is thought to be: then the touch is given up
@@ -66,6 +66,7 @@ class SphereStage:
 class SeamStage:
     """The pass of the profiler along the groove, and of the torch after it."""
 
+    passes: int = 2  # forth and back: the robot's own error is another one each time
     pass_mm_s: float = 25.0
     every_mm: float = 2.0  # a profile this often
     stand_off_mm: float = 85.0  # of the plate, from the profiler
@@ -132,5 +133,7 @@ def check_profiler_job(job: ProfilerJob | None, *, has_profiler: bool, has_groov
         raise InputError("Leave one scan out or more: held_out must be positive.")
     if not 0.0 < job.near_mm < job.far_mm or min(job.half_width_mm, job.robot_sigma_mm, job.ball.radius_mm) <= 0.0:
         raise InputError("The profiler's field, the sphere's radius and the robot's sigma must be positive.")
+    if job.seam.passes < 1:
+        raise InputError("A seam needs seam.passes of 1 or more.")
     if min(job.sphere.descent_mm_s, job.seam.pass_mm_s, job.seam.every_mm, job.seam.torch_mm_s) <= 0.0:
         raise InputError("The descent, both passes' speeds and the distance of profiles must be positive.")

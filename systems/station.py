@@ -164,6 +164,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
         workpiece=real,
         X_BP=X_BP,
         profiler=fixture,
+        time_step_s=0.002 if fixture is None else fixture.time_step_s,
     )
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, fixture)
     apply_driver_config(scenario.robot, build)

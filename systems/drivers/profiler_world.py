@@ -43,6 +43,7 @@ class ProfilerFixture(Message):
     job: ProfilerJob
     meshes: tuple[tuple[TriMesh, float], ...]
     X_FS_drawn: RigidTransform
+    time_step_s: float = 0.004  # of the plant: nothing in it is softer than the arm's servos
 
 
 @dataclass(frozen=True, eq=False)

@@ -249,7 +249,8 @@ class TouchSensor(LeafSystem):
         felt = any(self._felt(results, k) for k in range(results.num_point_pair_contacts()))
         if felt == old.down:
             return
-        time = last_step(context.get_time(), self._step)
+        # contact is found where the last step began: one step before the place that the plant's poses show
+        time = last_step(context.get_time(), self._step) - self._step
         new = TorchTouch(old.sequence + 1, time, True) if felt else dc.replace(old, down=False)
         state.get_mutable_abstract_state(self._touch).set_value(new)
 
