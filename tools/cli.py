@@ -12,6 +12,7 @@ from weldcal.tools import cli_hand_eye, console
 from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_profiler import profiler
+from weldcal.tools.cli_profiler_live import live as profiler_live
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.cli_cell import cell as reproduce_cell
@@ -39,6 +40,7 @@ mount_flange(benchmarks)
 app.add_typer(cli_hand_eye.hand_eye, name="hand-eye")
 benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
 app.add_typer(profiler, name="profiler")
+profiler.command("live")(profiler_live)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
@@ -92,6 +94,7 @@ CorrectionOption = Annotated[
     ),
 ]
 RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
+DEMO_SCENARIO = "s_groove"
 ScenarioOption = Annotated[
     str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
 ]
@@ -122,7 +125,10 @@ def weldcal(
 
 @app.command(short_help="The whole story in simulation, with a report at the end.")
 def demo(
-    scenario: ScenarioOption = "s_groove",
+    name: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help="The same as --scenario.", show_default=False)
+    ] = None,
+    scenario: ScenarioOption = DEMO_SCENARIO,
     out: OutOption = None,
     seed: SeedOption = 0,
     browser: BrowserOption = True,
@@ -135,8 +141,13 @@ def demo(
     debug: DebugOption = False,
 ) -> None:
     """The whole story: calibrate, verify, scan the workpiece, plan, weld, retract; with a report at the end."""
+    if name is not None:
+        if scenario not in (DEMO_SCENARIO, name):
+            raise typer.BadParameter("give the scenario once, by itself or with --scenario")
+        scenario = name
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.demo import DemoOptions, run_demo
+        from weldcal.tools.demo import DemoOptions
+        from weldcal.tools.procedures import run_procedure
 
         options = DemoOptions(
             scenario=scenario,
@@ -150,7 +161,7 @@ def demo(
             speed_factor=speed_factor,
         )
         with console.progress_bar("demo") as progress:
-            result = run_demo(options, progress)
+            result = run_procedure(options, progress)
     finish("demo", result.summary(), result.folder, json_wanted=json)
 
 
