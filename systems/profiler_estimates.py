@@ -78,7 +78,8 @@ class SeamFound(Message):
 def flange_poses(arm: ArmModel, taken: list[Array]) -> FlangePoses:
     """X_BF for joints, as arrays."""
     X = [forward_kinematics(arm, q) for q in taken]
-    return FlangePoses(np.array([x.rotation().matrix() for x in X]), np.array([x.translation() for x in X]))
+    R, p = np.array([x.rotation().matrix() for x in X]), np.array([x.translation() for x in X])
+    return FlangePoses(R.reshape(-1, 3, 3), p.reshape(-1, 3))
 
 
 def feature_sigmas(p: RenderedProfiler, z_m: float) -> Array:
@@ -93,7 +94,9 @@ def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
     """What is known before of the sphere's measurements: what a whole profile is off by counts with the robot's error."""
     return SphereSigmas(
         # samples are noisy in z alone, and the arc's normals lean by up to 60 degrees or so from it
-        sensor_m=1e-3 * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0))) * np.sqrt(0.5 + 0.75 * np.sqrt(3) / np.pi / 2),
+        sensor_m=1e-3
+        * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0)))
+        * np.sqrt(0.5 + 0.75 * np.sqrt(3) / np.pi / 2),
         # what a whole profile is off by lies in two of three axes
         robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, np.sqrt(2.0 / 3.0) * p.jitter_mm)),
         touch_m=1e-3 * job.robot_sigma_mm,
@@ -118,17 +121,27 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
             continue
         seen[one.kind][0].append(one.q)
         seen[one.kind][1].append(point)
+    _enough(len(seen["scan"][1]), taken, "the straightedge's edge")
     poses, points = flange_poses(arm, seen["scan"][0]), np.array(seen["scan"][1])
     e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=robot, sigma_xz_m=sigmas)
     others = flange_poses(arm, seen["held_out"][0])
     state = EdgeState(e.rotation, e.translation, e.point, e.direction)
     foretold, J, by_robot = predicted(state, others)
-    off = np.array(seen["held_out"][1]) - foretold
+    left_out = np.array(seen["held_out"][1]).reshape(-1, 2)
+    off = left_out - foretold
     r, _ = whitened(measurement_covariance(by_robot, robot, sigmas), off, J)
-    at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, np.array(seen["held_out"][1]))) + others.translation
+    at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, left_out)) + others.translation
     away = at - e.point
     away -= np.outer(away @ e.direction, e.direction)
     return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
+
+
+def _enough(found: int, taken: tuple[Taken, ...], what: str) -> None:
+    wanted = sum(one.kind == "scan" for one in taken)
+    if found < 0.5 * wanted:
+        raise FeatureNotFound(
+            f"Only {found} of {wanted} profiles show {what}: check where it stands and how the profiler is mounted."
+        )
 
 
 def _one_background(points: Array, behind_m: float) -> Array:
@@ -141,7 +154,9 @@ def _one_background(points: Array, behind_m: float) -> Array:
 
 
 def _in_flange(e: EdgeEstimate, points: Array) -> Array:
-    return np.asarray(np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ e.rotation.T + e.translation)
+    return np.asarray(
+        np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ e.rotation.T + e.translation
+    )
 
 
 def find_sphere(
@@ -168,11 +183,14 @@ def find_sphere(
         except FeatureNotFound:
             lost += 1
             continue
-        if circle[2] > radius + WIDER_M:  # a run of samples that is no cut of this sphere: a face, or another thing's edge
+        if (
+            circle[2] > radius + WIDER_M
+        ):  # a run of samples that is no cut of this sphere: a face, or another thing's edge
             lost += 1
             continue
         arcs[one.kind][0].append(one.q)
         arcs[one.kind][1].append(window[mask])
+    _enough(len(arcs["scan"][1]), taken, "an arc of the sphere")
     felt = flange_poses(arm, list(touches)) if touches else None
     data = SphereData(flange_poses(arm, arcs["scan"][0]), arcs["scan"][1], radius, felt, tip if touches else None)
     model: Model = "rigid"

@@ -233,13 +233,13 @@ def _stretch(room: Room, s: Array) -> NDArray[np.bool_]:
     return np.asarray((s >= begin) & (s <= end))
 
 
-def _along(
-    room: Room, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str
-) -> list[Goal]:
+def _along(room: Room, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str) -> list[Goal]:
     """A goal above the beginning, then the path."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
-    chosen = np.unique(np.searchsorted(length, np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M))))).clip(0, len(at) - 1)  # fmt: skip
-    joints, q = [], room.q_home
+    even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
+    chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
+    joints: list[Array] = []
+    q = room.q_home
     for k in chosen:
         found = room.joints(flange[k], q)
         if found is None:

@@ -218,7 +218,8 @@ class ProfilerProcedure(LeafSystem):
         if not s.steps_left:
             if s.step == "home":
                 return replace(s, phase="done", since=now)
-            goals, step, left = [Goal("via", room.q_home)], "home", ()
+            goals, step = [Goal("via", room.q_home)], "home"
+            left: tuple[str, ...] = ()
             if s.step == "torch":
                 goals = [Goal("via", self._raised(room, q)), *goals]
         else:

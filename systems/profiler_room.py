@@ -130,7 +130,7 @@ def _to_box(p: Array, X: RigidTransform, low: list[float], high: list[float]) ->
     q = X.inverse().multiply(p.T).T
     outside = np.maximum(np.maximum(low - q, q - high), 0.0)
     inside = np.minimum(np.minimum(q - low, high - q).min(axis=1), 1.0)
-    return np.where(inside > 0.0, -inside, np.linalg.norm(outside, axis=1))
+    return np.asarray(np.where(inside > 0.0, -inside, np.linalg.norm(outside, axis=1)))
 
 
 def _to_post(p: Array, top: Array) -> Array:

@@ -130,8 +130,8 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
 
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
-    `finger_camera.image`, `.capture_time`; with a profiler in `profiler.trigger`, out `profiler.profile`, `torch.touch`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
-    `query_object`.
+    `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
+    `query_object`. With a profiler: in `profiler.trigger`, out `profiler.profile`, `torch.touch`.
 
     Raises:
         InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the job.

@@ -40,8 +40,10 @@ def live(
 
         options = DemoOptions(scenario=scenario, out=folder, seed=seed, recording=record)
         loaded = load_scenario(scenario)
-        if runs > 1:
-            summary = run_profiler_seeds(loaded, options, runs, progress)
-        else:
-            summary = run_profiler_live(loaded, options, progress).summary()
+        one = runs == 1
+        summary = (
+            run_profiler_live(loaded, options, progress).summary()
+            if one
+            else run_profiler_seeds(loaded, options, runs, progress)
+        )
     finish("profiler live", summary, folder, json_wanted=json)

@@ -29,7 +29,6 @@ from weldcal.tools.report.profiler_live_report import live_report, seeds_report
 from weldcal.tools.report.render import write_atomic
 
 Array = NDArray[np.float64]
-WITHIN_SIGMAS = 3.0
 WITHIN_MM = 0.3
 
 
@@ -84,7 +83,7 @@ class ProfilerLive:
         poses = [p for p in (o.edge, o.sphere) if p is not None]
         if poses:
             found["largest_sigmas"] = max(p.largest for p in poses)
-            found["poses_within_3_sigma"] = all(p.largest <= WITHIN_SIGMAS for p in poses)
+            found["poses_within_3_sigma"] = all(p.within_3_sigma for p in poses)
         found["simulated_seconds"], found["wall_seconds"] = self.run.seconds, self.wall_seconds
         return found
 
@@ -182,9 +181,7 @@ def _touched(arm: ArmModel, touches: Sequence[Array], tip: Sequence[float], radi
     return more
 
 
-def run_profiler_seeds(
-    scenario: Scenario, options: DemoOptions, runs: int, progress: Progress
-) -> dict[str, object]:
+def run_profiler_seeds(scenario: Scenario, options: DemoOptions, runs: int, progress: Progress) -> dict[str, object]:
     """The same over seeds, each in a folder of its own; seeds.csv grows row by row, report.html shows all."""
     rows: list[dict[str, object]] = []
     outcomes: list[LiveOutcome] = []
@@ -207,7 +204,7 @@ def run_profiler_seeds(
             found[f"{name}_mean_nees"] = float(np.mean([p.nees for p in poses]))
             found[f"{name}_largest_sigmas"] = float(np.max([p.largest for p in poses]))
             found[f"{name}_rms_mm"] = float(np.sqrt(np.mean([p.error_mm**2 for p in poses])))
-            found[f"{name}_within_3_sigma"] = sum(p.largest <= WITHIN_SIGMAS for p in poses)
+            found[f"{name}_within_3_sigma"] = sum(p.within_3_sigma for p in poses)
     torches = [o.torch.distance_mm for o in outcomes if o.torch is not None]
     if torches:
         found["torch_mean_mm"] = float(np.mean([t.mean() for t in torches]))

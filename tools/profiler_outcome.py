@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.stats import chi2
 
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.systems.profiler_cell import ProfilerCell, ProfilerRun
@@ -15,6 +16,7 @@ from weldcal.welding.process import path_error
 from weldcal.welding.seam import SeamCurve
 
 Array = NDArray[np.float64]
+JOINT_3_SIGMA = float(chi2.ppf(chi2.cdf(9.0, 1), 6))  # 20.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +29,11 @@ class PoseOutcome:
     sigma_deg: float
     parts: Array
     nees: float
+
+    @property
+    def within_3_sigma(self) -> bool:
+        """Whether all six together are as likely as 3 sigma of one: 99.73 %."""
+        return self.nees <= JOINT_3_SIGMA
 
     @property
     def largest(self) -> float:
@@ -83,8 +90,10 @@ def live_outcome(cell: ProfilerCell, run: ProfilerRun) -> LiveOutcome:
     if profiler is None:
         raise RuntimeError("this station has no profiler")
     touched = s.sphere if s.sphere is not None and s.sphere.estimate.tip is not None else None
-    tip = None if touched is None else 1e3 * float(np.linalg.norm(touched.estimate.tip - profiler.p_FTip))
-    center = None if touched is None else 1e3 * float(np.linalg.norm(touched.estimate.center - profiler.center))
+    tip = center = None
+    if touched is not None and touched.estimate.tip is not None:
+        tip = 1e3 * float(np.linalg.norm(touched.estimate.tip - profiler.p_FTip))
+        center = 1e3 * float(np.linalg.norm(touched.estimate.center - profiler.center))
     points = curve = torch = None
     job = cell.scenario.profiler_job
     if s.seam is not None and truth.workpiece is not None and truth.X_BP is not None and job is not None:

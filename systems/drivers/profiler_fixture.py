@@ -45,7 +45,10 @@ def draw_fixture(
     )
     meshes = [
         (straightedge_mesh(1e-3 * s.length_mm, 1e-3 * s.width_mm).transformed(X_BE), 0.0),
-        *((post_mesh(p, table_z_m), 0.6) for p in (under_straightedge(X_BE, 1e-3 * s.width_mm), center - [0.0, 0.0, 0.9 * radius])),
+        *(
+            (post_mesh(p, table_z_m), 0.6)
+            for p in (under_straightedge(X_BE, 1e-3 * s.width_mm), center - [0.0, 0.0, 0.9 * radius])
+        ),
         (box_mesh([0.45, 0.0, table_z_m - 0.02], [1.5, 1.2, 0.04]), 0.6),
     ]
     if workpiece is not None and X_BP is not None:

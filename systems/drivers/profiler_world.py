@@ -141,4 +141,3 @@ def _show_torch(show: object, plate: object, tip: Array, rgba: tuple[float, ...]
 
 def _shape(mesh: TriMesh) -> Mesh:
     return mesh.to_drake("straightedge")
-

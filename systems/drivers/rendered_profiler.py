@@ -44,7 +44,9 @@ class RenderedProfiler:
     quantum_mm: float = 0.1
     share_missing: float = 0.01
     share_spikes: float = 0.005
-    grazing_deg: float = 78.0  # a surface this steep to the ray returns half of what it should, one 8 degrees steeper nothing
+    grazing_deg: float = (
+        78.0  # a surface this steep to the ray returns half of what it should, one 8 degrees steeper nothing
+    )
     exposure_s: float = 0.004
 
     @property
@@ -113,8 +115,8 @@ class RayFan:
         self._dark = []
         for mesh, dark in fixture.meshes:
             self._scene.add_triangles(
-                o3d.core.Tensor(np.asarray(mesh.vertices - self._origin, np.float32)),
-                o3d.core.Tensor(np.asarray(mesh.triangles, np.uint32)),
+                o3d.core.Tensor.from_numpy(np.asarray(mesh.vertices - self._origin, np.float32)),
+                o3d.core.Tensor.from_numpy(np.asarray(mesh.triangles, np.uint32)),
             )
             self._dark.append(dark)
 
@@ -126,11 +128,13 @@ class RayFan:
         start = X_BS.translation() - self._origin - c.apex_m * R[:, 2]
         d = slopes[:, None] * R[:, 0] + R[:, 2]
         rays = np.hstack([np.broadcast_to(start, d.shape), d]).astype(np.float32)
-        hit = self._scene.cast_rays(o3d.core.Tensor(rays))
+        hit = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
         t = hit["t_hit"].numpy().astype(float)
         normal = hit["primitive_normals"].numpy().astype(float)
         number = hit["geometry_ids"].numpy().astype(np.int64)
-        dark = np.array([*self._dark, 1.0])[np.minimum(number, len(self._dark))]  # a miss has the largest number there is
+        dark = np.array([*self._dark, 1.0])[
+            np.minimum(number, len(self._dark))
+        ]  # a miss has the largest number there is
         t_ball, normal_ball = self._sphere(start, d)
         nearer = t_ball < t
         t, dark = np.where(nearer, t_ball, t), np.where(nearer, 0.0, dark)

@@ -287,4 +287,6 @@ def build_world(
             only=("tag_print", "tag_white"),
             background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
         )
-    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, touch_pair)
+    return SimulatedWorld(
+        plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, touch_pair
+    )

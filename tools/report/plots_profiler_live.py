@@ -27,7 +27,8 @@ def sigmas_picture(poses: Mapping[str, Sequence[PoseOutcome]]) -> bytes:
         shift = 0.24 * (k - 0.5 * (len(poses) - 1))
         for j, pose in enumerate(found):
             spread = 0.0 if len(found) == 1 else 0.16 * (j / (len(found) - 1) - 0.5)
-            axes.plot(np.arange(6) + shift + spread, pose.parts, "o", color=_COLOURS[name], markersize=5 if len(found) == 1 else 3.5, label=name if j == 0 else None)  # fmt: skip
+            at, size = np.arange(6) + shift + spread, 5.0 if len(found) == 1 else 3.5
+            axes.plot(at, pose.parts, "o", color=_COLOURS[name], markersize=size, label=name if j == 0 else None)
     axes.set_xticks(range(6), PARTS)
     largest = max(float(np.abs(p.parts).max()) for found in poses.values() for p in found)
     axes.set_ylim(-max(4.0, 1.1 * largest), max(4.0, 1.1 * largest))
