@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, EventSta
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from weldcal.models.errors import InputError
-from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED
+from weldcal.systems.cell import JERK_LIMIT
 from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.drivers.station_build import PreparedRobot
@@ -28,6 +28,7 @@ from weldcal.welding.guard import SlewLimits
 
 Array = NDArray[np.float64]
 CONTROL_PERIOD_S = 0.004
+MOVE_SPEED, MOVE_ACCELERATION = 1.2, 5.0  # rad/s and rad/s^2 of the fastest joint: most moves are short
 LOG_PERIOD_S = 0.02
 RECORDING_FPS = 8.0
 

@@ -32,7 +32,7 @@ from weldcal.systems.profiler_room import Room
 from weldcal.welding.seam import SeamCurve
 
 Array = NDArray[np.float64]
-DWELL_S = 0.15  # at rest before a profile is taken
+DWELL_S = 0.1  # at rest before a profile is taken
 FEEDBACK_PER_S = 8.0  # towards the path
 PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # what each stage does, in order
 
@@ -88,7 +88,7 @@ class ProfilerProcedure(LeafSystem):
     touch, the profiler's pass, the torch's. `trigger` (1) is the number of the newest profile asked for.
     """
 
-    def __init__(self, room: Room, profiler: RenderedProfiler, seed: int, period_s: float = 0.004) -> None:
+    def __init__(self, room: Room, profiler: RenderedProfiler, seed: int, period_s: float = 0.008) -> None:
         super().__init__()
         self._room, self._profiler, self._seed = room, profiler, seed
         self._position = self.DeclareVectorInputPort("position", 6)

@@ -188,7 +188,7 @@ class ProfilerSensor(LeafSystem):
         flange: BodyIndex,
         seed: int,
         plant_period_s: float,
-        period_s: float = 0.004,
+        period_s: float = 0.008,
     ) -> None:
         super().__init__()
         self._config, self._fixture, self._flange, self._seed = config, fixture, int(flange), seed

@@ -30,8 +30,8 @@ from weldcal.tools.profiler_live import ProfilerLive, run_profiler_live
 # fewer scans and touches than shipped, and the first 60 mm of the seam
 SHORT = """
 profiler_job:
-  edge: {scans: 12, held_out: 3}
-  sphere: {scans: 8, held_out: 2, touches: 9, descent_mm_s: 10.0, gap_mm: 8.0}
+  edge: {scans: 10, held_out: 2}
+  sphere: {scans: 7, held_out: 1, touches: 8, descent_mm_s: 10.0, gap_mm: 8.0}
   seam: {seam_length_mm: 60.0, passes: 1, torch_mm_s: 20.0}
 """
 
@@ -47,7 +47,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> ProfilerLive:
 def test_all_stages_are_done_and_nothing_is_lost(live: ProfilerLive) -> None:
     s = live.run.state
     assert (s.phase, s.reason) == ("done", "")
-    assert (len(s.edge_scans), len(s.sphere_scans), len(s.touches)) == (15, 10, 9)
+    assert (len(s.edge_scans), len(s.sphere_scans), len(s.touches)) == (12, 8, 8)
     assert len(s.seam_scans) >= 28
 
 
