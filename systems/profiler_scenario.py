@@ -129,8 +129,8 @@ def check_profiler_job(job: ProfilerJob | None, *, has_profiler: bool, has_groov
         raise InputError("A seam needs the torch's tip, which the touches find: write stages: [sphere, seam].")
     if "seam" in job.stages and not has_groove:
         raise InputError("A seam needs a workpiece in the scenario.")
-    if job.edge.scans < 8 or job.sphere.scans < 6 or job.sphere.touches < 8:
-        raise InputError("Take 8 scans of the edge, 6 of the sphere and 8 touches of it, or more.")
+    if job.edge.scans < 8 or job.sphere.scans < 6 or job.sphere.touches < 6:
+        raise InputError("Take 8 scans of the edge, 6 of the sphere and 6 touches of it, or more.")
     if min(job.edge.held_out, job.sphere.held_out) < 1:
         raise InputError("Leave one scan out or more: held_out must be positive.")
     if not 0.0 < job.near_mm < job.far_mm or min(job.half_width_mm, job.robot_sigma_mm, job.ball.radius_mm) <= 0.0:

@@ -62,8 +62,8 @@ def profiles_picture(profiles: Mapping[str, Array]) -> bytes:
         near = p[np.isfinite(p).all(axis=1)]
         if len(near):
             top = float(np.percentile(near[:, 1], 3.0))
-            near = near[near[:, 1] < top + 0.03]
-        axes.plot(1e3 * near[:, 0], 1e3 * near[:, 1], ".", color=OURS, markersize=2)
+            near = near[near[:, 1] < top + 0.045]
+        axes.plot(1e3 * near[:, 0], 1e3 * near[:, 1], ".", color=OURS, markersize=2.5)
         axes.invert_yaxis()
         axes.set_title(name, fontsize=10)
         axes.set_xlabel("x, mm")

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from weldcal.calibration.result import software_version
 from weldcal.systems.profiler_procedure import ProfilerState
 from weldcal.tools.profiler_outcome import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render
 
+Array = NDArray[np.float64]
 LIMIT_MM = 0.3
 
 
@@ -18,7 +22,7 @@ def live_report(summary: Mapping[str, object], outcome: LiveOutcome, state: Prof
     poses = {name: [p] for name, p in _poses(outcome).items()}
     paths = {n: p for n in ("points", "curve", "torch") if (p := getattr(outcome, n)) is not None}
     shown = {
-        f"{name}": scans[len(scans) // 2].points
+        name: min(scans, key=lambda scan: _aside(scan.points)).points
         for name, scans in (("edge", state.edge_scans), ("sphere", state.sphere_scans), ("groove", state.seam_scans))
         if scans
     }
@@ -82,6 +86,15 @@ _COLUMNS = {
 
 def _poses(o: LiveOutcome) -> dict[str, PoseOutcome]:
     return {n: p for n in ("edge", "sphere") if (p := getattr(o, n)) is not None}
+
+
+def _aside(points: Array) -> float:
+    """How far from the middle the nearest face lies in a profile (n, 2) m."""
+    p = points[np.isfinite(points).all(axis=1)]
+    if not len(p):
+        return np.inf
+    near = p[:, 1] < np.percentile(p[:, 1], 5.0) + 0.012
+    return abs(float(np.mean(p[near, 0])))
 
 
 def _row(name: str, p: PoseOutcome) -> tuple[str, ...]:
