@@ -127,6 +127,8 @@ def check_profiler_job(job: ProfilerJob | None, *, has_profiler: bool, has_groov
         raise InputError(f"profiler_job.stages are some of {', '.join(STAGES)}, in this order, not {job.stages}.")
     if "seam" in job.stages and "sphere" not in job.stages:
         raise InputError("A seam needs the torch's tip, which the touches find: write stages: [sphere, seam].")
+    if len(job.torch.tip_m) != 3 or not job.torch.tip_m[2] > 0.03:
+        raise InputError("profiler_job.torch.tip_m has three numbers, and the tip is 0.03 m or more before the flange.")
     if "seam" in job.stages and not has_groove:
         raise InputError("A seam needs a workpiece in the scenario.")
     if job.edge.scans < 8 or job.sphere.scans < 6 or job.sphere.touches < 6:

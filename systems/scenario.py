@@ -244,6 +244,8 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
+    if isinstance(scenario.profiler, RenderedProfiler):
+        scenario.profiler.preset()
     check_profiler_job(
         scenario.profiler_job,
         has_profiler=not isinstance(scenario.profiler, NoDevice),

@@ -12,6 +12,7 @@ from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
 from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.station_build import StationBuild
@@ -66,7 +67,12 @@ class RenderedProfiler:
         return float((z_m + self.apex_m) * (self.slopes[1] - self.slopes[0]))
 
     def preset(self) -> ProfilerPreset:
-        """The noise of samples, in the words of models.profilers; raises InputError for numbers that are none."""
+        """The noise of samples, in the words of models.profilers; raises InputError for numbers that no profiler has."""
+        if (
+            not self.width_far_mm > self.width_near_mm > 0.0
+            or min(self.noise_mm, self.jitter_mm, self.exposure_s) < 0.0
+        ):
+            raise InputError("A profiler is wider far away than near, and its noise and exposure are not negative.")
         return ProfilerPreset(
             samples=self.samples,
             width_m=1e-3 * self.width_near_mm,

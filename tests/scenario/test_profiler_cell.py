@@ -159,6 +159,9 @@ def test_a_stopped_robot_holds_it_with_its_own_words(alone: Alone) -> None:
         ("profiler_job: {edge: {scans: 3}}", "8 scans of the edge"),
         ("tool: welding\ncalibration: {feature: tool_ring}", "takes the tool's place"),
         ("workpiece: null", "needs a workpiece"),
+        ("profiler_job: {torch: {tip_m: [0.0, 0.1]}}", "three numbers"),
+        ("profiler: !RenderedProfiler {width_far_mm: 30.0}", "wider far away"),
+        ("profiler: !RenderedProfiler {samples: 1}", "two samples"),
         ("profiler_job: {sphere: {descent_mm_s: 0.0}}", "must be positive"),
     ],
 )

@@ -46,6 +46,51 @@ finger_camera: !RenderedFingerCamera
   latency_s: 0.02
   noise_grey: 1.0
   hidden_from_s: 3.0
+profiler: !RenderedProfiler
+  xyz_m: [0.08, 0.01, 0.05]
+  rpy_deg: [1.0, 0.0, 80.0]
+  mounting_translation_mm: 2.0
+  mounting_rotation_deg: 1.0
+  samples: 300
+  nearest_mm: 55.0
+  farthest_mm: 300.0
+  width_near_mm: 45.0
+  width_far_mm: 150.0
+  noise_mm: 0.05
+  jitter_mm: 0.02
+  quantum_mm: 0.05
+  share_missing: 0.02
+  share_spikes: 0.01
+  grazing_deg: 75.0
+  exposure_s: 0.008
+profiler_job:
+  stages: [sphere, seam]
+  torch: {tip_m: [0.01, 0.0, 0.13], error_mm: 1.0}
+  straightedge:
+    xyz_m: [0.6, 0.0, 0.15]
+    rpy_deg: [5.0, -4.0, 30.0]
+    length_mm: 150.0
+    width_mm: 25.0
+    translation_mm: 2.0
+    rotation_deg: 0.5
+  ball: {xyz_m: [0.65, 0.2, 0.15], radius_mm: 15.0, translation_mm: 2.0}
+  edge: {scans: 20, held_out: 4, tilt_deg: 20.0}
+  sphere: {scans: 20, held_out: 4, touches: 12, tilt_deg: 20.0, descent_mm_s: 5.0, gap_mm: 9.0, deepest_mm: 9.0}
+  seam:
+    passes: 1
+    pass_mm_s: 20.0
+    every_mm: 3.0
+    stand_off_mm: 90.0
+    torch_mm_s: 10.0
+    above_root_mm: 3.0
+    ends_mm: 10.0
+    seam_length_mm: 100.0
+  robot_sigma_mm: 0.03
+  clearance_mm: 8.0
+  near_mm: 70.0
+  far_mm: 100.0
+  half_width_mm: 15.0
+  maximum_time_s: 300.0
 home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
 calibration:
   feature: flange
