@@ -12,12 +12,14 @@ from weldcal.calibration.iterative import COST_AXES, named_cost
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated_tablet import SimulatedTablet
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.mounting_scenario import MountingJob, check_mounting
+from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job
 from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
 from weldcal.welding.laws import get_law
@@ -163,6 +165,8 @@ class Scenario:
     finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
     wrist_camera: RenderedWristCamera | NoDevice = dc.field(default_factory=NoDevice)
     digitizer: SimulatedTablet | NoDevice = dc.field(default_factory=NoDevice)
+    profiler: RenderedProfiler | NoDevice = dc.field(default_factory=NoDevice)
+    profiler_job: ProfilerJob | None = None
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     mounting: MountingJob | None = None
@@ -226,6 +230,9 @@ def check_scenario(scenario: Scenario) -> None:
         )
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
+    asked = [name for name in ("tablet", "mounting", "profiler_job") if getattr(scenario, name) is not None]
+    if len(asked) > 1:
+        raise InputError(f"A scenario is one procedure: take {' or '.join(asked)} out of it, and make another of that.")
     check_tablet(scenario)
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
         raise InputError(
@@ -261,6 +268,14 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
+    if isinstance(scenario.profiler, RenderedProfiler):
+        scenario.profiler.preset()
+    check_profiler_job(
+        scenario.profiler_job,
+        has_profiler=not isinstance(scenario.profiler, NoDevice),
+        has_groove=scenario.workpiece is not None,
+        tool=scenario.tool,
+    )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:

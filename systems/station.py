@@ -20,6 +20,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.profiler_world import ProfilerFixture, ProfilerTruth
+from weldcal.systems.drivers.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.drivers.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.second_arm import PlacedArm, apply_second_robot, place_second_arm
 from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
@@ -40,6 +43,7 @@ class Truth(Message):
     tablet: TabletTruth | None = None  # camera and pen on the wrist and the tablet on the table
     X_LC: RigidTransform | None = None  # the scanner on what carries it, where that is not the base
     X_BD: RigidTransform | None = None  # the second arm's base
+    profiler: ProfilerTruth | None = None
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -134,7 +138,8 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
     `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
-    `query_object`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`.
+    `query_object`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
+    profiler: in `profiler.trigger`, out `profiler.profile`, `torch.touch`.
 
     Raises:
         InputError: the scenario has no robot. A driver adds its own: RobotRefused where the robot does not allow the job.
@@ -157,6 +162,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
     visit = tablet_fittings(scenario, rng)
     second = _second_arm(scenario, rng)
+    fixture = _fixture(scenario, rng, real, X_BP)
     builder = DiagramBuilder()
     world = build_world(
         builder,
@@ -170,9 +176,10 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
         fittings=() if visit is None else (visit,),
         second=second,
         foot=None if scenario.mounting is None else base_circle(scenario.arm),
-        time_step_s=0.002 if scenario.mounting is None else 0.004,  # nothing is touched in a mounting job
+        profiler=fixture,
+        time_step_s=_time_step(scenario, fixture),
     )
-    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, visit)
+    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, visit, fixture)
     if second is not None:
         apply_second_robot(scenario.robot_2, second, build, apply_driver_config)
     apply_driver_config(scenario.robot, build)
@@ -180,14 +187,28 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Statio
     apply_driver_config(scenario.finger_camera, build)
     apply_driver_config(scenario.wrist_camera, build)
     apply_driver_config(scenario.digitizer, build)
+    apply_driver_config(scenario.profiler, build)
     on_base = isinstance(scenario.scanner, NoDevice) or scenario.scanner.mounted_on == "base"
-    X_BD = None if second is None else second.X_BD
-    seen = None if visit is None else visit.truth
-    truth = Truth(X_LC if on_base else None, X_BP, real, seen, X_LC=X_LC, X_BD=X_BD)
+    truth = Truth(
+        X_LC if on_base else None,
+        X_BP,
+        real,
+        None if visit is None else visit.truth,
+        X_LC,
+        None if second is None else second.X_BD,
+        None if fixture is None else fixture.truth,
+    )
     _export(build, truth)
     diagram = builder.Build()
     diagram.set_name("station")
     return Station(diagram, robot, tool, cad, truth, world)
+
+
+def _time_step(scenario: Scenario, fixture: ProfilerFixture | None) -> float:
+    """Of the plant, s: as fine as what is touched asks for, and nothing is touched in a mounting job."""
+    if fixture is not None:
+        return fixture.time_step_s
+    return 0.002 if scenario.mounting is None else 0.004
 
 
 def _second_arm(scenario: Scenario, rng: np.random.Generator) -> PlacedArm | None:
@@ -230,6 +251,17 @@ def _workpieces(
         rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
     )
     return cad, real, spec.pose_guess.pose() @ placed
+
+
+def _fixture(
+    scenario: Scenario, rng: np.random.Generator, real: Workpiece | None, X_BP: RigidTransform | None
+) -> ProfilerFixture | None:
+    """What the profiler looks at, where there is one."""
+    p, job = scenario.profiler, scenario.profiler_job
+    if not isinstance(p, RenderedProfiler) or job is None:
+        return None
+    error = 1e-3 * p.mounting_translation_mm, float(np.deg2rad(p.mounting_rotation_deg))
+    return draw_fixture(drawn_pose(p), *error, job, rng, scenario.calibration.table_z_m, real, X_BP)
 
 
 def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:

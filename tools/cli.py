@@ -14,6 +14,7 @@ from weldcal.tools.benchmarks.cli_profiler import profiler as benchmark_profiler
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_mounting import benchmark_mountings, live
 from weldcal.tools.cli_profiler import profiler
+from weldcal.tools.cli_profiler_live import live as profiler_live
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.cli_cell import cell as reproduce_cell
@@ -44,6 +45,7 @@ benchmarks.command("hand-eye")(cli_hand_eye.benchmark)
 benchmarks.command("mountings")(benchmark_mountings)
 app.add_typer(profiler, name="profiler")
 benchmarks.command("profiler")(benchmark_profiler)
+profiler.command("live")(profiler_live)
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")

@@ -10,6 +10,7 @@ from weldcal.systems.scenario import Scenario, load_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions, run_calibration_live, run_scenario
 from weldcal.tools.mounting_live import run_mounting_live
+from weldcal.tools.profiler_live import run_profiler_live
 from weldcal.tools.tablet_demo import run_tablet_demo
 
 
@@ -29,6 +30,7 @@ JOB = "job"
 PROCEDURES: dict[str, tuple[Callable[[Scenario], bool], Runner]] = {
     "tablet": (lambda scenario: scenario.tablet is not None, run_tablet_demo),
     "mounting": (lambda scenario: scenario.mounting is not None, run_mounting_live),
+    "profiler": (lambda scenario: scenario.profiler_job is not None, run_profiler_live),
 }
 
 

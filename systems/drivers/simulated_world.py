@@ -50,6 +50,7 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.drivers.picture_scene import PictureScene, add_picture_scene
+from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair, add_fixture
 from weldcal.systems.drivers.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
@@ -86,6 +87,7 @@ class SimulatedWorld(Message):
     scanner_view: PictureScene
     finger_view: PictureScene | None
     second: ModelInstanceIndex | None = None  # the second arm of a co-manipulation
+    touch_pair: TouchPair | None = None
 
 
 class Fittings(Protocol):
@@ -245,6 +247,7 @@ def build_world(
     workpiece: Workpiece | None,
     X_BP: RigidTransform | None,
     fittings: Sequence[Fittings] = (),
+    profiler: ProfilerFixture | None = None,
     time_step_s: float = 0.002,
     second: PlacedArm | None = None,
     foot: BaseCircle | None = None,
@@ -258,7 +261,7 @@ def build_world(
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
             time_step=time_step_s,
-            contact_model="hydroelastic",
+            contact_model="hydroelastic" if profiler is None else "point",
             discrete_contact_approximation="lagged",  # with `sap` the tip's rest position depends on the sliding speed
         ),
         builder,
@@ -270,6 +273,7 @@ def build_world(
     second_arm = None if second is None else add_second_arm(plant, second, JOINT_STIFFNESS, JOINT_DAMPING)
     if second_arm is not None:
         _add_flange(plant, second_arm, flange)
+    touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, table_z_m)
     world_body = plant.world_body()
     if foot is not None:
         ring = mesh_shape(flange_mesh(foot.standard, foot.standard.bore_depth_m), "foot.obj")
@@ -280,9 +284,10 @@ def build_world(
         rigid = ProximityProperties()
         AddContactMaterial(friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=rigid)
         AddRigidHydroelasticProperties(resolution_hint=0.002, properties=rigid)
-        plant.RegisterCollisionGeometry(
-            world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
-        )
+        if profiler is None:
+            plant.RegisterCollisionGeometry(
+                world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
+            )
     fitted = [fitting.add(plant, instance) for fitting in fittings]
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
@@ -318,5 +323,5 @@ def build_world(
             background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
         )
     return SimulatedWorld(
-        plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, second_arm
+        plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, second_arm, touch_pair
     )

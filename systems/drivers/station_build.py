@@ -12,6 +12,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 
 if TYPE_CHECKING:
+    from weldcal.systems.drivers.profiler_world import ProfilerFixture
     from weldcal.systems.drivers.simulated_world import SimulatedWorld
     from weldcal.systems.drivers.tablet_world import TabletFittings
 
@@ -54,6 +55,7 @@ class StationBuild:
     world: SimulatedWorld | None = None
     robot: PreparedRobot | None = None
     visit: TabletFittings | None = None  # camera, pen and tablet as they truly are, where there is a tablet
+    profiler: ProfilerFixture | None = None
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
 

@@ -15,6 +15,7 @@ from pydrake.common.yaml import yaml_load
 from pydrake.geometry import FramePoseVector, GeometryId, Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
+from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDataType
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
@@ -28,7 +29,17 @@ from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, Nex
 from weldcal.systems.cell_visualizer import CellVisualizer
 from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.picture_scene import PicturePoses
+from weldcal.systems.drivers.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
+from weldcal.systems.drivers.rendered_profiler import (
+    CheatTorch,
+    ProfilerSensor,
+    ProfileScan,
+    RenderedProfiler,
+    TorchTouch,
+    TouchSensor,
+)
 from weldcal.systems.drivers.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera, WristCamera
 from weldcal.systems.drivers.simulated_tablet import SimulatedTablet, TabletDigitizer
@@ -54,6 +65,10 @@ from weldcal.systems.mounting_procedure import MountingProcedure
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.process_switch import ProcessSwitch
+from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
+from weldcal.systems.profiler_robot_error import RobotError
+from weldcal.systems.profiler_room import Room
+from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.systems.scenario import VisualizationConfig, load_scenario
 from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
@@ -72,6 +87,18 @@ X = RigidTransform()
 IDEAL = get_scanner("ideal", width=206, height=154)
 CALIBRATOR = CalibratorConfig(1e-4, 6, 10, np.zeros(3))
 JOB = JobPlan(True, True, Q_HOME, 10, 1, 5e-4, 1e-4)
+
+
+def profiler_fixture() -> ProfilerFixture:
+    """A fixture with nothing off its drawing."""
+    return draw_fixture(X, 0.0, 0.0, ProfilerJob(), np.random.default_rng(0), 0.0, None, None)
+
+
+def profiler_room() -> Room:
+    """What a procedure without a seam is told."""
+    job = ProfilerJob(stages=["edge"])
+    return Room(the_arm(), job, Q_HOME, X, np.array(job.torch.tip_m), np.array(job.ball.xyz_m))
+
 
 MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
@@ -112,6 +139,11 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
         MountingFitConfig(get_flange("tool-ring-63"), 0.06, False, 6, 1e-4),
         (),
     ),
+    ProfilerSensor: lambda: ProfilerSensor(RenderedProfiler(), profiler_fixture(), BodyIndex(7), 0, 0.004),
+    TouchSensor: lambda: TouchSensor(TouchPair(GeometryId.get_new_id(), GeometryId.get_new_id()), 0.004),
+    CheatTorch: lambda: CheatTorch(profiler_fixture(), BodyIndex(7)),
+    RobotError: lambda: RobotError(the_arm(), 6e-5, 0),
+    ProfilerProcedure: lambda: ProfilerProcedure(profiler_room(), RenderedProfiler(), 0),
     TabletDigitizer: lambda: TabletDigitizer(
         SimulatedTablet(), 5256.0, {GeometryId.get_new_id(), GeometryId.get_new_id()}, X, 0
     ),
@@ -119,6 +151,22 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
 
 # What travels on each port: a vector of that many numbers, or a message of that type.
 KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
+    ProfilerSensor: {"trigger": 1, "body_poses": list, "profile": ProfileScan},
+    TouchSensor: {"contact_results": ContactResults, "touch": TorchTouch},
+    CheatTorch: {"body_poses": list, "torch": 3},
+    RobotError: {"position_measured": 6, "job": JobCommand, "position": 6},
+    ProfilerProcedure: {
+        "position": 6,
+        "history": PoseHistory,
+        "settled_goal": 1,
+        "robot_status": UrStatus,
+        "profile": ProfileScan,
+        "touch": TorchTouch,
+        "job": JobCommand,
+        "creep": 6,
+        "trigger": 1,
+        "state": ProfilerState,
+    },
     TabletProcedure: {
         "position_measured": 6,
         "settled_goal": 1,
@@ -274,6 +322,8 @@ FEEDTHROUGH: dict[type[LeafSystem], set[tuple[str, str]]] = {
     ProcessSwitch: {(i, "process_on") for i in ("torch_wanted", "job", "robot_status", "margin", "hold")},
     PicturePoses: {("body_poses", "frame_poses")},
     CheatPoses: {("body_poses", "contact"), ("body_poses", "torch")},
+    CheatTorch: {("body_poses", "torch")},
+    RobotError: {("position_measured", "position"), ("job", "position")},
 }
 
 # A port that only carries one calculation to two others, and is nobody's to connect.

@@ -6,11 +6,10 @@ import dataclasses as dc
 import re
 import types
 import typing
-from pathlib import Path
 from typing import Any
 
 import pytest
-from pydrake.common.yaml import yaml_dump_typed, yaml_load
+from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
@@ -85,6 +84,51 @@ tablet:
   deepest_mm: 11.0
   turn_deg: 20.0
   tilt_deg: 10.0
+profiler: !RenderedProfiler
+  xyz_m: [0.08, 0.01, 0.05]
+  rpy_deg: [1.0, 0.0, 80.0]
+  mounting_translation_mm: 2.0
+  mounting_rotation_deg: 1.0
+  samples: 300
+  nearest_mm: 55.0
+  farthest_mm: 300.0
+  width_near_mm: 45.0
+  width_far_mm: 150.0
+  noise_mm: 0.05
+  jitter_mm: 0.02
+  quantum_mm: 0.05
+  share_missing: 0.02
+  share_spikes: 0.01
+  grazing_deg: 75.0
+  exposure_s: 0.008
+profiler_job:
+  stages: [sphere, seam]
+  torch: {tip_m: [0.01, 0.0, 0.13], error_mm: 1.0}
+  straightedge:
+    xyz_m: [0.6, 0.0, 0.15]
+    rpy_deg: [5.0, -4.0, 30.0]
+    length_mm: 150.0
+    width_mm: 25.0
+    translation_mm: 2.0
+    rotation_deg: 0.5
+  ball: {xyz_m: [0.65, 0.2, 0.15], radius_mm: 15.0, translation_mm: 2.0}
+  edge: {scans: 20, held_out: 4, tilt_deg: 20.0}
+  sphere: {scans: 20, held_out: 4, touches: 12, tilt_deg: 20.0, descent_mm_s: 5.0, gap_mm: 9.0, deepest_mm: 9.0}
+  seam:
+    passes: 1
+    pass_mm_s: 20.0
+    every_mm: 3.0
+    stand_off_mm: 90.0
+    torch_mm_s: 10.0
+    above_root_mm: 3.0
+    ends_mm: 10.0
+    seam_length_mm: 100.0
+  robot_sigma_mm: 0.03
+  clearance_mm: 8.0
+  near_mm: 70.0
+  far_mm: 100.0
+  half_width_mm: 15.0
+  maximum_time_s: 300.0
 home_deg: [1.0, -81.0, 111.0, -121.0, -91.0, 1.0]
 mounting:
   target_known: false
@@ -146,10 +190,9 @@ ONLY_ONE_CHOICE = {"arm"}  # there is one arm so far: its default cannot be depa
 
 
 @pytest.fixture
-def everything(tmp_path: Path) -> Scenario:
-    path = tmp_path / "everything.yaml"
-    path.write_text(ONE_OF_EVERYTHING, encoding="utf-8")
-    return load_scenario(str(path))
+def everything() -> Scenario:
+    scenario: Scenario = yaml_load_typed(schema=Scenario, data=ONE_OF_EVERYTHING)
+    return scenario
 
 
 def sections(schema: Any) -> list[type]:
@@ -192,10 +235,13 @@ def test_one_of_everything_sets_every_option_and_none_is_lost(everything: Scenar
     assert compare(Scenario, yaml_load(data=ONE_OF_EVERYTHING), everything, Scenario()) == []
 
 
-def test_one_of_everything_survives_being_written_and_read_again(everything: Scenario, tmp_path: Path) -> None:
-    again = tmp_path / "again.yaml"
-    again.write_text(yaml_dump_typed(everything, schema=Scenario), encoding="utf-8")
-    assert load_scenario(str(again)) == everything
+def test_one_of_everything_survives_being_written_and_read_again(everything: Scenario) -> None:
+    assert yaml_load_typed(schema=Scenario, data=yaml_dump_typed(everything, schema=Scenario)) == everything
+
+
+def test_a_scenario_is_one_procedure(everything: Scenario) -> None:
+    with pytest.raises(InputError, match="one procedure"):
+        check_scenario(everything)
 
 
 def test_overrides_change_what_they_name_and_nothing_else() -> None:

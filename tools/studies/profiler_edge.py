@@ -67,13 +67,15 @@ class EdgeRow:
         return bool(self.rotation_deg <= TARGETS[self.name][0] and self.translation_mm <= TARGETS[self.name][1])
 
 
-def edge_rows(name: str, trials: Iterable[EdgeTrial], progress: Callable[[float], None]) -> list[EdgeRow]:
-    """All rows of a set."""
-    found: dict[tuple[int, str], list[Floats]] = {(n, m): [] for n in COUNTS for m in METHODS}
+def edge_rows(
+    name: str, trials: Iterable[EdgeTrial], progress: Callable[[float], None], counts: tuple[int, ...] = COUNTS
+) -> list[EdgeRow]:
+    """All rows of a set, for each of these numbers of orientations."""
+    found: dict[tuple[int, str], list[Floats]] = {(n, m): [] for n in counts for m in METHODS}
     every = list(trials)
     for k, trial in enumerate(every):
         progress(k / len(every))
-        for n in COUNTS:
+        for n in counts:
             few = slice(0, n * TRANSLATIONS)
             poses, points = trial.poses[few], trial.points[few]
             sigma, xz = trial.noise.robot_m, trial.noise.xz_m

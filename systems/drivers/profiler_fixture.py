@@ -1,0 +1,56 @@
+"""How the profiler's fixture really is: pose of the sensor, torch, straightedge and sphere, each off its drawing by the seed."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.profiler_world import (
+    ProfilerFixture,
+    ProfilerTruth,
+    box_mesh,
+    post_mesh,
+    straightedge_mesh,
+    under_straightedge,
+)
+from weldcal.systems.drivers.rendered_scanner import random_pose_error
+from weldcal.systems.profiler_scenario import ProfilerJob, pose_of
+
+
+def draw_fixture(
+    X_FS_drawn: RigidTransform,
+    error_m: float,
+    error_rad: float,
+    job: ProfilerJob,
+    rng: np.random.Generator,
+    table_z_m: float,
+    workpiece: Workpiece | None,
+    X_BP: RigidTransform | None,
+) -> ProfilerFixture:
+    """How the real fixture differs from the drawing, from the seed."""
+    off = random_pose_error(rng, error_m, error_rad)
+    X_FS = RigidTransform(X_FS_drawn.rotation() @ off.rotation(), X_FS_drawn.translation() + off.translation())
+    bent = rng.normal(size=3)
+    tip = np.array(job.torch.tip_m) + 1e-3 * job.torch.error_mm * bent / np.linalg.norm(bent)
+    s = job.straightedge
+    moved = random_pose_error(rng, 1e-3 * s.translation_mm, np.deg2rad(s.rotation_deg))
+    thought = pose_of(s.xyz_m, s.rpy_deg)
+    X_BE = RigidTransform(thought.rotation() @ moved.rotation(), thought.translation() + moved.translation())
+    aside = rng.normal(size=3)
+    center = np.array(job.ball.xyz_m) + 1e-3 * job.ball.translation_mm * aside / np.linalg.norm(aside)
+    radius = 1e-3 * job.ball.radius_mm
+    truth = ProfilerTruth(
+        X_FS, tip, np.array(X_BE.translation()), X_BE.rotation().matrix()[:, 0].copy(), center, radius
+    )
+    meshes = [
+        (straightedge_mesh(1e-3 * s.length_mm, 1e-3 * s.width_mm).transformed(X_BE), 0.0),
+        *(
+            (post_mesh(p, table_z_m), 0.6)
+            for p in (under_straightedge(X_BE, 1e-3 * s.width_mm), center - [0.0, 0.0, 0.9 * radius])
+        ),
+        (box_mesh([0.45, 0.0, table_z_m - 0.02], [1.5, 1.2, 0.04]), 0.6),
+    ]
+    if workpiece is not None and X_BP is not None:
+        meshes.append((workpiece.mesh.transformed(X_BP), 0.0))
+    return ProfilerFixture(truth, X_BE, job, tuple(meshes), X_FS_drawn)

@@ -1,0 +1,273 @@
+"""From what a profiler's job has measured to what it wanted: X_FS by an edge, X_FS and the torch's tip by a sphere, a seam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.profiler.arc import find_arc
+from weldcal.calibration.profiler.edge_features import extract_edge
+from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge_model import EdgeState, measurement_covariance, predicted, whitened
+from weldcal.calibration.profiler.errors import FeatureNotFound
+from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.motion import FlangePoses
+from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, sphere_joint
+from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
+from weldcal.systems.messages import Message
+from weldcal.systems.profiler_scenario import ProfilerJob
+from weldcal.welding.seam import SeamCurve
+
+Array = NDArray[np.float64]
+SMOOTHING_M = 0.004  # waves of a seam shorter than about six times this are taken for noise
+FAR_SIGMAS = 4.0  # of the scatter about the smooth seam: a point beyond is left out
+TRIALS = 3  # rounds of leaving points out
+ARC_SIGMAS = 4.0  # of a sample, within which it is taken for one of the arc
+WINDOW_M = 0.012  # beyond the field and the sphere's radius: further away is another thing
+NEAREST_PERCENT = 3.0  # of a profile's depths: spikes towards the sensor are fewer
+WIDER_M = 0.5e-3  # a circle may be larger than the sphere by the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Taken(Message):
+    """One profile with the joints (6,) rad, as the controller said, at the time it was taken."""
+
+    kind: str
+    q: Array
+    points: Array
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeFound(Message):
+    """X_FS by the edge; scans without an edge; held-out scans: distance from the edge (n,) mm and whitened (n, 2) residuals."""
+
+    estimate: EdgeEstimate
+    poses: FlangePoses
+    points: Array
+    lost: int
+    held_out_mm: Array
+    held_out_sigmas: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SphereFound(Message):
+    """X_FS and the tip by the sphere; which model; held-out scans: rms distance (n,) mm of their points from the sphere."""
+
+    estimate: SphereEstimate
+    data: SphereData
+    model: str
+    lost: int
+    held_out_mm: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SeamFound(Message):
+    """The groove's root as seen (n, 3) m in B, which points were kept (n,), and the smooth curve."""
+
+    points_B: Array
+    kept: NDArray[np.bool_]
+    curve: SeamCurve
+    lost: int
+
+
+def flange_poses(arm: ArmModel, taken: list[Array]) -> FlangePoses:
+    """X_BF for joints, as arrays."""
+    X = [forward_kinematics(arm, q) for q in taken]
+    R, p = np.array([x.rotation().matrix() for x in X]), np.array([x.translation() for x in X])
+    return FlangePoses(R.reshape(-1, 3, 3), p.reshape(-1, 3))
+
+
+def feature_sigmas(p: RenderedProfiler, z_m: float) -> Array:
+    """Sigma (2,) m of an edge's point [x, z], by the sensor's data sheet."""
+    x = float(np.hypot(p.pitch_m(z_m) / np.sqrt(12.0), 1e-3 * p.jitter_mm))
+    few = np.sqrt(6e-3 / p.pitch_m(z_m))
+    z = float(np.hypot(2e-3 * np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0)) / few, 1e-3 * p.jitter_mm))
+    return np.array([x, z])
+
+
+def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
+    """What is known before of the sphere's measurements: what a whole profile is off by counts with the robot's error."""
+    return SphereSigmas(
+        # samples are noisy in z alone, and the arc's normals lean by up to 60 degrees or so from it
+        sensor_m=1e-3
+        * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0)))
+        * np.sqrt(0.5 + 0.75 * np.sqrt(3) / np.pi / 2),
+        # what a whole profile is off by lies in two of three axes
+        robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, np.sqrt(2.0 / 3.0) * p.jitter_mm)),
+        touch_m=1e-3 * job.robot_sigma_mm,
+    )
+
+
+def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple[Taken, ...]) -> EdgeFound:
+    """X_FS by the scans of kind `scan`, held against those of kind `held_out`.
+
+    Raises:
+        WeldcalError: the scans do not show one edge, or do not tell enough; see edge_joint.
+    """
+    sigmas = feature_sigmas(p, 0.5e-3 * (job.near_mm + job.far_mm))
+    robot = 1e-3 * job.robot_sigma_mm
+    seen: dict[str, tuple[list[Array], list[Array]]] = {"scan": ([], []), "held_out": ([], [])}
+    lost = 0
+    for one in taken:
+        try:
+            point, _ = extract_edge(_one_background(one.points, 1e-3 * job.straightedge.width_mm), "bar", "left")
+        except FeatureNotFound:
+            lost += 1
+            continue
+        seen[one.kind][0].append(one.q)
+        seen[one.kind][1].append(point)
+    _enough(len(seen["scan"][1]), taken, "the straightedge's edge")
+    poses, points = flange_poses(arm, seen["scan"][0]), np.array(seen["scan"][1])
+    e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=robot, sigma_xz_m=sigmas)
+    others = flange_poses(arm, seen["held_out"][0])
+    state = EdgeState(e.rotation, e.translation, e.point, e.direction)
+    foretold, J, by_robot = predicted(state, others)
+    left_out = np.array(seen["held_out"][1]).reshape(-1, 2)
+    off = left_out - foretold
+    r, _ = whitened(measurement_covariance(by_robot, robot, sigmas), off, J)
+    at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, left_out)) + others.translation
+    away = at - e.point
+    away -= np.outer(away @ e.direction, e.direction)
+    return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
+
+
+def _enough(found: int, taken: tuple[Taken, ...], what: str) -> None:
+    wanted = sum(one.kind == "scan" for one in taken)
+    if found < 0.5 * wanted:
+        raise FeatureNotFound(
+            f"Only {found} of {wanted} profiles show {what}: check where it stands and how the profiler is mounted."
+        )
+
+
+def _one_background(points: Array, behind_m: float) -> Array:
+    """The profile with all that lies further behind its nearest face put at one depth: of post and table, no edges."""
+    p = points[np.isfinite(points).all(axis=1)]
+    if not len(p):
+        return p
+    nearest = float(np.percentile(p[:, 1], NEAREST_PERCENT))
+    return np.column_stack([p[:, 0], np.minimum(p[:, 1], nearest + behind_m)])
+
+
+def _in_flange(e: EdgeEstimate, points: Array) -> Array:
+    return np.asarray(
+        np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]]) @ e.rotation.T + e.translation
+    )
+
+
+def find_sphere(
+    arm: ArmModel,
+    p: RenderedProfiler,
+    job: ProfilerJob,
+    taken: tuple[Taken, ...],
+    touches: tuple[Array, ...] = (),
+    tip: Array | None = None,
+    first: SphereEstimate | None = None,
+) -> SphereFound:
+    """X_FS by the sphere's profiles; with touches (joints (6,) each) the torch's tip as well, from the first estimate on.
+
+    Raises:
+        WeldcalError: the scans do not show the sphere, or do not tell enough; see sphere_joint.
+    """
+    radius, sigmas = 1e-3 * job.ball.radius_mm, sphere_sigmas(p, job)
+    arcs: dict[str, tuple[list[Array], list[Array]]] = {"scan": ([], []), "held_out": ([], [])}
+    lost = 0
+    for one in taken:
+        window = one.points[one.points[:, 1] < 1e-3 * job.far_mm + radius + WINDOW_M]  # of what stands behind, nothing
+        try:
+            mask, circle, _ = find_arc(window, radius, tolerance_m=ARC_SIGMAS * sigmas.sensor_m)
+        except FeatureNotFound:
+            lost += 1
+            continue
+        if (
+            circle[2] > radius + WIDER_M
+        ):  # a run of samples that is no cut of this sphere: a face, or another thing's edge
+            lost += 1
+            continue
+        arcs[one.kind][0].append(one.q)
+        arcs[one.kind][1].append(window[mask])
+    _enough(len(arcs["scan"][1]), taken, "an arc of the sphere")
+    felt = flange_poses(arm, list(touches)) if touches else None
+    data = SphereData(flange_poses(arm, arcs["scan"][0]), arcs["scan"][1], radius, felt, tip if touches else None)
+    model: Model = "rigid"
+    e = sphere_joint(data, model, sigmas, first)
+    if touches:
+        model, e = _better_model(data, sigmas, e)
+    others = flange_poses(arm, arcs["held_out"][0])
+    rms = []
+    for R, t, arc in zip(others.rotation, others.translation, arcs["held_out"][1], strict=True):
+        distance = np.linalg.norm(e.points_F(arc) @ R.T + t - e.center, axis=1) - radius
+        rms.append(1e3 * float(np.sqrt(np.mean(distance**2))))
+    return SphereFound(e, data, model, lost, np.array(rms))
+
+
+def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate) -> tuple[Model, SphereEstimate]:
+    """Rigid or affine, whichever foretells scans left out better by more than a fiftieth, and its estimate."""
+    names: tuple[Model, ...] = ("rigid", "affine")
+    estimates = {name: sphere_joint(data, name, sigmas, rigid) for name in names}
+    errors = {}
+    for name in names:
+        off = []
+        for k, arc in enumerate(data.profiles):
+            e = sphere_joint(data.without(k), name, sigmas, estimates[name])
+            at = e.points_F(arc) @ data.poses.rotation[k].T + data.poses.translation[k] - e.center
+            off.append(float(np.mean((np.linalg.norm(at, axis=1) - data.radius_m) ** 2)))
+        errors[name] = float(np.sqrt(np.mean(off)))
+    best: Model = "affine" if errors["affine"] < 0.98 * errors["rigid"] else "rigid"
+    return best, estimates[best]
+
+
+def find_seam(
+    arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[Taken, ...], every_m: float
+) -> SeamFound:
+    """The groove's root in B by what was calibrated: points of all passes brought together along the drawn seam, smoothed.
+
+    Points that lie far from their neighbours are left out.
+
+    Raises:
+        WeldcalError: too few profiles show a groove.
+    """
+    points, lost = [], 0
+    for one in taken:
+        try:
+            root = groove_features(one.points).points[1:2]
+        except FeatureNotFound:
+            lost += 1
+            continue
+        points.append(forward_kinematics(arm, one.q).multiply(estimate.points_F(root)[0]))
+    if len(points) < max(8, 0.5 * len(taken)):
+        raise FeatureNotFound(
+            f"Only {len(points)} of {len(taken)} profiles show the groove: check where the workpiece lies."
+        )
+    p = np.array(points)
+    place = np.round(drawn.project(p) / every_m).astype(int)
+    up = drawn.ups[0]
+    smoothing = SMOOTHING_M**4 / every_m
+    kept = np.ones(len(p), bool)
+    curve = SeamCurve.from_points(_means(p, place), up, smoothing)
+    for _ in range(TRIALS):
+        s = curve.project(p)
+        off = np.linalg.norm(p - curve.position(s), axis=1)
+        limit = FAR_SIGMAS * 1.2 * float(np.median(off))  # median of a Rayleigh distance is 1.18 sigma
+        new = off < max(limit, 1e-4)
+        if (new == kept).all():
+            break
+        kept = new
+        curve = SeamCurve.from_points(_means(p[kept], place[kept]), up, smoothing)
+    return SeamFound(p, kept, curve, lost)
+
+
+def _means(p: Array, place: NDArray[np.int_]) -> Array:
+    """The mean point (m, 3) of each place, in their order."""
+    return np.array([p[place == k].mean(axis=0) for k in np.unique(place)])
+
+
+def pose_sigmas(error: RigidTransform, covariance: Array) -> tuple[Array, float]:
+    """An error exp(w), t (estimate to truth, in F) in sigmas of the prediction: each of its six parts, and w^T C^-1 w of all."""
+    angle = error.rotation().ToAngleAxis()
+    e = np.concatenate([angle.angle() * np.asarray(angle.axis()), error.translation()])
+    return e / np.sqrt(np.diag(covariance)), float(e @ np.linalg.solve(covariance, e))

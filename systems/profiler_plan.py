@@ -1,0 +1,256 @@
+"""Where the profiler's job goes: poses of an edge and of a sphere that tell most, touches, and the passes along a seam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from scipy.interpolate import CubicSpline
+
+from weldcal.calibration.profiler.edge_model import EdgeState
+from weldcal.calibration.profiler.motion import FlangePoses
+from weldcal.calibration.profiler.plan import (
+    plan_edge_poses,
+    plan_sphere_poses,
+    sample_edge_poses,
+    sample_sphere_poses,
+)
+from weldcal.calibration.profiler.sphere_model import SphereSigmas
+from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.errors import InputError
+from weldcal.systems.messages import Message
+from weldcal.systems.profiler_room import Room
+from weldcal.systems.profiler_scenario import edge_as_thought
+from weldcal.welding.seam import SeamCurve
+
+Array = NDArray[np.float64]
+CANDIDATES = 160
+FIRST = 5  # poses at random, before the planner has anything to add to
+CAP_RAD = np.radians(55.0)  # of the sphere that is touched, from its top
+SIDE_RAD = np.radians(62.0)  # largest angle between torch and the sphere's normal at a touch
+LEAN_RAD = np.radians(25.0)
+TURN_RAD = np.radians(60.0)
+STATION_M = 0.004  # between joint positions along a pass
+RAMP_S = 0.5  # to a pass's speed and from it
+
+
+@dataclass(frozen=True, eq=False)
+class JointPath(Message):
+    """A way in joint space by its length s: knots (n,) m and joints (n, 6) rad, passed at a speed with ramps at both ends."""
+
+    s: Array
+    q: Array
+    speed: float
+
+    @property
+    def duration(self) -> float:
+        """Seconds from rest to rest."""
+        return float(self.s[-1] / self.speed + RAMP_S)
+
+    def at(self, t: float) -> tuple[Array, Array, float]:
+        """Joints (6,), joint velocity (6,) and s at a time since the start."""
+        T, v = self.duration, self.speed
+        t = min(max(t, 0.0), T)
+        left = T - t
+        if t < RAMP_S:
+            s, ds = 0.5 * v * t * t / RAMP_S, v * t / RAMP_S
+        elif left < RAMP_S:
+            s, ds = float(self.s[-1]) - 0.5 * v * left * left / RAMP_S, v * left / RAMP_S
+        else:
+            s, ds = v * (t - 0.5 * RAMP_S), v
+        return np.asarray(self.curve(s)), np.asarray(self.curve(s, 1)) * ds, float(s)
+
+    @cached_property
+    def curve(self) -> CubicSpline:
+        """q over s."""
+        return CubicSpline(self.s, self.q)
+
+    def backwards(self) -> JointPath:
+        """The same way from its end."""
+        return JointPath(self.s[-1] - self.s[::-1], self.q[::-1].copy(), self.speed)
+
+
+@dataclass(frozen=True, eq=False)
+class Goal(Message):
+    """One thing to do: `via`, `scan`, `touch` (then down along `way`, (3,) unit), or `pass` and `torch` along `path`."""
+
+    kind: str
+    q: Array
+    way: Array | None = None
+    path: JointPath | None = None
+
+
+def plan_edge(room: Room, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
+    """Scans of the straightedge: those that make the profiler surest, and the held-out ones among the rest.
+
+    Raises:
+        InputError: too few poses can be taken.
+    """
+    stage, job = room.job.edge, room.job
+    point, direction = edge_as_thought(job)
+    state = EdgeState(room.X_FS.rotation().matrix(), np.array(room.X_FS.translation()), point, direction)
+    q, poses = _standing(room, sample_edge_poses(state, CANDIDATES, seed, room.field, stage.tilt_deg), "straightedge")
+    first, rest = _split(poses, stage.scans + stage.held_out)
+    plan = plan_edge_poses(
+        state,
+        poses[first],
+        poses[rest],
+        stage.scans - FIRST,
+        sigma_robot_m=1e-3 * job.robot_sigma_mm,
+        sigma_xz_m=sigma_xz_m,
+        field=room.field,
+    )
+    return _scans(room, q_from, q, first, rest, plan.chosen, stage.held_out)
+
+
+def plan_sphere(room: Room, q_from: Array, seed: int, sigmas: SphereSigmas) -> list[Goal]:
+    """The same of the sphere; see plan_edge."""
+    stage = room.job.sphere
+    R, t = room.X_FS.rotation().matrix(), np.array(room.X_FS.translation())
+    candidates = sample_sphere_poses(R, t, room.center, room.radius_m, CANDIDATES, seed, room.field, stage.tilt_deg)
+    q, poses = _standing(room, candidates, "sphere")
+    first, rest = _split(poses, stage.scans + stage.held_out)
+    plan = plan_sphere_poses(
+        R, t, room.center, room.radius_m, poses[first], poses[rest], stage.scans - FIRST, sigmas=sigmas, field=room.field
+    )  # fmt: skip
+    return _scans(room, q_from, q, first, rest, plan.chosen, stage.held_out)
+
+
+def plan_touches(room: Room, q_from: Array, seed: int) -> list[Goal]:
+    """Above points spread over the sphere's upper part, the torch leaning and turned another way at each.
+
+    Raises:
+        InputError: too few of them can be reached.
+    """
+    stage, rng = room.job.sphere, np.random.default_rng([seed, 5])
+    yaw = RollPitchYaw(forward_kinematics(room.arm, room.q_home).rotation()).yaw_angle()
+    q, normals = [], []
+    for k in range(20 * stage.touches):
+        # Fibonacci's lattice: each new point falls into the largest gap of those before
+        cosine = 1.0 - (1.0 - np.cos(CAP_RAD)) * ((k + 0.5) % stage.touches) / stage.touches
+        angle = 2.399963 * k
+        n = np.array([np.sqrt(1.0 - cosine**2) * np.cos(angle), np.sqrt(1.0 - cosine**2) * np.sin(angle), cosine])
+        lean = LEAN_RAD * rng.uniform(-1.0, 1.0, 2)
+        R = RollPitchYaw(np.pi + lean[0], lean[1], yaw + TURN_RAD * rng.uniform(-1.0, 1.0)).ToRotationMatrix()
+        if float(-R.matrix()[:, 2] @ n) < np.cos(SIDE_RAD):
+            continue
+        tip = room.center + (room.radius_m + 1e-3 * stage.gap_mm) * n
+        X = RigidTransform(R, tip - R.multiply(room.p_FTip))
+        found = room.joints(X, room.q_home)
+        if found is not None and room.gap(X) > 0.5e-3 * stage.gap_mm:
+            q.append(found)
+            normals.append(n)
+        if len(q) == stage.touches:
+            break
+    if len(q) < stage.touches:
+        raise InputError("The arm cannot touch the sphere all around where it is thought to stand: move it nearer.")
+    return [
+        Goal("via" if k < 0 else "touch", at, None if k < 0 else -normals[k])
+        for at, k in room.route(q_from, np.array(q))
+    ]
+
+
+def plan_pass(room: Room, q_from: Array) -> list[Goal]:
+    """The profiler along the seam of the drawing, square to the plate, its line across the groove."""
+    assert room.cad is not None
+    assert room.X_BP is not None
+    stage = room.job.seam
+    keep = _stretch(room, np.asarray(room.cad.arc_length_m))
+    seam = room.X_BP.multiply(np.asarray(room.cad.seam_P)[keep].T).T
+    tangents = room.X_BP.rotation().multiply(np.asarray(room.cad.tangents_P)[keep].T).T
+    up = room.X_BP.rotation().matrix()[:, 2]
+    top = seam + room.cad.depth_m * up + 1e-3 * stage.stand_off_mm * up
+    X_SF = room.X_FS.inverse()
+    flange = []
+    for p, t in zip(top, tangents, strict=True):
+        x = np.cross(t, up)
+        flange.append(RigidTransform(RotationMatrix(np.column_stack([x, np.cross(-up, x), -up])), p) @ X_SF)
+    goals = _along(room, q_from, flange, top, 1e-3 * stage.pass_mm_s, "pass")
+    for _ in range(stage.passes - 1):
+        assert goals[-1].path is not None
+        back = goals[-1].path.backwards()
+        goals.append(Goal("pass", back.q[0], path=back))
+    return goals
+
+
+def plan_torch(room: Room, q_from: Array, curve: SeamCurve) -> list[Goal]:
+    """The torch's tip along a seam that was found, upright, the profiler ahead of it."""
+    stage = room.job.seam
+    s = np.arange(0.0, curve.length, STATION_M)
+    tips = curve.position(s) + 1e-3 * stage.above_root_mm * curve.up(s)
+    flange = []
+    for tip, t, up in zip(tips, curve.tangent(s), curve.up(s), strict=True):
+        x = t - (t @ up) * up
+        x /= np.linalg.norm(x)
+        R = RotationMatrix(np.column_stack([x, np.cross(-up, x), -up]))
+        flange.append(RigidTransform(R, tip - R.multiply(room.p_FTip)))
+    return _along(room, q_from, flange, tips, 1e-3 * stage.torch_mm_s, "torch")
+
+
+def _standing(room: Room, candidates: FlangePoses, what: str) -> tuple[Array, FlangePoses]:
+    q, which = room.standing(candidates)
+    if not len(q):
+        raise InputError(f"The arm cannot take the profiler over the {what} where it is thought to stand: move it.")
+    return q, candidates[which]
+
+
+def _split(poses: FlangePoses, wanted: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    if len(poses) < wanted + FIRST:
+        raise InputError(
+            f"Only {len(poses)} poses stand clear and can be reached, too few for {wanted} scans: ask for fewer or for less tilt."
+        )
+    return np.arange(FIRST), np.arange(FIRST, len(poses))
+
+
+def _scans(
+    room: Room,
+    q_from: Array,
+    q: Array,
+    first: NDArray[np.intp],
+    rest: NDArray[np.intp],
+    chosen: tuple[int, ...],
+    held_out: int,
+) -> list[Goal]:
+    taken = [*first, *rest[list(chosen)]]
+    spare = [k for k in rest if k not in taken][:held_out]
+    way = room.route(q_from, q[taken])
+    goals = [Goal("via" if k < 0 else "scan", at) for at, k in way]
+    more = room.route(goals[-1].q, q[spare])
+    return goals + [Goal("via" if k < 0 else "held_out", at) for at, k in more]
+
+
+def _stretch(room: Room, s: Array) -> NDArray[np.bool_]:
+    """Which of the drawing's seam points are passed."""
+    stage = room.job.seam
+    begin, end = 1e-3 * stage.ends_mm, float(s[-1]) - 1e-3 * stage.ends_mm
+    if stage.seam_length_mm is not None:
+        end = min(end, begin + 1e-3 * stage.seam_length_mm)
+    if end - begin < 0.03:
+        raise InputError("The seam that is passed is shorter than 30 mm: lessen seam.ends_mm.")
+    return np.asarray((s >= begin) & (s <= end))
+
+
+def _along(room: Room, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str) -> list[Goal]:
+    """A goal above the beginning, then the path."""
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
+    even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
+    chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
+    joints: list[Array] = []
+    q = room.q_home
+    for k in chosen:
+        found = room.joints(flange[k], q)
+        if found is None:
+            raise InputError("The arm cannot follow the seam where it is thought to lie: move the workpiece nearer.")
+        if joints and float(np.abs(found - q).max()) > 0.5:
+            raise InputError("The arm would have to turn over while it follows the seam: move the workpiece.")
+        joints.append(found)
+        q = found
+    raised = RigidTransform([0.0, 0.0, 0.05]) @ flange[0]
+    above = room.joints(raised, joints[0])
+    ways = [] if above is None else [Goal("via", above)]
+    if above is not None and not room.clear_way(q_from, above):
+        ways = [Goal("via", room.q_home), *ways]
+    return [*ways, Goal(kind, joints[0], path=JointPath(length[chosen], np.array(joints), speed))]

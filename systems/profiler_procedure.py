@@ -1,0 +1,290 @@
+"""ProfilerProcedure: scan the edge, scan and touch the sphere, pass along the groove, and take the torch after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from weldcal.models.arms.kinematics import forward_kinematics, jacobian
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.drivers.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
+from weldcal.systems.messages import JobCommand, Message, UrStatus
+from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.profiler_estimates import (
+    EdgeFound,
+    SeamFound,
+    SphereFound,
+    Taken,
+    feature_sigmas,
+    find_edge,
+    find_seam,
+    find_sphere,
+    sphere_sigmas,
+)
+from weldcal.systems.profiler_plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
+from weldcal.systems.profiler_room import Room
+from weldcal.welding.seam import SeamCurve
+
+Array = NDArray[np.float64]
+DWELL_S = 0.1  # at rest before a profile is taken
+FEEDBACK_PER_S = 8.0  # towards the path
+PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # what each stage does, in order
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilerState(Message):
+    """Where the procedure stands and what it has; `step` is what is being done: edge, sphere, touch, pass, torch."""
+
+    phase: str = "start"  # start, move, dwell, await, descend, lift, run, done, held
+    since: float = 0.0
+    goal_id: int = 0
+    step: str = ""
+    steps_left: tuple[str, ...] = ()
+    goals: tuple[Goal, ...] = ()  # the first is the one at hand
+    sequence: int = 0  # of the newest profile that was asked for
+    seen: int = 0  # of the newest one that came
+    before: int = 0  # profiles there had been when the pass began
+    felt: int = 0  # touches there had been when the descent began
+    taken: tuple[Taken, ...] = ()
+    touches: tuple[Array, ...] = ()
+    edge: EdgeFound | None = None
+    sphere: SphereFound | None = None
+    seam: SeamFound | None = None
+    edge_scans: tuple[Taken, ...] = ()
+    sphere_scans: tuple[Taken, ...] = ()
+    seam_scans: tuple[Taken, ...] = ()
+    torch_from_s: float = np.inf
+    torch_until_s: float = np.inf
+    reason: str = ""
+    room: Room | None = field(default=None)
+
+
+class ProfilerProcedure(LeafSystem):
+    """Runs the stages of the job; a fault, a sphere that is not met or profiles that show nothing hold it with a sentence.
+
+    .. pydrake_system::
+
+        name: ProfilerProcedure
+        input_ports:
+        - position
+        - history
+        - settled_goal
+        - robot_status
+        - profile
+        - touch
+        output_ports:
+        - job
+        - creep
+        - trigger
+        - state
+
+    `job` drives the FlangeMover between goals (mode move), or says that `creep` (6) rad/s does (mode weld): the descent to a
+    touch, the profiler's pass, the torch's. `trigger` (1) is the number of the newest profile asked for.
+    """
+
+    def __init__(self, room: Room, profiler: RenderedProfiler, seed: int, period_s: float = 0.008) -> None:
+        super().__init__()
+        self._room, self._profiler, self._seed = room, profiler, seed
+        self._position = self.DeclareVectorInputPort("position", 6)
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+        self._settled = self.DeclareVectorInputPort("settled_goal", 1)
+        self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
+        self._profile = self.DeclareAbstractInputPort("profile", AbstractValue.Make(ProfileScan()))
+        self._touch = self.DeclareAbstractInputPort("touch", AbstractValue.Make(TorchTouch()))
+        self._state = self.DeclareAbstractState(AbstractValue.Make(ProfilerState(room=room)))
+        out = self.DeclareDiscreteState(np.zeros(6))
+        ticket = {self.abstract_state_ticket(self._state)}
+        self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
+        self.DeclareVectorOutputPort("creep", 6, self._creep, {self.discrete_state_ticket(out)})
+        self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
+        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(ProfilerState()), self._show, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def _update(self, context: Context, state: State) -> None:
+        old: ProfilerState = context.get_abstract_state(self._state).get_value()
+        q = np.array(self._position.Eval(context))
+        try:
+            new = self._next(old, q, context)
+        except WeldcalError as error:  # planning or estimating: the sentence says what to change
+            new = replace(old, phase="held", reason=str(error), since=context.get_time())
+        if new is not old:
+            state.get_mutable_abstract_state(self._state).set_value(new)
+        state.get_mutable_discrete_state().set_value(self._velocity(new, q, context.get_time()))
+
+    def _velocity(self, s: ProfilerState, q: Array, now: float) -> Array:
+        """Straight along a touch's way, or along a path with feedback towards it."""
+        room = s.room or self._room
+        if s.phase == "descend" and s.goals[0].way is not None:
+            v = np.concatenate([np.zeros(3), 1e-3 * room.job.sphere.descent_mm_s * s.goals[0].way])
+            return np.asarray(np.linalg.solve(jacobian(room.arm, q, room.p_FTip), v))
+        if s.phase == "run" and s.goals[0].path is not None:
+            q_path, v_path, _ = s.goals[0].path.at(now - s.since)
+            return np.asarray(v_path + FEEDBACK_PER_S * (q_path - q))
+        return np.zeros(6)
+
+    def _next(self, s: ProfilerState, q: Array, context: Context) -> ProfilerState:
+        now = context.get_time()
+        if s.phase in ("done", "held"):
+            return s
+        status: UrStatus = self._status.Eval(context)
+        if not status.ready:
+            reason = status.fault or "The robot does not obey velocity commands."
+            return replace(s, phase="held", since=now, reason=reason)
+        if s.phase == "start":
+            steps = tuple(step for stage in self._room.job.stages for step in PLANS[stage])
+            return self._begin(replace(s, steps_left=steps), q, now)
+        if s.phase == "move" and s.goal_id == int(self._settled.Eval(context)[0]):
+            return self._arrived(s, q, now, context)
+        if s.phase == "dwell" and now - s.since >= DWELL_S:
+            return replace(s, phase="await", since=now, sequence=s.sequence + 1)
+        if s.phase == "await":
+            s = self._collected(s, context)
+            return self._go_on(s, q, now) if s.seen == s.sequence else s
+        if s.phase == "descend":
+            return self._descending(s, now, context)
+        if s.phase == "lift" and s.goal_id == int(self._settled.Eval(context)[0]):
+            return self._go_on(s, q, now)
+        if s.phase == "run":
+            return self._running(s, q, now, context)
+        return s
+
+    def _arrived(self, s: ProfilerState, q: Array, now: float, context: Context) -> ProfilerState:
+        kind = s.goals[0].kind
+        if kind in ("scan", "held_out"):
+            return replace(s, phase="dwell", since=now)
+        if kind == "touch":
+            touch: TorchTouch = self._touch.Eval(context)
+            return replace(s, phase="descend", since=now, felt=touch.sequence)
+        if kind in ("pass", "torch"):
+            torch = now if kind == "torch" else s.torch_from_s
+            return replace(s, phase="run", since=now, before=s.sequence, torch_from_s=torch)
+        return self._go_on(s, q, now)
+
+    def _collected(self, s: ProfilerState, context: Context) -> ProfilerState:
+        """With the newest profile, once the joints of its time are known."""
+        scan: ProfileScan = self._profile.Eval(context)
+        if scan.sequence <= s.seen:
+            return s
+        history: PoseHistory = self._history.Eval(context)
+        q = history.joints_at(scan.capture_time)
+        if q is None:
+            return s
+        return replace(s, seen=scan.sequence, taken=(*s.taken, Taken(s.goals[0].kind, q, scan.points)))
+
+    def _descending(self, s: ProfilerState, now: float, context: Context) -> ProfilerState:
+        touch: TorchTouch = self._touch.Eval(context)
+        stage = self._room.job.sphere
+        if touch.sequence > s.felt:
+            history: PoseHistory = self._history.Eval(context)
+            q = history.joints_at(touch.time)
+            if q is None:
+                return s
+            return replace(s, phase="lift", since=now, goal_id=s.goal_id + 1, touches=(*s.touches, q))
+        if now - s.since > (stage.gap_mm + stage.deepest_mm) / stage.descent_mm_s:
+            number = len(s.touches) + 1
+            reason = f"The torch met no sphere at touch {number}: check where the sphere stands and its radius."
+            return replace(s, phase="held", since=now, reason=reason)
+        return s
+
+    def _running(self, s: ProfilerState, q: Array, now: float, context: Context) -> ProfilerState:
+        path = s.goals[0].path
+        assert path is not None
+        if s.goals[0].kind == "pass":
+            s = self._collected(s, context)
+            every = self._room.job.seam.every_mm / self._room.job.seam.pass_mm_s
+            due = s.before + int((now - s.since) / every) + 1
+            if s.seen == s.sequence and s.sequence < due and now - s.since < path.duration:
+                s = replace(s, sequence=s.sequence + 1)
+        if now - s.since > path.duration + 0.2 and s.seen == s.sequence:
+            if s.goals[0].kind == "torch":
+                s = replace(s, torch_until_s=now)
+            return self._go_on(s, q, now)
+        return s
+
+    def _go_on(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
+        if len(s.goals) > 1:
+            return replace(s, phase="move", since=now, goal_id=s.goal_id + 1, goals=s.goals[1:])
+        return self._begin(self._concluded(s), q, now)
+
+    def _begin(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
+        """Plan the next step and go to its first goal; home at the end."""
+        room = s.room or self._room
+        if not s.steps_left:
+            if s.step == "home":
+                return replace(s, phase="done", since=now)
+            goals, step = [Goal("via", room.q_home)], "home"
+            left: tuple[str, ...] = ()
+            if s.step == "torch":
+                goals = [Goal("via", self._raised(room, q)), *goals]
+        else:
+            step, *rest = s.steps_left
+            left = tuple(rest)
+            goals = self._planned(s, step, room, q)
+        return replace(
+            s, phase="move", since=now, goal_id=s.goal_id + 1, step=step, steps_left=left, goals=tuple(goals), taken=()
+        )
+
+    def _planned(self, s: ProfilerState, step: str, room: Room, q: Array) -> list[Goal]:
+        if step == "edge":
+            return plan_edge(room, q, self._seed, feature_sigmas(self._profiler, 0.085))
+        if step == "sphere":
+            return plan_sphere(room, q, self._seed, sphere_sigmas(self._profiler, room.job))
+        if step == "touch":
+            return plan_touches(room, q, self._seed)
+        if step == "pass":
+            return plan_pass(room, q)
+        assert s.seam is not None
+        return plan_torch(room, q, s.seam.curve)
+
+    @staticmethod
+    def _raised(room: Room, q: Array) -> Array:
+        up = room.joints(RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(room.arm, q), q)
+        return room.q_home if up is None else up
+
+    def _concluded(self, s: ProfilerState) -> ProfilerState:
+        """What the step that ended tells, and the room as it is known now."""
+        room, p = s.room or self._room, self._profiler
+        if s.step == "edge":
+            found = find_edge(room.arm, p, room.job, s.taken)
+            return replace(s, edge=found, edge_scans=s.taken, room=room.known(X_FS=found.estimate.X_FS))
+        if s.step == "sphere":
+            first = find_sphere(room.arm, p, room.job, s.taken)
+            known = room.known(X_FS=first.estimate.X_FS, center=first.estimate.center)
+            return replace(s, sphere_scans=s.taken, sphere=first, room=known)
+        if s.step == "touch":
+            assert s.sphere is not None
+            before = s.sphere.estimate
+            sphere = find_sphere(room.arm, p, room.job, s.sphere_scans, s.touches, room.p_FTip, before)
+            e = sphere.estimate
+            assert e.tip is not None
+            X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
+            return replace(s, sphere=sphere, room=room.known(X_FS=X, center=e.center, p_FTip=e.tip))
+        if s.step == "pass":
+            assert s.sphere is not None
+            assert room.X_BP is not None
+            assert room.cad is not None
+            drawn = SeamCurve.from_points(np.asarray(room.cad.seam_P)[::4]).transformed(room.X_BP)
+            seam = find_seam(room.arm, s.sphere.estimate, drawn, s.taken, 1e-3 * room.job.seam.every_mm)
+            return replace(s, seam=seam, seam_scans=s.taken)
+        return s
+
+    def _job(self, context: Context, output: Any) -> None:
+        s: ProfilerState = context.get_abstract_state(self._state).get_value()
+        mode = {"move": "move", "lift": "move", "descend": "weld", "run": "weld"}.get(s.phase, "hold")
+        q_goal = s.goals[0].q if s.goals else None
+        output.set_value(JobCommand(s.phase, mode, s.goal_id, q_goal, s.sequence, s.step))
+
+    def _creep(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value())
+
+    def _trigger(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().sequence))
+
+    def _show(self, context: Context, output: Any) -> None:
+        output.set_value(context.get_abstract_state(self._state).get_value())

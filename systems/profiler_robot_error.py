@@ -1,0 +1,40 @@
+"""RobotError: the flange is never quite where the controller says; by how much differs from pose to pose."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
+from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.systems.messages import JobCommand
+
+
+class RobotError(LeafSystem):
+    """Adds to the joints what makes the flange, as the controller has it, differ from where it is: anew for each goal.
+
+    .. pydrake_system::
+
+        name: RobotError
+        input_ports:
+        - position_measured
+        - job
+        output_ports:
+        - position
+
+    Both positions (6) rad. The error of the flange's place is `sigma_m` per axis, its orientation is right; it stays the same
+    as long as the goal does, for the touch after a move as for the whole of a pass.
+    """
+
+    def __init__(self, arm: ArmModel, sigma_m: float, seed: int) -> None:
+        super().__init__()
+        self._arm, self._sigma_m, self._seed = arm, sigma_m, seed
+        self._position = self.DeclareVectorInputPort("position_measured", 6)
+        self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self.DeclareVectorOutputPort("position", 6, self._add)
+
+    def _add(self, context: Context, output: BasicVector) -> None:
+        job: JobCommand = self._job.Eval(context)
+        q = np.array(self._position.Eval(context))
+        shift = self._sigma_m * np.random.default_rng([self._seed, job.goal_id]).standard_normal(3)
+        output.SetFromVector(q + np.linalg.solve(jacobian(self._arm, q), np.concatenate([np.zeros(3), shift])))

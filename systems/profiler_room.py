@@ -1,0 +1,139 @@
+"""What the profiler's planning knows: the arm, the rig on its flange and what stands around, all as thought; and what is clear of what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.profiler.motion import FlangePoses
+from weldcal.calibration.profiler.plan import Field
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import LINKS, ArmModel, forward_kinematics
+from weldcal.models.arms.urdf import Capsule
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
+from weldcal.systems.profiler_scenario import ProfilerJob, pose_of
+
+Array = NDArray[np.float64]
+STEP_RAD = 0.1  # along a move, between places that are looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Poses as drawn or, later, as calibrated: X_FS, the tip in F, the sphere's centre in B; the workpiece's drawing at X_BP."""
+
+    arm: ArmModel
+    job: ProfilerJob
+    q_home: Array
+    X_FS: RigidTransform
+    p_FTip: Array
+    center: Array
+    cad: Workpiece | None = None
+    X_BP: RigidTransform | None = None
+    table_z_m: float = 0.0
+
+    @property
+    def radius_m(self) -> float:
+        """Of the sphere."""
+        return 1e-3 * self.job.ball.radius_mm
+
+    @property
+    def field(self) -> Field:
+        """Where the calibration measures."""
+        return Field(1e-3 * self.job.half_width_mm, 1e-3 * self.job.near_mm, 1e-3 * self.job.far_mm)
+
+    def bodies(self) -> list[Body]:
+        """The arm with the rig on its flange."""
+        at = np.array(self.X_FS.translation())
+        capsules = [
+            Capsule(len(LINKS), np.zeros(3), np.array(self.p_FTip), 0.008),
+            Capsule(len(LINKS), np.array([at[0], at[1], 0.01]), at, 0.030),
+        ]
+        return arm_bodies(self.arm, capsules)
+
+    def gap(self, X_BF: RigidTransform) -> float:
+        """Smallest distance (m) of torch and profiler to what stands around; negative inside."""
+        points, radii = rig_points(self.p_FTip, self.X_FS)
+        p = X_BF.multiply(points.T).T
+        e = self.job.straightedge
+        X_BE, length, width = pose_of(e.xyz_m, e.rpy_deg), 1e-3 * e.length_mm, 1e-3 * e.width_mm
+        gaps = [
+            _to_box(p, X_BE, [-0.5 * length, 0.0, -BEVEL_M], [0.5 * length, width, 0.0]),
+            np.linalg.norm(p - self.center, axis=1) - self.radius_m,
+            _to_post(p, under_straightedge(X_BE, width)),
+            _to_post(p, self.center),
+        ]
+        if self.cad is not None and self.X_BP is not None:
+            x, y, z = self.cad.size_m
+            gaps.append(_to_box(p, self.X_BP, [-0.5 * x, -0.5 * y, -z], [0.5 * x, 0.5 * y, 0.0]))
+        return float((np.min(gaps, axis=0) - radii).min())
+
+    def joints(self, X_BF: RigidTransform, q_near: Array) -> Array | None:
+        """The joints nearest to others; None: out of reach."""
+        return nearest_solution(self.arm, X_BF, q_near)
+
+    def clear_way(self, q_a: Array, q_b: Array) -> bool:
+        """Whether a move straight in joint space keeps torch, profiler and arm off everything."""
+        n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
+        for u in np.linspace(0.0, 1.0, n):
+            if self.gap(forward_kinematics(self.arm, q_a + u * (q_b - q_a))) < 0.5e-3 * self.job.clearance_mm:
+                return False
+        lowest, gap = path_clearance(self.arm, self.bodies(), q_a, q_b, 2.0 * STEP_RAD)
+        return lowest > self.table_z_m and gap > 0.0
+
+    def standing(self, poses: FlangePoses) -> tuple[Array, NDArray[np.intp]]:
+        """Joints (n, 6) of those poses that can be reached and stand clear, and which these are."""
+        q, which = [], []
+        for k, (R, p) in enumerate(zip(poses.rotation, poses.translation, strict=True)):
+            X = RigidTransform(np.vstack([np.column_stack([R, p]), [0.0, 0.0, 0.0, 1.0]]))
+            if self.gap(X) < 1e-3 * self.job.clearance_mm:
+                continue
+            found = self.joints(X, self.q_home)
+            if found is not None:
+                q.append(found)
+                which.append(k)
+        return np.array(q).reshape(-1, 6), np.array(which, dtype=np.intp)
+
+    def route(self, q_from: Array, goals: Array) -> list[tuple[Array, int]]:
+        """A way through all goals (n, 6), each the nearest of the rest: (joints, number of the goal or -1 for home between).
+
+        Raises:
+            InputError: a goal has no clear way, not even from home.
+        """
+        here, left, way = q_from, list(range(len(goals))), []
+        while left:
+            k = min(left, key=lambda j: float(np.abs(goals[j] - here).max()))
+            left.remove(k)
+            if not self.clear_way(here, goals[k]):
+                if not (self.clear_way(here, self.q_home) and self.clear_way(self.q_home, goals[k])):
+                    continue
+                way.append((self.q_home, -1))
+            way.append((goals[k], k))
+            here = goals[k]
+        if sum(k >= 0 for _, k in way) < 0.8 * len(goals):
+            raise InputError(
+                "Too many of the profiler's poses have no clear way: put the objects further apart in profiler_job."
+            )
+        return way
+
+    def known(self, **changes: object) -> Room:
+        """The same with what has been found out."""
+        return replace(self, **changes)  # type: ignore[arg-type]
+
+
+def _to_box(p: Array, X: RigidTransform, low: list[float], high: list[float]) -> Array:
+    q = X.inverse().multiply(p.T).T
+    outside = np.maximum(np.maximum(low - q, q - high), 0.0)
+    inside = np.minimum(np.minimum(q - low, high - q).min(axis=1), 1.0)
+    return np.asarray(np.where(inside > 0.0, -inside, np.linalg.norm(outside, axis=1)))
+
+
+def _to_post(p: Array, top: Array) -> Array:
+    below = np.maximum(p[:, 2] - top[2], 0.0)
+    beside = np.maximum(np.hypot(p[:, 0] - top[0], p[:, 1] - top[1]) - POST_RADIUS_M, 0.0)
+    return np.asarray(np.hypot(below, beside))
