@@ -109,6 +109,28 @@ def test_a_sphere_with_touches_by_both_methods_and_what_was_written_is_read_back
     assert "likely wrong in scans [14]" in text
 
 
+def test_scans_without_the_sphere_are_left_out_and_poses_turned_round_are_told(tmp_path: Path) -> None:
+    d = sphere_trial(SphereWorld.made(5, CLEAN), 500, touches=8, views=0).data
+    T = np.tile(np.eye(4), (20, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = d.poses.rotation, d.poses.translation
+    profiles = np.array(d.profiles)
+    profiles[7, :, 1] = 0.2
+    np.savez(tmp_path / "s.npz", T=T[:, :3], profiles=profiles, radius=d.radius_m, unit="m")
+    answer = found("sphere", tmp_path / "s.npz", "--model", "rigid", "--out", tmp_path / "a")
+    assert answer["without_sphere"] == [7]
+    np.savez(tmp_path / "i.npz", T=np.linalg.inv(T), profiles=np.array(d.profiles), radius=d.radius_m, unit="m")
+    code, text = called("sphere", tmp_path / "i.npz", "--model", "rigid", "--out", tmp_path / "b")
+    assert code == 1
+    assert "turned round" in text
+    np.savez(tmp_path / "t.npz", T=np.swapaxes(T, 1, 2), profiles=np.array(d.profiles), radius=d.radius_m, unit="m")
+    code, text = called("sphere", tmp_path / "t.npz", "--out", tmp_path / "b")
+    assert code == 1
+    assert "transposed" in text
+    np.savez(tmp_path / "r.npz", T=T, profiles=np.array(d.profiles), radius=d.radius_m + 0.001, unit="m")
+    _, text = called("sphere", tmp_path / "r.npz", "--model", "rigid", "--out", tmp_path / "c")
+    assert "check the radius" in text
+
+
 def test_a_groove_is_mapped_with_what_was_calibrated(tmp_path: Path) -> None:
     found("edge", edge_csv(tmp_path / "e.csv"), "--out", tmp_path / "cal")
     x = np.linspace(-0.02, 0.02, 300)

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.profiler.arc import find_arc, fit_circle
-from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import (
     ArcNotFound,
     DegenerateMotion,
@@ -114,7 +114,49 @@ def test_a_scan_of_something_else_is_named() -> None:
     _, trial, start = clean()
     profiles = list(trial.data.profiles)
     profiles[3] = profiles[3] + np.array([0.0, 1.5 * MM])
-    assert sphere_joint(replace(trial.data, profiles=profiles), "rigid", SIGMAS, init=start).wrong_poses == (3,)
+    e = sphere_joint(replace(trial.data, profiles=profiles), "rigid", SIGMAS, init=start)
+    assert e.wrong_poses == (3,)
+    assert e.reduced_chi2 == pytest.approx(1.0, abs=0.15)  # it is left out, and the rest agrees
+
+
+def test_the_arms_errors_move_the_flange_as_their_derivatives_say() -> None:
+    world, trial, _ = clean()
+    q = trial.data.q
+    assert q is not None
+    values = 1e-3 * np.random.default_rng(9).standard_normal(ARM_ERRORS)
+    loads, point, h = world.nominal.loads(q), np.array([0.1, -0.2, 0.3]), 1e-6
+
+    def at(v: np.ndarray) -> np.ndarray:
+        X = world.nominal.with_errors(q, ArmErrors.of(v), loads)
+        return X.rotation @ point + X.translation
+
+    w, v = world.nominal.twists(q, ArmErrors.of(values), loads)
+    for k in range(ARM_ERRORS):
+        step = h * np.eye(ARM_ERRORS)[k]
+        found = (at(values + step) - at(values - step)) / (2.0 * h)
+        np.testing.assert_allclose(np.cross(w[:, k], at(values)) + v[:, k], found, atol=1e-7)
+
+
+def test_touches_of_one_spot_or_one_circle_leave_the_centre_open() -> None:
+    world, trial, _ = clean()
+    felt = trial.data.touches
+    assert felt is not None
+    turn = np.linspace(0.0, 2.0 * np.pi, 20)
+    for lean in (0.0, 0.1, 10.0):  # the top, a ring around it, the equator
+        n = np.column_stack([lean * np.cos(turn), lean * np.sin(turn), np.ones(20)])
+        p = world.center + RADIUS_M * n / np.linalg.norm(n, axis=1, keepdims=True)
+        p_BF = p - felt.rotation @ world.tip + 4e-5 * np.random.default_rng(10).standard_normal((20, 3))
+        with pytest.raises(DegenerateMotion, match="one spot or one circle"):
+            fit_touch_sphere(felt.rotation, p_BF, world.tip, RADIUS_M)
+
+
+def test_a_radius_that_is_not_the_spheres_is_told_by_the_profiles() -> None:
+    _, trial, start = clean()
+    wrong = sphere_joint(
+        replace(trial.data, touches=None, tip=None, radius_m=RADIUS_M + 0.3 * MM), "rigid", SIGMAS, start
+    )
+    assert wrong.radius_change_m == pytest.approx(-0.3 * MM, abs=5 * wrong.radius_sigma_m)
+    assert wrong.radius_sigma_m < 0.03 * MM
 
 
 def test_positions_on_a_line_are_refused() -> None:

@@ -148,7 +148,7 @@ def over_seeds(lines: Sequence[Line]) -> bytes:
         axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
                   label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
         if line.fixed is not None:
-            axes.plot(line.fixed.value / line.target, k, "D", ms=5, mfc="none", mec=PAPER, mew=1.4,
+            axes.plot(line.fixed.value / line.target, k, "D", ms=5, mfc="none", mec="black", mew=1.4,
                       label="the fixed files" if k == 0 else None)  # fmt: skip
     axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
     axes.set_yticks(range(len(lines)), [f"{line.what}, {line.target:g} {line.unit}" for line in lines], fontsize=8)
