@@ -29,6 +29,7 @@ from weldcal.tools.tablet_report import visit_report
 from weldcal.tools.tablet_run import run_visit
 
 Array = NDArray[np.float64]
+MOST_LEAN_RAD = 0.15  # of the pen at them
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
 
 
@@ -132,8 +133,10 @@ def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> d
     """The fit against the truth that only the simulation knows: camera, pen, and touches of points never seen before.
 
     An unseen touch: the camera sees a point of the tablet from where the picture was taken, the hand is sent to where the
-    fit puts the pen on it, in any turn; what counts is where the true pen then is, in the tablet's plane.
+    fit puts the pen on it, in any turn and leaning no more than the visit's touches did; what counts is where the true pen then
+    is, in the tablet's plane.
     """
+    lean = min(MOST_LEAN_RAD, float(np.deg2rad(cell.tablet.tilt_deg)))
     truth, rng = cell.truth, np.random.default_rng([seed, 1])
     X_BF = forward_kinematics(cell.station.arm, visit.state.q_look)
     points = rng.uniform([0.0, 0.0], cell.tablet.landmarks_m().max(axis=0), (UNSEEN, 2))
@@ -143,7 +146,7 @@ def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> d
         p_B = truth.X_BT.multiply(np.r_[p, 0.0])
         p_C = (X_BF @ truth.X_FC).inverse().multiply(p_B)
         R = RollPitchYaw(
-            np.pi + rng.uniform(-0.15, 0.15), rng.uniform(-0.15, 0.15), rng.uniform(-np.pi, np.pi)
+            np.pi + rng.uniform(-lean, lean), rng.uniform(-lean, lean), rng.uniform(-np.pi, np.pi)
         ).ToRotationMatrix()
         tip = seen_point(fit, X_BF, p_C[:2] / p_C[2]) + R.multiply(truth.p_FP - fit.p_FP)
         misses.append(1e3 * float(np.linalg.norm(R_T.T @ (tip - p_B))))

@@ -125,13 +125,12 @@ def calibration_report(
         worst = f"largest {fixed(held_out['max'], 3)}; never used"
         cards.insert(0, ("The file's queries, mean", fixed(held_out["mean"], 3), "mm", "good", worst))
     sentence = f"Left-out landmarks are missed by {fixed(mean, 2)} mm." if left else "Nothing could be left out."
-    tone = "warn" if result.warnings or result.unobservable else "good"
     return render(
         "tablet.html.j2",
         page=Page(
             title="Camera and pen by a tablet",
             subtitle=f"Model: {_MODELS.get(result.model, result.model)}.",
-            verdict=(tone, "Camera and pen are found" + (", with reserve" if tone == "warn" else ""), sentence),
+            verdict=_verdict(result, sentence),
             cards=cards,
             notes=(*result.warnings, *result.unobservable),
             arrows=miss_arrows(shown),
@@ -179,7 +178,7 @@ def visit_report(
     return render(
         "tablet.html.j2",
         page=Page(
-            verdict=("good", "Camera and pen are found", f"Points nobody touched are met within {fixed(unseen['max'], 2)} mm."),
+            verdict=_verdict(result, f"Points nobody touched are met within {fixed(unseen['max'], 2)} mm."),
             cards=cards,
             notes=(*result.warnings, *result.unobservable),
             truth=_truth(cell, found),
@@ -193,6 +192,13 @@ def visit_report(
             **common,
         ),
     )  # fmt: skip
+
+
+def _verdict(result: TabletResult, sentence: str) -> tuple[str, str, str]:
+    """Tone, headline and what is to be said with it."""
+    if result.warnings or result.unobservable:
+        return ("warn", "Camera and pen are found, with reserve", sentence)
+    return ("good", "Camera and pen are found", sentence)
 
 
 def _truth(cell: TabletCell, found: Mapping[str, Any]) -> list[tuple[str, ...]]:

@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from weldcal.calibration.tablet.planar_files import load_planar
+from weldcal.calibration.tablet.two_stage import Sign
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.tablet_world import TabletTrial, simulate_trial
+from weldcal.tools.tablet_planar import VisitFits, best_model, fit_visit
 
 Fields = dict[str, Any]
 PER_LANDMARK = ("uv", "depth", "hand", "theta_deg", "delta_px", "tablet_px")
@@ -75,14 +78,18 @@ def test_hands_that_are_finer_are_not_fitted_as_intervals(tmp_path: Path) -> Non
     assert run(tmp_path, d, "--hand-step-mm", "1")["hand_step_mm"] == 1.0
 
 
-QUICK = ("--hand-step-mm", "0")  # without the interval fit, and its leaving out
+def fitted(path: Path, d: Fields) -> VisitFits:
+    """The fits of a file with these fields, without the command's report; hands are taken as they are."""
+    np.savez(path / "touches.npz", **d)
+    (visit,) = load_planar(path / "touches.npz").visits
+    return fit_visit(visit, Sign.CORRECTED, 0.0)
 
 
 @lru_cache(maxsize=1)
-def run_plain() -> dict[str, Any]:
-    """What the command says of the trial that the tests below change."""
+def fitted_plain() -> VisitFits:
+    """The fits of the trial that the tests below change."""
     with tempfile.TemporaryDirectory() as folder:
-        return run(Path(folder), fields(simulate_trial((5, 3))), *QUICK)
+        return fitted(Path(folder), fields(simulate_trial((5, 3))))
 
 
 def only(d: Fields, rows: list[int]) -> Fields:
@@ -108,9 +115,9 @@ TURNED = np.array([[0.0, -1.0], [1.0, 0.0]])
 )
 def test_how_it_is_written_makes_no_difference(tmp_path: Path, changed: Callable[[Fields], Fields]) -> None:
     d = fields(simulate_trial((5, 3)))
-    said = run(tmp_path, changed(d), *QUICK)
-    assert said["model"] == "pnp"
-    assert said["held_out_mm"]["mean"] == pytest.approx(run_plain()["held_out_mm"]["mean"], abs=0.05)
+    found = fitted(tmp_path, changed(d))
+    assert best_model([found])[0] == "pnp"
+    assert found.held_out_mm("pnp").mean() == pytest.approx(fitted_plain().held_out_mm("pnp").mean(), abs=0.05)
 
 
 def test_four_landmarks_are_enough_and_leave_nothing_out(tmp_path: Path) -> None:
@@ -132,8 +139,8 @@ def test_four_landmarks_are_enough_and_leave_nothing_out(tmp_path: Path) -> None
 )
 def test_what_looks_wrong_is_told(tmp_path: Path, changed: Callable[[Fields], Fields], warning: str) -> None:
     d = fields(simulate_trial((5, 3)))
-    assert run_plain()["warnings"] == []
-    told = run(tmp_path, changed(d), *QUICK)["warnings"]
+    assert fitted_plain().warnings == ()
+    told = fitted(tmp_path, changed(d)).warnings
     assert len(told) == 1
     assert re.search(warning, told[0]), told
 
