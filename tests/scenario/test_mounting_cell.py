@@ -137,7 +137,7 @@ def test_the_result_folder_is_whole(report: MountingReport) -> None:
     assert (report.folder / "station.png").read_bytes()[:4] == b"\x89PNG"
     assert len((report.folder / "sightings.csv").read_text().splitlines()) == 1 + len(report.run.status.seen)
     page = (report.folder / "report.html").read_text()
-    assert "pose of the camera in the arm link frame: X_LC" in page
+    assert "Pose of the camera in the arm link frame: X_LC" in page
     assert "Next best pose" in page
 
 
