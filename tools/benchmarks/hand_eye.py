@@ -267,7 +267,8 @@ def degenerate(seed: int = 0) -> dict[str, str]:
 
 
 def speed(n: int = 200, repeats: int = 7) -> dict[str, float]:
-    """Milliseconds (best of some) that each method takes for ``n`` poses in this process."""
+    """Milliseconds of processor time (best of some) that each method takes for ``n`` poses in this process: what else runs on
+    the machine does not count."""
     problem, _ = simulated("eye_in_hand", n, np.random.default_rng(0), float(np.radians(0.05)), 2e-4)
     tasks: dict[str, Callable[[], object]] = {"weldcal": lambda: solve_problem(problem, config=_PLAIN)}
     tasks |= {m: partial(opencv_solve, m, problem.F, problem.G) for m in METHODS}
@@ -275,9 +276,9 @@ def speed(n: int = 200, repeats: int = 7) -> dict[str, float]:
     for name, task in tasks.items():
         times = []
         for _ in range(repeats if name == "weldcal" else 3):
-            begin = time.perf_counter()
+            begin = time.process_time()
             task()
-            times.append(time.perf_counter() - begin)
+            times.append(time.process_time() - begin)
         out[name] = 1e3 * min(times)
     return out
 
