@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
+from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
 from weldcal.calibration.handeye.problem import NAMES, Problem, State
@@ -72,19 +72,21 @@ def _distinct(stated: list[Array], extent: float) -> int:
     """Number of poses no two of which are the same within 0.1 deg and 0.2 % of the motion."""
     n = len(stated[0])
     limit = SAME_PLACE_SHARE * max(extent, 1e-12)
-    same = np.ones((n, n), dtype=bool)
+    near = cKDTree(np.concatenate([X[:, :3, 3] for X in stated], axis=1)).query_pairs(
+        limit * np.sqrt(len(stated)), output_type="ndarray"
+    )
+    a, b = near[:, 0], near[:, 1]
+    same = np.ones(len(near), dtype=bool)
     for X in stated:
         # chordal distance 2 sqrt(2) sin(angle / 2) of rotation matrices
-        same &= cdist(X[:, :3, :3].reshape(n, 9), X[:, :3, :3].reshape(n, 9)) < np.sqrt(2.0) * SAME_TURN_RAD
-        same &= cdist(X[:, :3, 3], X[:, :3, 3]) < limit
-    if int(same.sum()) == n:  # each is like itself alone
-        return n
+        turned = np.linalg.norm((X[a, :3, :3] - X[b, :3, :3]).reshape(-1, 9), axis=1)
+        moved = np.linalg.norm(X[a, :3, 3] - X[b, :3, 3], axis=1)
+        same &= (turned < np.sqrt(2.0) * SAME_TURN_RAD) & (moved < limit)
     left = np.ones(n, dtype=bool)
-    count = 0
-    while left.any():
-        left &= ~same[int(np.argmax(left))]
-        count += 1
-    return count
+    for i, j in near[same][np.argsort(a[same], kind="stable")]:
+        if left[i]:  # the first of its like stands for them
+            left[j] = False
+    return int(left.sum())
 
 
 def check_poses(problem: Problem, *, allow_coplanar: bool = False) -> Diversity:

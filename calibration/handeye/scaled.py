@@ -17,7 +17,7 @@ _HUBER = 2.0  # in sigma per axis
 _STUDENT = 5.0  # degrees of freedom of the heavy-tailed loss
 TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
 RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the sightings do not fix
-_VARIANCE_STEPS = 6
+_VARIANCE_STEPS = 2
 _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
 
 

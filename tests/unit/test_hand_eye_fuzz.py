@@ -20,8 +20,8 @@ QUICK = HandEyeConfig(folds=0)
 
 
 def test_random_worlds_never_get_a_nan_or_a_confident_wrong_answer() -> None:
-    said = fuzz(10, seed=1)
-    assert sum(sum(c.values()) for c in said.values()) == 10
+    said = fuzz(8, seed=3)
+    assert sum(sum(c.values()) for c in said.values()) == 8
     assert not any(c["NAN"] or c["WRONG"] for c in said.values())
     # tidy worlds are solved, not refused
     assert said["none"]["refused"] == said["none"]["named"] == 0
