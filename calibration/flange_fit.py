@@ -24,6 +24,8 @@ __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit
 Array = NDArray[np.float64]
 
 _GOOD_COVERAGE = 0.8  # a face seen this well, with its bore, ends the search
+_WARP = 0.2  # and so much of that along the normal: a scanner's warp tilts a half more than it tilts the whole
+_OUT_OF_ROUND_M = 7e-5  # per axis, from half of an edge: halves of recorded clouds against the whole ones
 
 
 @dataclass(frozen=True)
@@ -208,8 +210,12 @@ def _result(face: Face) -> FlangeFit:
     axes = np.column_stack(plane_axes(face.plane.normal))
     circles = [face.outer] + ([face.bore] if face.bore is not None else [])
     center, cov = fuse([c.center for c in circles], [c.covariance[:2, :2] for c in circles])
+    # edges of real faces are no perfect circles: round the whole of one it averages out, over a half it moves the centre
+    missing = max(_GOOD_COVERAGE - face.coverage, 0.0) / (_GOOD_COVERAGE - 0.5)
+    cov = cov + (_OUT_OF_ROUND_M * missing) ** 2 * np.eye(2)
     # the plane pivots about the middle of its points, where `center` is measured from
     along = face.plane.rms**2 / face.plane.n_inliers + (face.plane.normal_sigma * float(np.linalg.norm(center))) ** 2
+    along += (_WARP * _OUT_OF_ROUND_M * missing) ** 2
     point = face.plane.point + axes @ center
     normal = face.plane.normal if float(face.plane.normal @ point) < 0 else -face.plane.normal
     n_rim = sum(int(c.inliers.sum()) for c in circles)
