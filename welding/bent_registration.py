@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces import Workpiece
-from weldcal.welding.bent_face import BentFace, find_bent_faces, unrolled
+from weldcal.welding.bent_face import BentFace, find_bent_faces, rolled, unrolled
 from weldcal.welding.outline_fit import by_the_edge, inward_normals, outermost, slide
 from weldcal.welding.planes import Floats, into, point_pitch, thinned
 from weldcal.welding.pose_covariance import (
@@ -43,6 +43,7 @@ RADIUS_SHARE = 0.15  # how far the radius of a face that is looked at may be fro
 MOST_SAG_M = 0.0006  # by how much the part may sag against its drawing from its middle to its ends
 FACE_POINTS = 4000
 COARSE_POINTS = 60_000
+FORM_M, FORM_WAVES = 3e-5, 10
 
 
 def flattened(workpiece: Workpiece) -> Workpiece:
@@ -117,10 +118,7 @@ def _refine(
     """Pose, inset and covariance from a pose good to a few millimetres; then the check against the drawing."""
     radius, outline = workpiece.bend_radius_m, workpiece.outline_P
     core = outline * (1.0 - 0.012 / np.abs(outline).max())
-    slant = USUAL_SLANT_RAD
-    if eye_B is not None:
-        sight = eye_B - X_BP.translation()
-        slant = math.acos(min(1.0, float(sight @ X_BP.rotation().matrix()[:, 2]) / float(np.linalg.norm(sight))))
+    slants = _slants(outline, radius, None if eye_B is None else into(X_BP, eye_B[None])[0])
     inset, fit_rms, noise, band = 0.0, math.inf, 0.0, 0.0
     covariance = np.zeros((6, 6))
     u = unrolled(into(X_BP, points), radius)
@@ -152,7 +150,7 @@ def _refine(
         step = max(1, len(flat) // FACE_POINTS)
         crowd = points_per_independent(u[flat], point_pitch(u[flat][:, :2])) / step
         seen = _Seen(p[flat[::step]], edge_p[rims[:, 2].astype(np.int64)], edges, pitch, noise, crowd)
-        X_PP, inset, fit_rms, covariance = _fit(seen, outline, radius, slant)
+        X_PP, inset, fit_rms, covariance = _fit(seen, outline, radius, slants)
         X_BP = X_BP @ X_PP
     u = into_plate(X_BP, points, workpiece)
     inside = inside_loops(u[:, :2], [core])
@@ -173,15 +171,20 @@ def _refine(
     )
 
 
-def _fit(seen: _Seen, outline: Floats, radius: float, slant_rad: float) -> tuple[RigidTransform, float, float, Floats]:
+def _fit(
+    seen: _Seen, outline: Floats, radius: float, slants_rad: Floats
+) -> tuple[RigidTransform, float, float, Floats]:
     """The small motion of P in P that fits face and rims, the inset, the rms of the rims about the outline, and the
     covariance (6,6), rotation then translation.
     """
     a, inward = outline[seen.edges], inward_normals(outline)[seen.edges]
     pitch = seen.pitch
-    face_sigma = max(seen.noise, 1e-5) * math.sqrt(max(seen.crowd, 1e-3))
-    common = math.sqrt(
-        pitch**2 * (EDGE_PITCHES**2 + (SLANT_PITCHES * math.tan(slant_rad)) ** 2) + (EDGE_NOISES * seen.noise) ** 2
+    # However many its points: the plate is no cylinder to less than that, in a few long waves.
+    face_sigma = math.hypot(
+        max(seen.noise, 1e-5) * math.sqrt(max(seen.crowd, 1e-3)), FORM_M * math.sqrt(len(seen.face) / FORM_WAVES)
+    )
+    common = np.sqrt(
+        pitch**2 * (EDGE_PITCHES**2 + (SLANT_PITCHES * np.tan(slants_rad)) ** 2) + (EDGE_NOISES * seen.noise) ** 2
     )
     counts = np.bincount(seen.edges, minlength=len(outline))
     rim_sigma = np.hypot(SCATTER_PITCHES * pitch, common * np.sqrt(counts))[seen.edges]
@@ -216,10 +219,23 @@ def _fit(seen: _Seen, outline: Floats, radius: float, slant_rad: float) -> tuple
         mine = seen.edges == edge
         hidden = max(0.0, (SCATTER_PITCHES * pitch) ** 2 - float(np.var(rims[mine])))
         together = (G[:, n:-1][:, mine] / rim_sigma[mine]).sum(axis=1)
-        middle += np.outer(together, together) * (hidden + common**2)
+        middle += np.outer(together, together) * (hidden + common[edge] ** 2)
     covariance = middle[:6, :6] + np.diag([0.0] * 5 + [HEIGHT_FLOOR_M**2])
     X = RigidTransform(RollPitchYaw(fit.x[:3]), fit.x[3:6])
     return X, float(fit.x[6]), float(np.sqrt(np.mean(np.square(rims)))), np.asarray(covariance)
+
+
+def _slants(outline: Floats, radius: float, eye_P: Floats | None) -> Floats:
+    """For each edge (k,) the angle between the face's normal at its middle and the sight: the ends of the plate lean."""
+    middle = 0.5 * (outline + np.roll(outline, -1, axis=0))
+    angle = middle[:, 0] / radius
+    if eye_P is None:
+        return np.asarray(np.abs(angle) + USUAL_SLANT_RAD)
+    at = rolled(np.column_stack([middle, np.zeros(len(middle))]), radius)
+    sight = eye_P - at
+    up = np.column_stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)])
+    cosine = np.sum(sight * up, axis=1) / np.linalg.norm(sight, axis=1)
+    return np.asarray(np.arccos(np.clip(cosine, math.cos(math.radians(75.0)), 1.0)))
 
 
 def _same_bend(u: Floats, workpiece: Workpiece, noise: float) -> None:
