@@ -28,6 +28,7 @@ SMOOTHING_M = 0.004  # waves of a seam shorter than about six times this are tak
 FAR_SIGMAS = 4.0  # of the scatter about the smooth seam: a point beyond is left out
 TRIALS = 3  # rounds of leaving points out
 ARC_SIGMAS = 4.0  # of a sample, within which it is taken for one of the arc
+ARC_COSINE = 0.84  # rms over 60 degrees to both sides: samples are noisy in z alone, and an arc's normals lean from it
 WINDOW_M = 0.012  # beyond the field and the sphere's radius: further away is another thing
 NEAREST_PERCENT = 3.0  # of a profile's depths: spikes towards the sensor are fewer
 WIDER_M = 0.5e-3  # a circle may be larger than the sphere by the noise
@@ -93,12 +94,9 @@ def feature_sigmas(p: RenderedProfiler, z_m: float) -> Array:
 def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
     """What is known before of the sphere's measurements: what a whole profile is off by counts with the robot's error."""
     return SphereSigmas(
-        # samples are noisy in z alone, and the arc's normals lean by up to 60 degrees or so from it
-        sensor_m=1e-3
-        * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0)))
-        * np.sqrt(0.5 + 0.75 * np.sqrt(3) / np.pi / 2),
-        # what a whole profile is off by lies in two of three axes
-        robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, np.sqrt(2.0 / 3.0) * p.jitter_mm)),
+        sensor_m=1e-3 * ARC_COSINE * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0))),
+        # what a whole profile is off by lies in its plane, and so do most of the normals
+        robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, p.jitter_mm)),
         touch_m=1e-3 * job.robot_sigma_mm,
     )
 

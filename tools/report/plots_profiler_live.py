@@ -81,7 +81,7 @@ def torch_bars(seeds: Sequence[int], paths: Sequence[PathOutcome], limit_mm: flo
     axes.bar(x, [p.distance_mm.max() for p in paths], color="#e3c3ae", width=0.7, label="largest")
     axes.bar(x, [p.distance_mm.mean() for p in paths], color=RUST, width=0.7, label="mean")
     axes.axhline(limit_mm, color="#a8402f", linewidth=1, linestyle=":")
-    axes.annotate(f"{limit_mm:g} mm", (-0.5, limit_mm), fontsize=9, va="bottom", color="#a8402f")
+    axes.annotate(f"{limit_mm:g} mm", (-0.35, limit_mm), fontsize=9, va="bottom", color="#a8402f")
     axes.set_xticks(x, [str(s) for s in seeds])
     axes.set_xlabel("seed")
     axes.set_ylabel("torch off the true line, mm")

@@ -71,16 +71,16 @@ def seeds_report(
 _COLUMNS = {
     "seed": "seed",
     "state": "",
-    "edge_error_mm": "edge: error, mm",
-    "edge_sigma_mm": "sigma, mm",
+    "edge_error_mm": "edge, mm",
+    "edge_sigma_mm": "sigma",
     "edge_nees": "NEES",
-    "sphere_error_mm": "sphere: error, mm",
-    "sphere_sigma_mm": "sigma, mm",
+    "sphere_error_mm": "sphere, mm",
+    "sphere_sigma_mm": "sigma",
     "sphere_nees": "NEES",
-    "largest_sigmas": "largest part, sigma",
+    "largest_sigmas": "largest",
     "sphere_tip_error_mm": "tip, mm",
-    "torch_mean_mm": "torch mean, mm",
-    "torch_max_mm": "torch max, mm",
+    "torch_mean_mm": "torch, mm",
+    "torch_max_mm": "at most",
 }
 
 
@@ -104,4 +104,4 @@ def _row(name: str, p: PoseOutcome) -> tuple[str, ...]:
 
 
 def _shown(value: object) -> str:
-    return fixed(value, 3) if isinstance(value, float) else "–" if value is None else str(value)
+    return fixed(value, 2) if isinstance(value, float) else "–" if value is None else str(value)
