@@ -118,7 +118,7 @@ def solve(
             loss=c.loss,
             keep=keep,
             hold_centre=bool(fits),
-            begin=near.lin if fits else None,
+            begin=near.lin if np.array_equal(near.keep, keep) else None,
         )
     squares = _left_out(fits)
     agreed = _alike(fits, squares)
@@ -202,10 +202,10 @@ def most_promising(problem: Problem, pool: list[tuple[str, State]], tries: int) 
     ranked.sort(key=lambda r: r[:2])
     best: tuple[State | None, float, str] = (None, np.inf, "")
     for _, _, name, state in ranked[:tries]:
-        state, cost = descend(problem, state)
-        if cost < best[1] * (1.0 - 1e-6):
+        state, cost = descend(problem, state, tolerance=1e-4)
+        if cost < best[1] * (1.0 - 1e-3):
             best = (state, cost, name)
-        elif cost < best[1] * (1.0 + 1e-4):
+        elif cost < best[1] * (1.0 + 1e-3):
             break  # the same valley from another start
     return best
 
