@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +12,25 @@ from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
 from weldcal.tools.benchmarks.cli_profiler import profiler as benchmark_profiler
 from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
 from weldcal.tools.cli_mounting import benchmark_mountings, live
+from weldcal.tools.cli_options import (
+    BrowserOption,
+    CorrectionOption,
+    DebugOption,
+    DryRunOption,
+    JsonOption,
+    OutOption,
+    PaceOption,
+    RealtimeOption,
+    RobotOption,
+    ScenarioOption,
+    SeedOption,
+    SpeedFactorOption,
+    finish,
+    fresh_folder,
+)
 from weldcal.tools.cli_profiler import profiler
 from weldcal.tools.cli_profiler_live import live as profiler_live
+from weldcal.tools.cli_robot import mount as mount_robot
 from weldcal.tools.cli_robots import robots
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.cli_cell import cell as reproduce_cell
@@ -33,7 +49,6 @@ app = typer.Typer(
 benchmarks = typer.Typer(help="Speed tables.", no_args_is_help=True)
 app.add_typer(benchmarks, name="benchmark")
 app.add_typer(reproduce, name="reproduce")
-app.command("robots")(robots)
 reproduce.command("cell")(reproduce_cell)
 app.add_typer(tablet, name="tablet")
 benchmarks.command("tablet")(benchmark_tablet)
@@ -47,62 +62,7 @@ app.add_typer(profiler, name="profiler")
 benchmarks.command("profiler")(benchmark_profiler)
 profiler.command("live")(profiler_live)
 
-OutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
-]
-SeedOption = Annotated[
-    int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")]
-BrowserOption = Annotated[
-    bool,
-    typer.Option(
-        "--browser/--no-browser", help="Open the live 3D view in the web browser, or not.", show_default="open it"
-    ),
-]
-RobotOption = Annotated[
-    str | None,
-    typer.Option(
-        "--robot",
-        metavar="ROBOT",
-        help="simulated, emulated (a controller on loopback), or the address of a controller.",
-        show_default="the scenario's",
-    ),
-]
-DryRunOption = Annotated[
-    bool,
-    typer.Option(
-        "--dry-run", help="Only look at the robot, then run on a simulated arm like it: nothing is sent to it."
-    ),
-]
-PaceOption = Annotated[
-    float | None,
-    typer.Option(
-        "--pace", metavar="P", help="Emulated controller only: its seconds per second of the clock, 0.05 to 1."
-    ),
-]
-SpeedFactorOption = Annotated[
-    float | None,
-    typer.Option(
-        "--speed-factor", metavar="X", help="Make the arm's moves slower: 0.05 to 1. The weld keeps its speed."
-    ),
-]
-AddressOption = Annotated[
-    str, typer.Option("--address", metavar="ADDRESS", help="Loopback address 127.x.y.z of the emulated controller.")
-]
-CorrectionOption = Annotated[
-    bool,
-    typer.Option(
-        "--scanner-correction/--no-scanner-correction",
-        help="Of a dataset: look for the scanner's own scale error, or take its scans as they are.",
-    ),
-]
-RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
 DEMO_SCENARIO = "s_groove"
-ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
-]
 
 
 def main() -> None:
@@ -343,100 +303,6 @@ def benchmark_seeds(
     finish("benchmark seeds", summary, folder, json_wanted=json)
 
 
-@benchmarks.command("robot-faults")
-def benchmark_robot_faults(
-    sequences: Annotated[int, typer.Option("--sequences", metavar="N", min=0, help="Random fault sequences.")] = 20,
-    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Length of each.")] = 60.0,
-    address: AddressOption = "127.0.0.1",
-    out: OutOption = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """Every fault of the robot link at 0.05 m/s on an emulated controller: does the arm stop, stay, and say why."""
-    folder = out or fresh_folder("benchmark", "robot-faults", seed)
-    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark robot-faults") as progress:
-        from weldcal.tools.benchmarks.robot_faults import run_fault_benchmark
-
-        report = run_fault_benchmark(
-            folder, address=address, sequences=sequences, seconds=seconds, seed=seed, progress=progress
-        )
-    rows = {outcome.name: outcome.line for outcome in report.outcomes}
-    finish("benchmark robot-faults", report.summary(), folder, json_wanted=json, rows=rows)
-
-
-@benchmarks.command("robot")
-def benchmark_robot(
-    minutes: Annotated[float, typer.Option("--minutes", metavar="M", min=0.05, help="Length of the stream.")] = 10.0,
-    address: AddressOption = "127.0.0.1",
-    out: OutOption = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """A 125 Hz command stream to an emulated controller: periods, latencies, and every deadline missed by 20 ms."""
-    folder = out or fresh_folder("benchmark", "robot", seed)
-    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark robot") as progress:
-        from weldcal.tools.benchmarks.robot import run_robot_benchmark
-
-        report = run_robot_benchmark(folder, address=address, minutes=minutes, seed=seed, progress=progress)
-    finish("benchmark robot", report.summary(), folder, json_wanted=json)
-
-
-@app.command("emulate-ur", short_help="A UR controller on loopback.")
-def emulate_ur(
-    polyscope: Annotated[
-        str, typer.Option("--polyscope", metavar="VERSION", help="Controller version: 5.12, 5.21, 10.7 ...")
-    ] = "5.21",
-    kinematics: Annotated[
-        Path | None, typer.Option("--kinematics", metavar="FILE", help="A robot's factory calibration.")
-    ] = None,
-    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="Loopback address 127.x.y.z.")] = "127.0.0.1",
-    control_port: Annotated[
-        int, typer.Option("--control-port", metavar="PORT", help="Where faults are injected, as JSON lines.")
-    ] = 30090,
-    pace: Annotated[
-        float, typer.Option("--pace", metavar="P", help="Controller seconds per host second, 0.05 to 1.")
-    ] = 1.0,
-    seed: SeedOption = 0,
-    debug: DebugOption = False,
-) -> None:
-    """A UR controller on loopback that executes the URScript it is sent; runs until it is interrupted."""
-    with console.boundary(json_wanted=False, debug=debug):
-        from weldcal.tools.ur_emulator.main import run_emulator
-
-        run_emulator(
-            host=host,
-            control_port=control_port,
-            polyscope=polyscope,
-            kinematics=kinematics,
-            pace=pace,
-            seed=seed,
-            ready=typer.echo,
-        )
-
-
-@app.command("check-robot", short_help="Is this robot ready? Looks, moves nothing.")
-def check_robot(
-    host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """Is this robot ready? A table of what is right and what to change; nothing moves and nothing is written."""
-    with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.systems.drivers.ur.preflight import preflight
-        from weldcal.tools.check_robot import as_json, emit_table
-
-        report = preflight(host)
-        if json:
-            console.emit_json(as_json(report))
-        else:
-            emit_table(report)
-    if report.first_problem is not None:
-        console.emit_warning(report.first_problem.remedy)
-        raise typer.Exit(1)
-
-
 @app.command(short_help="Show a finished run again.")
 def view(
     result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],
@@ -462,32 +328,5 @@ def view(
                 typer.echo(str(page))
 
 
-def fresh_folder(command: str, name: str, seed: int) -> Path:
-    """The first unused weldcal-out/<command>-<name>-seed<N>[-2, -3 ...]: an earlier result is never written over."""
-    first = Path("weldcal-out") / f"{command}-{Path(name).stem}-seed{seed}"
-    folder, number = first, 1
-    while folder.exists():
-        number += 1
-        folder = first.with_name(f"{first.name}-{number}")
-    return folder
-
-
-def finish(
-    command: str,
-    summary: Mapping[str, object],
-    folder: Path,
-    *,
-    json_wanted: bool,
-    rows: Mapping[str, str] | None = None,
-) -> None:
-    """Reports the outcome (with --json as JSON, else in rows) and ends with exit code 1 unless its `state` is done."""
-    state = str(summary.get("state", "done"))
-    if json_wanted:
-        console.emit_json(summary)
-    else:
-        console.emit_summary(
-            f"{command}: {state}", {**console.rows(summary), **(rows or {}), "written to": str(folder)}
-        )
-    if state != "done":
-        console.emit_warning(str(summary.get("reason") or f"The {command} ended {state}; the report says why."))
-        raise typer.Exit(1)
+app.command("robots")(robots)
+mount_robot(app, benchmarks)

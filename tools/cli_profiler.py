@@ -196,13 +196,13 @@ def _sphere(
 
 
 def _folder(out: Path | None, file: Path, seed: int) -> Path:
-    from weldcal.tools.cli import fresh_folder
+    from weldcal.tools.cli_options import fresh_folder
 
     return out or fresh_folder("profiler", file.stem, seed)
 
 
 def _report(command: str, found: Mapping[str, object], folder: Path, json: bool) -> None:
-    from weldcal.tools.cli import finish
+    from weldcal.tools.cli_options import finish
 
     rows = {}
     after = found.get("next_poses")

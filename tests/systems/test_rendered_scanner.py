@@ -75,7 +75,8 @@ def scan_of_the_plate(width: int = 824, height: int = 616) -> Scan:
     builder = DiagramBuilder()
     config = RenderedScanner("ideal", width, height, [0.0, 0.0, DISTANCE_M], [180.0, 0.0, 0.0], 0.0, 0.0, 0.0)
     scene = a_scene(builder)
-    world: Any = _OnlyAScene(scene, PictureScene(scene, SCANNER_RENDERER, {}))
+    still: Any = None  # nobody moves in it
+    world: Any = _OnlyAScene(scene, PictureScene(scene, SCANNER_RENDERER, {}, still))
     build = StationBuild(builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), world)
     assert ApplyDriverConfig(config, build).IsNearlyEqualTo(X_BC, 1e-12)
     builder.ExportInput(build.inputs["scanner.trigger"], "trigger")
