@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array, dot
+from weldcal.welding.vectors import Array, dot, within
 
 
 class GuardError(InputError):
@@ -159,9 +159,9 @@ def slew_limit(v_des: ArrayLike, v_prev: Array, a_prev: Array, limits: SlewLimit
         wanted = np.zeros_like(v_prev)
     speed, top = np.asarray(limits.speed, dtype=float), np.asarray(limits.acceleration, dtype=float)
     step = np.asarray(limits.jerk, dtype=float) * dt
-    gap = np.clip(wanted, -speed, speed) - v_prev
+    gap = within(wanted, -speed, speed) - v_prev
     # With m whole jerk steps to undo afterwards, a tick at `a` and the fall gain dt((m+1)a - step m(m+1)/2) = |gap|.
     m = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.abs(gap) / (step * dt)) - 1.0))
     a_wish = np.sign(gap) * (np.abs(gap) / dt + 0.5 * step * m * (m + 1.0)) / (m + 1.0)
-    a = np.clip(np.clip(a_wish, -top, top), a_prev - step, a_prev + step)
+    a = within(within(a_wish, -top, top), a_prev - step, a_prev + step)
     return v_prev + a * dt, a

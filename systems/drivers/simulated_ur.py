@@ -12,8 +12,12 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobia
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
+from weldcal.welding.vectors import within
 
 _LARGEST_MM = 1.0  # an arm that misses by more is broken, not unrepeatable
+
+
+READY = UrStatus()
 
 
 @dc.dataclass
@@ -78,15 +82,12 @@ class SpeedJointServo(LeafSystem):
         measured = self._arm_state.Eval(context).copy()
         command = self._command.Eval(context)
         fault = old[25]
-        if (
-            not np.all(np.isfinite(command))
-            or np.max(np.abs(old[:6] - measured[:6])) > self._config.following_error_rad
-        ):
+        if not np.isfinite(command).all() or np.abs(old[:6] - measured[:6]).max() > self._config.following_error_rad:
             fault = 1.0
-        wanted = np.zeros(6) if fault else np.clip(command, -self._arm.velocity_limit, self._arm.velocity_limit)
+        wanted = np.zeros(6) if fault else within(command, -self._arm.velocity_limit, self._arm.velocity_limit)
         step = self._arm.acceleration_limit * dt
-        v_ref = old[6:12] + np.clip(wanted - old[6:12], -step, step)
-        q_ref = np.clip(old[:6] + dt * v_ref, self._arm.position_lower, self._arm.position_upper)
+        v_ref = old[6:12] + within(wanted - old[6:12], -step, step)
+        q_ref = within(old[:6] + dt * v_ref, self._arm.position_lower, self._arm.position_upper)
         own = old[26:].copy()
         if own.size:
             if not old[6:12].any() and v_ref.any():  # it sets off
@@ -125,7 +126,7 @@ class SpeedJointServo(LeafSystem):
             if fault
             else None
         )
-        output.set_value(UrStatus(safety_mode="PROTECTIVE_STOP" if fault else "NORMAL", fault=text))
+        output.set_value(UrStatus(safety_mode="PROTECTIVE_STOP", fault=text) if fault else READY)
 
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
