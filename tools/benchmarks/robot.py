@@ -90,9 +90,9 @@ class Tap:
                 self._stepped = None
         return found
 
-    def command(self, qd: NDArray[np.float64]) -> int:
+    def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
         """As the link's."""
-        number, now = self.link.command(qd), time.monotonic()
+        number, now = self.link.command(qd, process), time.monotonic()
         self.command_times.append(now)
         if qd[STEP_JOINT] != self._wanted:
             self._stepped = (now, self._wanted, float(qd[STEP_JOINT]))
