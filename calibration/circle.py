@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.calibration.circle_steps import MAD as _MAD
+from weldcal.calibration.circle_steps import TUKEY as _TUKEY
+from weldcal.calibration.circle_steps import circle_steps
 from weldcal.calibration.errors import CircleFitError
 
 Array = NDArray[np.float64]
-
-_TUKEY = 4.685  # 95 % efficient on Gaussian noise
-_MAD = 1.4826  # median absolute deviation -> standard deviation of a Gaussian
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def fit_circle(
 
 
 def refine_circles(
-    edges: Sequence[Array],
+    edges: Sequence[Array | NDArray[np.float32]],
     radii: Sequence[float],
     *,
     noise_floor: float,
@@ -104,66 +104,20 @@ def refine_circles(
     fixed: NDArray[np.bool_] | None = None,
 ) -> list[CircleFit]:
     """Circles about the origin of their points (N_k, 2) [m], as ``fit_circle`` refines them from radii [m] that are
-    right to a millimetre or so, all at once: most of a small fit's time is the number of its steps, not their size.
-    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
+    right to a millimetre or so. Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
     settled = 1e-2 * noise_floor if settled is None else settled
-    longest = max(len(e) for e in edges)
-    q = np.zeros((len(edges), 2, longest))
-    real = np.zeros((len(edges), longest), dtype=bool)
-    for k, e in enumerate(edges):
-        q[k, :, : len(e)], real[k, : len(e)] = e.T, True
-    n = real.sum(axis=1)
-    rows = np.arange(len(edges))
-    theta = np.column_stack([np.zeros((len(edges), 2)), radii])
-    J = np.empty((len(edges), 3, longest))
-    J[:, 2] = 1.0
-    if fixed is not None:
-        J[fixed, 2] = 0.0
-    for k in range(7):
-        d = q - theta[:, :2, None]
-        rho = np.sqrt((d * d).sum(axis=1)) + 1e-15
-        e = rho - theta[:, 2:]
-        size = np.abs(e)
-        if k < 3:
-            scale = np.maximum(_MAD * np.sort(np.where(real, size, np.inf), axis=1)[rows, n // 2], noise_floor)
-        t = e / (_TUKEY * scale[:, None])
-        inside = np.maximum(1.0 - t * t, 0.0) * real
-        w = inside * inside
-        J[:, :2] = d / rho[:, None]
-        weighted = J * w[:, None]
-        normal = weighted @ J.transpose(0, 2, 1)
-        if fixed is not None:
-            normal[fixed, 2, 2] = np.maximum(w[fixed].sum(axis=1), 1e-9)
-        # one check after the start: a step that leads astray ends in a matrix that cannot be inverted, or far off
-        if k < 2 and not (np.abs(np.linalg.det(normal)) > 1e-9 * normal[:, 2, 2] ** 3).all():
-            raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
-        try:
-            step = np.linalg.solve(normal, weighted @ e[:, :, None])[:, :, 0]
-        except np.linalg.LinAlgError:
-            raise CircleFitError("The points do not fix a circle: they cover too short an arc.") from None
-        theta = theta + step
-        if k > 2 and float(np.abs(step).max()) < settled:
-            break
-    psi = e * w
-    dpsi = np.where(inside > 0.0, inside * (1.0 - 5.0 * t * t), 0.0).sum(axis=1) / n
-    variance = (psi * psi).sum(axis=1) / np.maximum(n - 3, 1) / np.maximum(dpsi, 0.2) ** 2
-    J *= real[:, None]
-    information = J @ J.transpose(0, 2, 1)
-    if fixed is not None:
-        information[fixed, 2, 2] = 1.0
-    try:
-        covariance = variance[:, None, None] * np.linalg.inv(information)
-    except np.linalg.LinAlgError:
-        raise CircleFitError("The points do not fix a circle: they cover too short an arc.") from None
-    if not np.isfinite(theta).all():
-        raise CircleFitError("No circle agrees with enough of the points.")
-    if fixed is not None:
-        covariance[fixed, 2, 2] = 0.0
     out = []
-    for k in range(len(edges)):
-        inliers = inside[k, : n[k]] > 0.0
-        rms = float(np.sqrt((e[k, : n[k]] ** 2 * inliers).sum() / max(int(inliers.sum()), 1)))
-        out.append(CircleFit(theta[k, :2], float(theta[k, 2]), covariance[k], rms, inliers))
+    for k, (edge, radius) in enumerate(zip(edges, radii, strict=True)):
+        x, y = np.ascontiguousarray(edge.T, dtype=float)
+        free = 2 if fixed is not None and fixed[k] else 3
+        fixes, theta, information, variance, rms, inliers = circle_steps(x, y, radius, free, noise_floor, settled)
+        if not fixes:
+            raise CircleFitError("The points do not fix a circle: they cover too short an arc.")
+        if not np.isfinite(theta).all():
+            raise CircleFitError("No circle agrees with enough of the points.")
+        covariance = np.zeros((3, 3))
+        covariance[:free, :free] = variance * np.linalg.inv(information[:free, :free])
+        out.append(CircleFit(theta[:2], float(theta[2]), covariance, rms, inliers))
     return out
 
 

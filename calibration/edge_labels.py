@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from weldcal.calibration.border_likelihood import WRONG as _WRONG
+from weldcal.calibration.border_likelihood import border_likelihood
 from weldcal.calibration.circle import CircleFit
 from weldcal.calibration.errors import CircleFitError
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
-_WRONG = 0.02  # share of labels that may be plainly wrong (flying pixels)
 _SCALES = (0.4, 0.16, 0.06)  # width of the border, in pitches: from easy to sharp
 _SETTLED = 0.05  # gain of the log likelihood below which a step is the last
 
@@ -70,7 +72,7 @@ def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, A
 
 
 def refine_pair(
-    places: Sequence[Array], on_face: Sequence[NDArray[np.bool_]], starts: Sequence[CircleFit], pitch: float
+    places: Sequence[Single], on_face: Sequence[NDArray[np.bool_]], starts: Sequence[CircleFit], pitch: float
 ) -> list[CircleFit]:
     """The outer edge and the bore of one face, as ``refine_circle`` finds them from pixels (2, N_k) m, both at once.
 
@@ -78,26 +80,21 @@ def refine_pair(
     their border, which is the scanner's, and the number of steps. Single precision: a millionth of a pixel. Raises
     CircleFitError.
     """
-    split = places[0].shape[1]
-    J = np.ones((3, split + places[1].shape[1]), dtype=np.float32)
-    xy = np.concatenate(places, axis=1).astype(np.float32)
-    side = np.concatenate([np.where(on_face[0], -1.0, 1.0), np.where(on_face[1], 1.0, -1.0)]).astype(np.float32)
-    parts = (slice(0, split), slice(split, J.shape[1]))
     theta = np.array([[0.0, 0.0, s.radius] for s in starts])
-    now = _pair_likelihood(xy, side, parts, theta, _SCALES[0] * pitch, J)
+    now = _pair_likelihood(places, on_face, theta, _SCALES[0] * pitch)
     theta = theta + np.linalg.solve(now[2], now[1][:, :, None])[:, :, 0]
     widths = [s * pitch for s in _SCALES]
-    now, sharper = (_pair_likelihood(xy, side, parts, theta, w, J) for w in widths[:2])
+    now, sharper = (_pair_likelihood(places, on_face, theta, w) for w in widths[:2])
     width = widths[0]
     if sharper[0] > now[0]:
         now, width = sharper, widths[1]
     while True:
         for _ in range(4):
             step = np.linalg.solve(now[2], now[1][:, :, None])[:, :, 0]
-            new = _pair_likelihood(xy, side, parts, theta + step, width, J)
+            new = _pair_likelihood(places, on_face, theta + step, width)
             while new[0] < now[0] and float(np.abs(step).max()) > 1e-2 * width:
                 step = 0.4 * step
-                new = _pair_likelihood(xy, side, parts, theta + step, width, J)
+                new = _pair_likelihood(places, on_face, theta + step, width)
             gain = new[0] - now[0]
             if gain < 0.0:
                 break
@@ -107,7 +104,7 @@ def refine_pair(
         if width != widths[1]:
             break
         width = widths[2]
-        sharper = _pair_likelihood(xy, side, parts, theta, width, J)
+        sharper = _pair_likelihood(places, on_face, theta, width)
         if sharper[0] < now[0]:
             break  # sharper than the border is
         now = sharper
@@ -123,33 +120,12 @@ def refine_pair(
 
 
 def _pair_likelihood(
-    xy: NDArray[np.float32],
-    side: NDArray[np.float32],
-    parts: tuple[slice, slice],
-    theta: Array,
-    width: float,
-    J: NDArray[np.float32],
+    places: Sequence[Single], on_face: Sequence[NDArray[np.bool_]], theta: Array, width: float
 ) -> tuple[float, Array, Array]:
-    """Log likelihood of both circles theta (2, 3), its gradient (2, 3) and information (2, 3, 3); J (3, N) is worked in."""
-    for s, t in zip(parts, theta.astype(np.float32), strict=True):
-        np.subtract(xy[:, s], t[:2, None], out=J[:2, s])
-    rho = np.sqrt(J[0] * J[0] + J[1] * J[1])
-    J[:2] *= np.float32(1.0) / (rho + np.float32(1e-12))
-    for s, t in zip(parts, theta.astype(np.float32), strict=True):
-        rho[s] -= t[2]
-    across = side * np.float32(-1.0 / width)
-    z = rho * across
-    squared = z * z
-    # Phi by tanh, right to 2e-4: ndtr takes ten times as long
-    p = np.float32(0.5) - np.float32(0.5 - _WRONG) * np.tanh(
-        z * (np.float32(0.7978845608) + np.float32(0.0356774081) * squared)
-    )
-    slope = np.float32((1.0 - 2.0 * _WRONG) / np.sqrt(2.0 * np.pi)) * np.exp(np.float32(-0.5) * squared)
-    toward = across * slope / p
-    heavy = J * (across * slope / (np.float32(1.0) - p) * toward)
-    gradient = np.array([J[:, s] @ toward[s] for s in parts], dtype=np.float64)
-    information = np.array([heavy[:, s] @ J[:, s].T for s in parts], dtype=np.float64)
-    return float(np.log(p).sum(dtype=np.float64)), gradient, information
+    """Log likelihood of both circles theta (2, 3), its gradient (2, 3) and information (2, 3, 3)."""
+    outer = border_likelihood(places[0], on_face[0], True, theta[0], width)
+    bore = border_likelihood(places[1], on_face[1], False, theta[1], width)
+    return outer[0] + bore[0], np.stack([outer[1], bore[1]]), np.stack([outer[2], bore[2]])
 
 
 def _likelihood(xy: Array, side: Array, theta: Array, width: float) -> tuple[float, Array, Array]:

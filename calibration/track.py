@@ -14,13 +14,14 @@ from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.face import Face, FlangeFitConfig, Measured, Refusal, clear_band, judge, lowered_by, thickness
 from weldcal.calibration.plane import PlaneFit, shared_noise
 from weldcal.calibration.rim import plane_axes
+from weldcal.calibration.track_loops import borders, near_edge, plane_steps, ring_points
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-_TUKEY, _MAD = 4.685, 1.4826
+_TUKEY = 4.685
 _SLACK_M = 0.003  # that the centre may have moved sideways
 _PLANE_POINTS = 2500
 _BLOCK = 4  # pixels a side; what such a block's middle says of the ring and the bore is enough
@@ -32,7 +33,6 @@ _FLAT_M = 3e-4  # rms of a face from its plane; a rougher one is for the careful
 _EDGE_POINTS = 240  # crossings that place a circle well enough to look at the pixels about it
 _BENT = 0.05  # pixels: a lens that bends rays more is for the careful way, which knows quadratics
 _THREE = np.ones((3, 3), np.uint8)
-_BLOCK_V, _BLOCK_U = (a.ravel() for a in np.mgrid[0:_BLOCK, 0:_BLOCK].astype(np.int32))
 
 
 def fit_tracked(
@@ -134,49 +134,24 @@ def _plane(
     ring = np.pi * (standard.face_outer_radius_m**2 - standard.face_inner_radius_m**2)
     pitch2 = abs(rays[1, 0] * rays[2, 1] - rays[1, 1] * rays[2, 0]) * float(center[2]) ** 2
     step = max(1, int(np.sqrt(ring / pitch2 / _PLANE_POINTS) + 0.3))
-    part = z[::step, ::step]
-    h, w = part.shape
+    shape = tuple(-(-n // step) for n in z.shape)
     axes = np.empty((3, 3))
     axes[:, 0], axes[:, 1] = plane_axes(normal)
     axes[:, 2] = normal
-    # rays in the axes of the expected plane
-    turned, at = (rays @ axes).astype(np.float32), (center @ axes).astype(np.float32)
-    u, v = (np.arange(0, n * step, step, dtype=np.float32) for n in (w, h))
-    x, y, d = (part * ((turned[0, k] + turned[1, k] * u) + (turned[2, k] * v)[:, None]) - at[k] for k in range(3))
-    rho2 = x * x + y * y
     inner, outer = standard.face_inner_radius_m + 0.001, standard.face_outer_radius_m - 0.001
-    with np.errstate(invalid="ignore"):
-        on = np.flatnonzero((rho2 > inner**2) & (rho2 < outer**2) & (np.abs(d) < 4.0 * config.hypothesis_tolerance_m))
+    tolerance = config.hypothesis_tolerance_m
+    # in the axes of the expected plane
+    p, on = ring_points(z, rays @ axes, center @ axes, step, inner, outer, 4.0 * tolerance)
     if len(on) < config.min_points:
         return None
-    A = np.ones((3, len(on)))
-    A[1], A[2] = x.ravel()[on], y.ravel()[on]
-    d = d.ravel()[on].astype(np.float64)
-    few = max(1, len(on) // 600)
-    B, b = A[:, ::few], d[::few]
-    fit = np.array([float(np.partition(b, len(b) // 2)[len(b) // 2]), 0.0, 0.0])
-    scale = 2.0 * config.hypothesis_tolerance_m / _TUKEY
-    for k in range(4):  # a part of the points finds the plane; then all of them
-        if k == 2:
-            B, b = A, d
-        e = b - fit @ B
-        if k:
-            size = np.abs(e[:: max(1, len(e) // 600)])
-            scale = max(_MAD * float(np.partition(size, len(size) // 2)[len(size) // 2]), 2e-5)
-        e *= 1.0 / (_TUKEY * scale)
-        weight = np.maximum(1.0 - e * e, 0.0)
-        weight *= weight
-        weighted = B * weight
-        moments = weighted @ B.T
-        if not moments[0, 0] > 0.3 * len(e):
-            return None
-        fit = np.linalg.solve(moments, weighted @ b)
-    e = d - fit @ A
-    good = np.abs(e) < _TUKEY * scale
+    agree, fit, moments, limit, e = plane_steps(p, tolerance)
+    if not agree:
+        return None
+    good = np.abs(e) < limit
     e *= good
     count = int(np.count_nonzero(good))
     rms = float(np.sqrt(e @ e / count))
-    shared = shared_noise(e, good, on, (h, w))
+    shared = shared_noise(e, good, on, shape)
     new = axes @ np.array([-fit[1], -fit[2], 1.0])
     new /= float(np.sqrt(new @ new))
     middle = moments[0] / moments[0, 0]
@@ -237,26 +212,13 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
     corner = view.places(0.5 * w + np.array([0.0, 1.0, 0.0]), 0.5 * h + np.array([0.0, 0.0, 1.0]))
     along, down = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
     pitch = float(np.sqrt(abs(along[0] * down[1] - along[1] * down[0])))
-    face, known, flat = view.face, view.known, view.face.ravel()
-    one = np.flatnonzero((face[:, 1:] != face[:, :-1]) & known[:, 1:] & known[:, :-1])
-    two = np.flatnonzero((face[1:] != face[:-1]) & known[1:] & known[:-1])
-    v, q = one // (w - 1), two // w
-    first = np.concatenate([one + v, two])
-    second = first + 1
-    second[len(one) :] += w - 1
-    points = view.places(np.concatenate([one - v * (w - 1) + 0.5, two - q * w]), np.concatenate([v, q + 0.5]))
-    on_first = flat[first]
-    step = np.empty_like(points)
-    step[:, : len(one)], step[:, len(one) :] = along[:, None], down[:, None]
-    step *= on_first * 2.0 - 1.0
-    d = points - near.astype(np.float32)[:, None]
+    d, inward, beyond = borders(view.face, view.known, view.turned, view.at, near)
     rho = np.sqrt(d[0] * d[0] + d[1] * d[1])
-    outward = d[0] * step[0] + d[1] * step[1]
     radii = [standard.face_outer_radius_m, standard.face_inner_radius_m]
     width = 2.0 * pitch + 0.0012 + 0.5 * _SLACK_M
     rims = []
-    for r, way in zip(radii, (outward, -outward), strict=True):
-        at = np.flatnonzero((np.abs(rho - r) < width) & (way > 0.0))
+    for r, way in zip(radii, (inward, ~inward), strict=True):
+        at = np.flatnonzero((np.abs(rho - r) < width) & way)
         if len(at) < 48:
             raise CircleFitError("Too little of an edge was seen.")
         rims.append(d[:, at[:: -(-len(at) // _EDGE_POINTS)]].T)
@@ -267,13 +229,12 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
     ):
         raise CircleFitError("The edges do not agree.")
     starts, lowered, clear = [], [], []
-    for k, (f, way) in enumerate(zip(rough, (outward, -outward), strict=True)):
+    for k, (f, way) in enumerate(zip(rough, (inward, ~inward), strict=True)):
         e = d - f.center.astype(np.float32)[:, None]
         e = np.sqrt(e[0] * e[0] + e[1] * e[1]) - f.radius
         clear.append(clear_band(standard, pitch, k == 0))
-        at = np.flatnonzero((np.abs(e) < max(clear[k], 1.2 * pitch) + height) & (way > 0.0))
-        beyond = view.above.ravel()[np.where(on_first[at], second[at], first[at])]
-        lowered.append(lowered_by(beyond, height))
+        at = np.flatnonzero((np.abs(e) < max(clear[k], 1.2 * pitch) + height) & way)
+        lowered.append(lowered_by(view.above.ravel()[beyond[at]], height))
         center = near + f.center
         if lowered[k]:
             center = center - lowered[k] * view.slide(center)
@@ -288,30 +249,14 @@ def _labelled(
     view: _View, starts: list[CircleFit], pitch: float, lowered: list[float], clear: list[float]
 ) -> list[CircleFit]:
     """Both edges from the pixels on either side of them."""
-    h, w = view.shape
-    bv = np.repeat(np.arange(0, h - _BLOCK + 1, _BLOCK, dtype=np.int32), w // _BLOCK)
-    bu = np.tile(np.arange(0, w - _BLOCK + 1, _BLOCK, dtype=np.int32), h // _BLOCK)
-    half = np.float32(0.5 * (_BLOCK - 1))
-    blocks = view.places(bu + half, bv + half)
-    known, face = view.known.ravel(), view.face.ravel()
     places, sides = [], []
     for k, start in enumerate(starts):
         reach = min(clear[k], _LABELLED * pitch + 3.0 * float(np.sqrt(np.trace(start.covariance[:2, :2]))))
-        middle = start.center.astype(np.float32)[:, None]
-        d = blocks - middle
-        rho = np.sqrt(d[0] * d[0] + d[1] * d[1])
-        # the middle of a block's corner pixel lies 2.1 pixels from its own, and a leaning face stretches them
-        close = np.flatnonzero(np.abs(rho - start.radius) < reach + lowered[k] + 0.6 * _BLOCK * pitch)
-        u = (bu[close][:, None] + _BLOCK_U).ravel()
-        v = (bv[close][:, None] + _BLOCK_V).ravel()
-        at = v * w + u
-        xy = view.places(u, v)
-        if lowered[k]:
-            xy -= lowered[k] * view.slide(xy)
-        xy -= middle
-        good = np.flatnonzero((np.abs(np.sqrt(xy[0] * xy[0] + xy[1] * xy[1]) - start.radius) < reach) & known[at])
-        places.append(xy[:, good])
-        sides.append(face[at[good]])
+        xy, on = near_edge(
+            view.face, view.known, view.turned, view.at, start.center, start.radius, reach, lowered[k], pitch, _BLOCK
+        )
+        places.append(xy)
+        sides.append(on)
     return [replace(f, covariance=_SHARED * f.covariance) for f in refine_pair(places, sides, starts, pitch)]
 
 
