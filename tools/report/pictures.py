@@ -38,7 +38,10 @@ def error_bars(
     axes.bar(x, error, color=[OURS if k else REFUSED for k in keep], width=0.7)
     median = float(np.median(error[keep])) if keep.any() else float(np.nanmedian(error))
     axes.axhline(median, color="#444", linewidth=1, linestyle="--")
-    axes.annotate(f"median {median:.2f}", (x[-1] + 0.5, median), fontsize=9, va="bottom", ha="right", bbox=_PLATE)
+    beside = ("axes fraction", "data")  # right of the bars, which it would hide
+    axes.annotate(
+        f"median\n{median:.2f}", (1.01, median), xycoords=beside, fontsize=9, va="center", annotation_clip=False
+    )
     # gross outliers would flatten every other bar
     top = 1.25 * float(np.nanmax(error[keep] if keep.any() else error))
     if stated is not None:
