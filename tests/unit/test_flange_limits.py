@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.tools.studies.few_scans import study_few_scans
 from weldcal.tools.studies.ingredients import Ingredient, study_ingredients
 from weldcal.tools.studies.live_target import bound, live_scenario
 
@@ -64,3 +65,12 @@ def test_the_spread_of_a_median_is_that_of_many_medians() -> None:
 def test_a_comparison_of_ingredients_needs_a_dozen_scans() -> None:
     with pytest.raises(TooFewPoses, match="needs 12 usable scans, and there are 1"):
         study_ingredients(DATA / "franka_phoxi_m")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
+def test_few_scans_calibrate_to_tenths_on_the_scans_not_drawn_and_more_of_them_better() -> None:
+    one, four = study_few_scans(DATA / "aubo_i5_phoxi_s", draws=6, sizes=(1, 4))
+    assert (one.scans, four.scans, one.refused, four.refused) == (1, 4, 0, 0)
+    assert 1e-4 < np.median(four.position_m) < np.median(one.position_m) < 6e-4
+    with pytest.raises(TooFewPoses, match="8 usable scans and more, and there are 1"):
+        study_few_scans(DATA / "franka_phoxi_m")

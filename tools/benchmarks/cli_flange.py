@@ -1,4 +1,4 @@
-"""weldcal benchmark flange and flange-frames, -hidden, -parts, -honesty, -live, -ingredients: how fast, sure, honest and good."""
+"""weldcal benchmark flange and flange-frames, -hidden, -parts, -honesty, -live, -ingredients, -few: how fast, sure, honest and good."""
 
 from __future__ import annotations
 
@@ -30,6 +30,7 @@ def mount(benchmarks: typer.Typer) -> None:
     benchmarks.command("flange-honesty")(honesty)
     benchmarks.command("flange-live")(live)
     benchmarks.command("flange-ingredients")(ingredients)
+    benchmarks.command("flange-few")(few)
 
 
 def speed(
@@ -277,6 +278,47 @@ def ingredients(
         for r in found
     }
     _finish("benchmark flange-ingredients", {"state": "done", "rows": rows}, lines, out, json)
+
+
+def few(
+    dataset: Annotated[Path, typer.Argument(help="A folder of eight scans and more.")],
+    draws: Annotated[int, typer.Option("--draws", metavar="N", min=2, help="Random draws of each size.")] = 60,
+    out: OutOption = None,
+    seed: SeedOption = 0,
+    json: JsonOption = False,
+    debug: DebugOption = False,
+) -> None:
+    """How good is a calibration from 1, 2, 3, 4, 6, 8 or 12 of the scans on those that it did not use?"""
+    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-few") as progress:
+        import numpy as np
+
+        from weldcal.tools.studies.few_scans import study_few_scans
+
+        found = study_few_scans(dataset, draws, seed, progress=progress)
+        rows: list[dict[str, object]] = []
+        lines = {}
+        for r in found:
+            if len(r.position_m) < 2:
+                lines[f"{r.scans} scans"] = f"{r.refused} of {draws} draws refused"
+                continue
+            median, tilt = 1e3 * float(np.median(r.position_m)), float(np.degrees(np.median(r.tilt_rad)))
+            p95, sigma = 1e3 * float(np.percentile(r.position_m, 95)), 1e3 * r.median_sigma_m()
+            rows.append(
+                {
+                    "scans": r.scans,
+                    "median_mm": median,
+                    "median_sigma_mm": sigma,
+                    "p95_mm": p95,
+                    "tilt_deg": tilt,
+                    "corrected": r.corrected,
+                    "refused": r.refused,
+                }
+            )
+            lines[f"{r.scans} scan{'s' * (r.scans > 1)}"] = (
+                f"{median:.3f} +- {sigma:.3f} mm, 95 % {p95:.3f}, tilt {tilt:.3f} degrees; scanner corrected in {100 * r.corrected:.0f} %"
+                + (f"; {r.refused} refused" if r.refused else "")
+            )
+    _finish("benchmark flange-few", {"state": "done", "draws": draws, "rows": rows}, lines, out, json)
 
 
 def _finish(command: str, summary: dict[str, object], lines: dict[str, str], out: Path | None, json: bool) -> None:
