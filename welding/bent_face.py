@@ -84,7 +84,7 @@ def find_bent_faces(
 
     Two points and their normals span a cylinder; the one that most others agree with, in distance and in normal, is fitted.
     """
-    at, normal = _normals(points, rng)
+    at, normal = _normals(points, rng, min(map(abs, radii_m)))
     found: list[BentFace] = []
     for _ in range(most):
         if len(at) < least_seeds:
@@ -102,8 +102,9 @@ def find_bent_faces(
     return found
 
 
-def _normals(points: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Some points (M,3) and the normals (M,3) of the surface there, up; those at edges are left out."""
+def _normals(points: Floats, rng: np.random.Generator, least_radius_m: float) -> tuple[Floats, Floats]:
+    """Some points (M,3) and the normals (M,3) of the surface there, up; those at edges are left out, but none for a bend of that
+    radius or a wider one."""
     sample = points[rng.choice(len(points), size=min(len(points), 16 * SEEDS), replace=False)]
     seeds = sample[: min(SEEDS, len(sample))]
     near = sample[cKDTree(sample).query(seeds, k=min(NEIGHBOURS, len(sample)))[1]]
@@ -111,7 +112,10 @@ def _normals(points: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off) / near.shape[1])
     normal = vectors[:, :, 0] * np.where(vectors[:, 2:3, 0] < 0.0, -1.0, 1.0)
     rms = np.sqrt(np.maximum(values[:, 0], 0.0))
-    keep = (normal[:, 2] > STEEPEST) & (rms < 3.0 * float(np.median(rms)) + 1e-5) & (values[:, 1] > 0.1 * values[:, 2])
+    # x^2 / 2r is the height over a bend; over a disc its standard deviation is var(x) / 2r
+    bent = values[:, 2] / (2.0 * least_radius_m)
+    flat = rms < np.hypot(3.0 * float(np.median(rms)), 1.5 * bent) + 1e-5
+    keep = (normal[:, 2] > STEEPEST) & flat & (values[:, 1] > 0.1 * values[:, 2])
     return seeds[keep], normal[keep]
 
 

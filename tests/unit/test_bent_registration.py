@@ -63,6 +63,13 @@ def test_the_cylinder_is_found_in_the_whole_scan_with_its_radius(scene: Scene) -
     assert face.radius_m == pytest.approx(RADIUS_M, rel=0.01)
 
 
+def test_a_bend_without_any_noise_is_found_beside_a_table_as_exact() -> None:
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-0.3, 0.3, 0.001), np.arange(-0.1, 0.1, 0.001)))
+    z = np.where(np.abs(x) < 0.07, np.sqrt(0.2**2 - np.minimum(np.abs(x), 0.07) ** 2) - 0.15, 0.0)
+    (face,) = find_bent_faces(np.column_stack([x, y, z]), (0.1, 1.0), np.random.default_rng(0))
+    assert face.radius_m == pytest.approx(0.2, abs=1e-4)
+
+
 def test_the_bent_plate_is_found_near_the_guess_and_anywhere(scene: Scene) -> None:
     near = register_workpiece(scene.cloud_B, PART, scene.X_BP @ ERROR, eye_B=scene.eye_B)
     heading = RollPitchYaw(scene.X_BP.rotation()).yaw_angle()
