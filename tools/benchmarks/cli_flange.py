@@ -211,13 +211,16 @@ def live(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-live") as progress:
         import numpy as np
 
+        from weldcal.tools.report.render import write_atomic
         from weldcal.tools.studies.live_redraw import joined
-        from weldcal.tools.studies.live_target import TARGET_M, TARGET_RAD, study_live
+        from weldcal.tools.studies.live_target import TARGET_M, TARGET_RAD, live_picture, study_live
 
         rows = study_live(
             seeds, first=seed, scans=scans, repeatability_mm=repeatability, redraws=redraws, progress=progress
         )
         again = joined([r.redrawn for r in rows])
+        if out is not None and redraws:
+            write_atomic(out / "live.svg", live_picture(rows))
         work = 1e3 * np.array([r.at_work_m for r in rows])
         turn, turn_least = (np.degrees([getattr(r, k) for r in rows]) for k in ("rotation_rad", "least_rad"))
         least, expected = (1e3 * np.array([getattr(r, k) for r in rows]) for k in ("least_m", "expected_m"))

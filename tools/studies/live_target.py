@@ -6,13 +6,15 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.scenario import Scenario, check_scenario, load_scenario
 from weldcal.tools.outcome import calibration_error, calibration_status
+from weldcal.tools.report.pictures import svg
 from weldcal.tools.simulation import Progress, no_progress, run_cell
-from weldcal.tools.studies.live_redraw import Redrawn, Station, bound_covariance, joints_of, redraw
+from weldcal.tools.studies.live_redraw import Redrawn, Station, bound_covariance, joined, joints_of, redraw
 
 SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
@@ -86,3 +88,35 @@ def study_live(
             )
         )
     return rows
+
+
+def live_picture(rows: list[LiveRow]) -> bytes:
+    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise drawn anew, and at the bound."""
+    again = joined([r.redrawn for r in rows])
+    mm, deg = 1e3, float(np.degrees(1.0))
+    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    panels = (
+        (again.at_work_m, again.bound_at_work_m, [r.at_work_m for r in rows], mm, TARGET_M, "at the work point, mm"),
+        (
+            again.rotation_rad,
+            again.bound_rotation_rad,
+            [r.rotation_rad for r in rows],
+            deg,
+            TARGET_RAD,
+            "rotation, degrees",
+        ),
+    )
+    for ax, (drawn, least, live, unit, target, name) in zip(axes, panels, strict=True):
+        ax.ecdf(unit * least, color="#777", linewidth=1.2, linestyle="--", label="the least possible (Cramer-Rao)")
+        ax.ecdf(unit * drawn, color="#1d5f8a", linewidth=1.6, label=f"noise drawn anew, {len(drawn)} times")
+        ax.ecdf(unit * np.array(live), color="#b08a2e", linewidth=1.2, label=f"live, {len(live)} worlds")
+        ax.axvline(unit * target, color="#444", linewidth=1)
+        ax.annotate("target", (unit * target, 0.04), xytext=(-4, 0), textcoords="offset points", ha="right", fontsize=9)
+        ax.set_xlim(0.0, 1.25 * unit * target)
+        ax.set_xlabel(name)
+    axes[0].set_ylabel("share of calibrations within")
+    axes[0].legend(
+        facecolor="white", edgecolor="none", framealpha=1.0, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.15)
+    )
+    return svg(figure, *axes)
