@@ -13,7 +13,8 @@ from weldcal.calibration.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.tools.studies.few_scans import study_few_scans
 from weldcal.tools.studies.ingredients import Ingredient, study_ingredients
-from weldcal.tools.studies.live_target import bound, live_scenario
+from weldcal.tools.studies.live_redraw import Station, bound_covariance, joints_of, redraw
+from weldcal.tools.studies.live_target import live_scenario
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])
@@ -31,18 +32,43 @@ def _sightings(n: int, center_sigma_m: float = 1e-5) -> tuple[Observation, ...]:
     return tuple(out)
 
 
+def _station(observations: tuple[Observation, ...], repeatability_m: float) -> Station:
+    arm = load_arm("ur10e")
+    return Station(arm, joints_of(observations, arm, Q_HOME), repeatability_m, X_CB.inverse(), WORK)
+
+
+def _bound(observations: tuple[Observation, ...], repeatability_m: float) -> tuple[float, float]:
+    """At the work point (m) and of the rotation (rad), rms."""
+    least = np.diag(bound_covariance(observations, _station(observations, repeatability_m)))
+    return float(np.sqrt(least[3:].sum())), float(np.sqrt(least[:3].sum()))
+
+
 def test_the_bound_falls_with_the_number_of_scans_and_with_the_arms_repeatability() -> None:
-    arm, eight = load_arm("ur10e"), _sightings(8)
-    at_work, turn = bound(eight, arm, Q_HOME, 5e-5, WORK)
+    eight = _sightings(8)
+    at_work, turn = _bound(eight, 5e-5)
     # eight independent offsets of 0.05 mm: their mean is known to 0.018 mm, a point beside them a little worse
     assert 5e-5 / np.sqrt(8) < at_work < 4.0 * 5e-5 / np.sqrt(8)
     twice = tuple(o for o in eight for _ in range(2))
     # the same eight poses seen twice, each stop its own: half the variance
-    assert bound(twice, arm, Q_HOME, 5e-5, WORK)[0] == pytest.approx(at_work / np.sqrt(2.0), rel=1e-6)
+    assert _bound(twice, 5e-5)[0] == pytest.approx(at_work / np.sqrt(2.0), rel=1e-6)
     # the scanner's own noise is small beside the arm's here: what is left scales with the arm
-    assert bound(eight, arm, Q_HOME, 1e-4, WORK)[0] == pytest.approx(2.0 * at_work, rel=0.1)
-    assert bound(_sightings(8, 1e-4), arm, Q_HOME, 5e-5, WORK)[0] > 1.3 * at_work
+    assert _bound(eight, 1e-4)[0] == pytest.approx(2.0 * at_work, rel=0.1)
+    assert _bound(_sightings(8, 1e-4), 5e-5)[0] > 1.3 * at_work
     assert np.degrees(turn) < 0.02
+
+
+def test_calibrations_with_noise_drawn_anew_err_a_little_more_than_the_bound_and_never_less() -> None:
+    eight = _sightings(8, 2e-5)
+    found = redraw(eight, _station(eight, 5e-5), 60, seed=1)
+    at_work, turn = _bound(eight, 5e-5)
+    # the rms of 60 draws of three numbers each is known to 6 %; estimated weights cost a part of the information
+    assert 0.85 * at_work < np.sqrt(np.mean(found.at_work_m**2)) < 1.5 * at_work
+    assert 0.85 * turn < np.sqrt(np.mean(found.rotation_rad**2)) < 1.5 * turn
+    assert np.sqrt(np.mean(found.bound_rotation_rad**2)) == pytest.approx(turn, rel=0.2)
+    shares = found.within(2.0 * at_work, 2.0 * turn)
+    assert shares[0] > 0.5
+    assert shares[1] > 0.9
+    assert found.within(0.01 * at_work, turn) == (0.0, 0.0)
 
 
 def test_the_live_target_is_measured_with_that_many_scans_and_that_arm() -> None:

@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.stats import binom, chi2
 
+from weldcal.calibration.errors import CoplanarPoses
 from weldcal.calibration.estimate import with_scanner
 from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.observability import check_diversity
 from weldcal.calibration.observation import Observation
 from weldcal.calibration.rigid import exp_rotation, rotation_vector
 from weldcal.calibration.scanner_fit import from_motion
@@ -49,23 +51,33 @@ def simulated_sightings(
     n: int, rng: np.random.Generator, *, sigma_m: float = 1e-4, sigma_rad: float = 1e-3
 ) -> tuple[list[Observation], RigidTransform]:
     """Sightings (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``sigma_m`` and ``sigma_rad`` an
-    axis, the fit by what its own covariance says (0.02 to 0.06 mm)."""
+    axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
+    are drawn again."""
     X_BC = RigidTransform(
         RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
     )
-    out = []
-    for k in range(n):
-        p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
-        X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
-        A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
-        covariance = A @ A.T
-        normal_sigma = rng.uniform(2e-5, 2e-4)
-        seen = p + A @ rng.standard_normal(3) + sigma_m * rng.standard_normal(3)
-        z = X_CR.rotation().matrix()[:, 2]
-        lean = float(np.hypot(sigma_rad, normal_sigma)) * rng.standard_normal(3)
-        normal = exp_rotation(lean - z * float(z @ lean)).matrix() @ z
-        out.append(Observation(f"p{k}", X_BC @ X_CR, seen, normal, covariance, normal_sigma))
-    return out, X_BC
+    while True:
+        out = [_simulated_sighting(f"p{k}", X_BC, rng, sigma_m, sigma_rad) for k in range(n)]
+        try:
+            check_diversity(np.array([o.p_BR for o in out]), np.ones(n, dtype=bool))
+        except CoplanarPoses:
+            continue
+        return out, X_BC
+
+
+def _simulated_sighting(
+    id: str, X_BC: RigidTransform, rng: np.random.Generator, sigma_m: float, sigma_rad: float
+) -> Observation:
+    p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
+    X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
+    A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
+    covariance = A @ A.T
+    normal_sigma = rng.uniform(2e-5, 2e-4)
+    seen = p + A @ rng.standard_normal(3) + sigma_m * rng.standard_normal(3)
+    z = X_CR.rotation().matrix()[:, 2]
+    lean = float(np.hypot(sigma_rad, normal_sigma)) * rng.standard_normal(3)
+    normal = exp_rotation(lean - z * float(z @ lean)).matrix() @ z
+    return Observation(id, X_BC @ X_CR, seen, normal, covariance, normal_sigma)
 
 
 WRONG = ScannerCorrection(1.002, (0.006, -0.004))

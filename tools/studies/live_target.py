@@ -6,19 +6,15 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.figure import Figure
 
-from weldcal.calibration.observation import Observation
-from weldcal.calibration.rigid import skew
-from weldcal.models.arms.inverse import inverse_kinematics
-from weldcal.models.arms.kinematics import ArmModel, jacobian
 from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.scenario import Scenario, check_scenario, load_scenario
 from weldcal.tools.outcome import calibration_error, calibration_status
+from weldcal.tools.report.pictures import svg
 from weldcal.tools.simulation import Progress, no_progress, run_cell
-
-Array = NDArray[np.float64]
+from weldcal.tools.studies.live_redraw import Redrawn, Station, bound_covariance, joined, joints_of, redraw
 
 SCENARIO = "calibrate_only"
 TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
@@ -27,7 +23,7 @@ TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
 @dataclass(frozen=True)
 class LiveRow:
     """One seed: scans used, error of a point at the work point (m) and of the rotation (rad), what the estimate expected of the
-    former (rms), and the least that these poses, arm and scanner allow (rms, see `least`)."""
+    former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with noise drawn anew."""
 
     seed: int
     scans: int
@@ -36,6 +32,7 @@ class LiveRow:
     expected_m: float
     least_m: float
     least_rad: float
+    redrawn: Redrawn
 
 
 def live_scenario(repeatability_mm: float, scans: int) -> Scenario:
@@ -49,10 +46,18 @@ def live_scenario(repeatability_mm: float, scans: int) -> Scenario:
 
 
 def study_live(
-    seeds: int, *, first: int = 0, scans: int = 8, repeatability_mm: float = 0.05, progress: Progress = no_progress
+    seeds: int,
+    *,
+    first: int = 0,
+    scans: int = 8,
+    repeatability_mm: float = 0.05,
+    redraws: int = 0,
+    progress: Progress = no_progress,
 ) -> list[LiveRow]:
-    """Calibrate live, through the whole Diagram, once for each seed. Raises InputError for numbers that no cell takes, and
-    RuntimeError where a job was held."""
+    """Calibrate live, through the whole Diagram, once for each seed, and ``redraws`` times more from the same poses without it.
+
+    Raises InputError for numbers that no cell takes, and RuntimeError where a job was held.
+    """
     rows = []
     for k in range(seeds):
         seed = first + k
@@ -66,52 +71,52 @@ def study_live(
             raise RuntimeError(f"The calibration of seed {seed} came to no end: {run.reason}")
         work = work_point(scenario)
         error = calibration_error(status.estimate.X_BC, truth, work)
-        least = bound(
-            status.observations, cell.station.arm, np.deg2rad(scenario.home_deg), 1e-3 * repeatability_mm, work
-        )
+        found = status.observations
+        joints = joints_of(found, cell.station.arm, np.deg2rad(scenario.home_deg))
+        station = Station(cell.station.arm, joints, 1e-3 * repeatability_mm, truth, np.asarray(work))
+        least = np.diag(bound_covariance(found, station))
         rows.append(
             LiveRow(
-                seed, len(status.observations), error.at_work_m, error.rotation_rad, status.predicted_error_m, *least
+                seed,
+                len(found),
+                error.at_work_m,
+                error.rotation_rad,
+                status.predicted_error_m,
+                float(np.sqrt(least[3:].sum())),
+                float(np.sqrt(least[:3].sum())),
+                redraw(found, station, redraws, seed),
             )
         )
     return rows
 
 
-def bound(
-    observations: tuple[Observation, ...], arm: ArmModel, q_home: Array, repeatability_m: float, p_BWork: Array
-) -> tuple[float, float]:
-    """Cramer-Rao: the least rms error of a point at the work point (m) and of the rotation (rad, about all axes) that any unbiased
-    calibration from these sightings of a bare flange can have.
-
-    The arm's error is six independent joint offsets that displace the flange by ``repeatability_m`` (rms); the scanner's is what
-    each fit states of itself. Centre and normal of a pose err together, as one offset of the joints moves both.
-    """
-    pivot = np.mean([o.p_BR for o in observations], axis=0)
-    information = np.zeros((6, 6))
-    for o in observations:
-        solutions = inverse_kinematics(arm, o.X_BR)
-        q = min(solutions, key=lambda s: float(np.abs((s - q_home + np.pi) % (2.0 * np.pi) - np.pi).sum()))
-        J = jacobian(arm, q)
-        R, z = o.X_BR.rotation().matrix(), o.n_B
-        across = R[:, :2].T  # the two directions in which a normal can lean
-        H = np.zeros((5, 6))
-        H[:3, 3:], H[3:, :3] = np.eye(3), -across @ skew(z)
-        sigma_q = repeatability_m / float(np.linalg.norm(J[3:]))
-        noise = sigma_q**2 * H @ J @ J.T @ H.T
-        noise[:3, :3] += np.zeros((3, 3)) if o.center_covariance is None else _in_base(o)
-        noise[3:, 3:] += (o.normal_sigma or 0.0) ** 2 * np.eye(2)
-        A = np.zeros((5, 6))
-        A[:3, :3], A[:3, 3:], A[3:, :3] = -skew(o.p_BR - pivot), np.eye(3), -across @ skew(z)
-        information += A.T @ np.linalg.solve(noise, A)
-    covariance = np.linalg.inv(information)
-    at_work = np.hstack([-skew(np.asarray(p_BWork) - pivot), np.eye(3)])
-    return float(np.sqrt(np.trace(at_work @ covariance @ at_work.T))), float(np.sqrt(np.trace(covariance[:3, :3])))
-
-
-def _in_base(o: Observation) -> Array:
-    """The fit's covariance (3, 3) m^2: along the face's normal and across, whatever way the camera is turned."""
-    assert o.center_covariance is not None
-    n = np.asarray(o.n_C) if o.n_C is not None else np.array([0.0, 0.0, -1.0])
-    along = float(n @ o.center_covariance @ n)
-    across = 0.5 * (float(np.trace(o.center_covariance)) - along)
-    return np.asarray(across * np.eye(3) + (along - across) * np.outer(o.n_B, o.n_B))
+def live_picture(rows: list[LiveRow]) -> bytes:
+    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise drawn anew, and at the bound."""
+    again = joined([r.redrawn for r in rows])
+    mm, deg = 1e3, float(np.degrees(1.0))
+    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    panels = (
+        (again.at_work_m, again.bound_at_work_m, [r.at_work_m for r in rows], mm, TARGET_M, "at the work point, mm"),
+        (
+            again.rotation_rad,
+            again.bound_rotation_rad,
+            [r.rotation_rad for r in rows],
+            deg,
+            TARGET_RAD,
+            "rotation, degrees",
+        ),
+    )
+    for ax, (drawn, least, live, unit, target, name) in zip(axes, panels, strict=True):
+        ax.ecdf(unit * least, color="#777", linewidth=1.2, linestyle="--", label="the least possible (Cramer-Rao)")
+        ax.ecdf(unit * drawn, color="#1d5f8a", linewidth=1.6, label=f"noise drawn anew, {len(drawn)} times")
+        ax.ecdf(unit * np.array(live), color="#b08a2e", linewidth=1.2, label=f"live, {len(live)} worlds")
+        ax.axvline(unit * target, color="#444", linewidth=1)
+        ax.annotate("target", (unit * target, 0.04), xytext=(-4, 0), textcoords="offset points", ha="right", fontsize=9)
+        ax.set_xlim(0.0, 1.25 * unit * target)
+        ax.set_xlabel(name)
+    axes[0].set_ylabel("share of calibrations within")
+    axes[0].legend(
+        facecolor="white", edgecolor="none", framealpha=1.0, fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 0.15)
+    )
+    return svg(figure, *axes)
