@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
+from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.handeye.corners import poses_from_corners, refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
 from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
@@ -100,10 +100,10 @@ class HandEyeReport:
                 + "  deg  +- "
                 + _sigmas(np.degrees(sigma[:3]), 57.3),
             ]
-        lines += [
-            "",
-            f"held out     {r.held_out.rms_deg:.4f} deg   {1e3 * r.held_out.rms_translation:.3f} mm (rms, 5 folds)",
-        ]
+        lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
+        if not r.inliers.all():
+            kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
+            lines += [f"             {_held_out(kept, 'without those left out, ')}"]
         lines += [f"weighting    {r.method}"]
         lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
         if self.corners:
@@ -230,8 +230,21 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs, result, config)
     if mistake is not None:
         raise InconsistentPoses(mistake)
-    scale = scale_warning(problem, result)
-    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
+    said = [w for w in (scale_warning(problem, result), _repeated(pairs)) if w is not None]
+    return replace(result, warnings=(*result.warnings, *said))
+
+
+def _repeated(pairs: PosePairs) -> str | None:
+    seen = np.hstack(
+        [X.reshape(len(X), -1) for X in (pairs.robot, pairs.camera, pairs.robot2, pairs.link) if X is not None]
+    )
+    again = len(seen) - len(np.unique(seen, axis=0))
+    if not again:
+        return None
+    return (
+        f"{again} of {len(seen)} samples repeat others to the last digit: they make the uncertainty and the held-out errors look smaller "
+        "than they are; take them out."
+    )
 
 
 def problem_of_pairs(pairs: PosePairs) -> Problem:
@@ -251,6 +264,12 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
                 )
             )
     return tuple(rows)
+
+
+def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
+    if not np.isfinite(held_out.rms_translation):
+        return "nothing: too few poses to leave some out"
+    return f"{held_out.rms_deg:.4f} deg   {1e3 * held_out.rms_translation:.3f} mm ({of}rms, 5 folds)"
 
 
 def _sigmas(values: Array, certain: float) -> str:
