@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.arm_errors import DhArm
@@ -27,7 +28,7 @@ from weldcal.calibration.profiler.plan import (
     sample_sphere_poses,
 )
 from weldcal.calibration.profiler.record import ProfilerRecord, load_record, save_record
-from weldcal.calibration.profiler.result import ProfilerEstimate
+from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, choose_model, sphere_joint
 from weldcal.calibration.profiler.sphere_linear import (
     compensate,
@@ -37,6 +38,7 @@ from weldcal.calibration.profiler.sphere_linear import (
     wrong_sides,
 )
 from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.calibration.result import matrix4
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.profiler_files import ProfilerFile
@@ -225,8 +227,7 @@ def calibrate_sphere(
 
 
 def _widened(e: Estimate) -> Estimate:
-    """With the covariance that its residuals speak for, where they are larger than the sigmas stated."""
-    return replace(e, covariance=e.covariance * max(1.0, e.reduced_chi2 if np.isfinite(e.reduced_chi2) else 1.0))
+    return replace(e, covariance=believed_covariance(e))
 
 
 def _refuse_turned_round(data: SphereData, s: SphereSigmas) -> None:
@@ -385,6 +386,9 @@ def _next(candidates: FlangePoses, chosen: tuple[int, ...], rms_m: Floats) -> di
     }
 
 
-def write_calibration(record: ProfilerRecord, folder: Path) -> None:
-    """profiler.yaml and X_FS.json."""
+def write_calibration(record: ProfilerRecord, folder: Path) -> dict[str, Any]:
+    """profiler.yaml and X_FS.json; the pose as the JSON object has it."""
     save_record(record, folder)
+    return {
+        "X_FS": matrix4(RigidTransform(RotationMatrix.ProjectToRotationMatrix(record.rotation), record.translation))
+    }
