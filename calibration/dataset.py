@@ -79,6 +79,8 @@ def load_dataset(folder: Path) -> Dataset:
     that repeats another one to the last digit is refused by name.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise DatasetError(f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml.")
     if not folder.is_dir():
         raise DatasetError(
             f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."
