@@ -69,7 +69,7 @@ def error_bars(
     axes.set_xticks(x[::step], list(ids)[::step], rotation=60, ha="right", fontsize=8)
     axes.set_ylim(0.0, max(top, 1e-9))
     for i in np.nonzero(error > top)[0]:
-        axes.annotate(f"{error[i]:.1f}", (float(i), top), fontsize=8, ha="center", va="top", color="#333")
+        axes.annotate(f"{error[i]:.1f}", (float(i), top), fontsize=8, ha="center", va="top", color="#333", bbox=_PLATE)
     axes.set_ylabel(label)
     return svg(figure, axes)
 
