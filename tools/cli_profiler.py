@@ -21,8 +21,32 @@ TrialOption = Annotated[
 RobotSigma = Annotated[
     float, typer.Option("--sigma-robot", metavar="MM", help="The robot's position, one sigma per axis.")
 ]
-XSigma = Annotated[float, typer.Option("--sigma-x", metavar="MM", help="A profile point along the line, one sigma.")]
 ZSigma = Annotated[float, typer.Option("--sigma-z", metavar="MM", help="A profile point in depth, one sigma.")]
+OF_POINTS = "the file's, else what the points show, {} at least"
+EdgeRobotSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma-robot",
+        metavar="MM",
+        help="The robot's position, one sigma per axis.",
+        show_default=OF_POINTS.format(0.03),
+    ),
+]
+EdgeXSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma-x",
+        metavar="MM",
+        help="A profile point along the line, one sigma.",
+        show_default=OF_POINTS.format(0.05),
+    ),
+]
+EdgeZSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma-z", metavar="MM", help="A profile point in depth, one sigma.", show_default=OF_POINTS.format(0.06)
+    ),
+]
 PlanOption = Annotated[int, typer.Option("--plan", metavar="N", min=0, help="Also name N poses to add next.")]
 RadiusOption = Annotated[
     float | None, typer.Option("--radius", metavar="MM", help="The sphere's, where the file has none.")
@@ -58,9 +82,9 @@ def edge(
     ] = "joint",
     feature: Annotated[str, typer.Option("--feature", metavar="KIND", help="In raw profiles: bar, step or apex.")] = "",
     side: Annotated[str, typer.Option("--side", metavar="S", help="End of the near face: left or right.")] = "left",
-    sigma_robot: RobotSigma = 0.03,
-    sigma_x: XSigma = 0.05,
-    sigma_z: ZSigma = 0.06,
+    sigma_robot: EdgeRobotSigma = None,
+    sigma_x: EdgeXSigma = None,
+    sigma_z: EdgeZSigma = None,
     plan: PlanOption = 0,
     out: OutOption = None,
     seed: SeedOption = 0,
@@ -69,10 +93,13 @@ def edge(
 ) -> None:
     """The profiler's pose on the flange, from points of one straight edge seen in any poses; no guess is needed."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import Sigmas, calibrate_edge, write_calibration
+        from weldcal.tools.profiler import calibrate_edge, write_calibration
         from weldcal.tools.profiler_files import read_profiler_file
+        from weldcal.tools.profiler_noise import Sigmas
 
-        sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_x, 1e-3 * sigma_z)
+        given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
+        robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
+        sigmas = Sigmas(robot, x, z, stated=any(v is not None for v in given))
         data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
         record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=seed)
         folder = _folder(out, file, seed)
@@ -101,7 +128,8 @@ def sphere(
 ) -> None:
     """The profiler's pose on the flange, from raw profiles of a sphere; no sides, no pure translations, no guess."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import Sigmas, calibrate_sphere, write_calibration
+        from weldcal.tools.profiler import calibrate_sphere, write_calibration
+        from weldcal.tools.profiler_noise import Sigmas
 
         sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
         lost: list[int] = []
@@ -222,6 +250,10 @@ def _report(command: str, found: Mapping[str, object], folder: Path, json: bool)
     X = found.get("X_FS")
     if isinstance(X, list):
         rows |= _pose_rows(X)
+    for key in ("outlier_scans", "wrong_scans", "without_feature", "without_sphere", "without_groove", "wrong_sides"):
+        numbers = found.get(key)
+        if isinstance(numbers, list) and numbers:
+            rows[key.replace("_", " ")] = ", ".join(map(str, numbers))
     after = found.get("next_poses")
     if isinstance(after, dict):
         for k, pose in enumerate(after["poses"]):

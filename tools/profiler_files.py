@@ -30,7 +30,7 @@ DIMENSIONS = {
     "T": 3, "rotation": 3, "translation": 2, "points": 2, "profiles": 3, "sign": 1, "translated": 1, "group": 1, "q": 2,
     "touch_T": 3, "touch_q": 2, "tip": 1, "dh": 2, "scan_kind": 1, "dh_nominal": 2,
 }  # fmt: skip
-LENGTHS = ("translation", "points", "profiles", "tip", "radius")
+LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +131,16 @@ def _from_npz(
     if dataset and not sets:
         raise InputError(f"The file has no sets: leave --set {dataset} away.")
     if dataset:
+        level = raw.get(f"sigma_{dataset.rsplit('_', 1)[-1]}")  # of the noise that the set is named after
         raw = {
             name.removeprefix(f"{dataset}_"): v
             for name, v in raw.items()
             if name.startswith(f"{dataset}_") or name == "radius"
         }
+        if level is not None:
+            raw["sigma"] = level
+    if "sigma" in raw and np.shape(raw["sigma"]) != (3,):
+        raise InputError("The file's 'sigma' holds three numbers: of the robot, of a profile's x and of its z.")
     arrays: dict[str, Floats] = {}
     for name, value in raw.items():
         if value.dtype.kind not in "fiub":

@@ -230,3 +230,21 @@ def test_a_direction_that_is_open_by_centimetres_is_refused() -> None:
         InputError, match=r"translation along \(0.00, 0.00, 1.00\) of the flange almost open \(one sigma 400 mm\)"
     ):
         believed_covariance(cast(ProfilerEstimate, vague))
+
+
+def test_a_noisier_sensor_is_no_outlier_and_an_outlier_is_named(tmp_path: Path) -> None:
+    poses, p = edge()
+    noisy = p + 2.5e-4 * np.random.default_rng(8).standard_normal(p.shape)
+    noisy[5] += [6e-3, -4e-3]
+    arrays = {"rotation": poses.rotation, "translation": poses.translation, "points": noisy, "unit": "m"}
+    np.savez(tmp_path / "noisy.npz", **arrays)
+    np.savez(tmp_path / "said.npz", **arrays, sigma=[3e-5, 2.5e-4, 2.5e-4])
+    for name in ("noisy", "said"):
+        answer = found("edge", tmp_path / f"{name}.npz", "--out", tmp_path / name)
+        record = load_record(tmp_path / name)
+        assert answer["outlier_scans"] == [5]
+        assert answer["sigmas_mm"]["z"] > 0.15
+        assert record.covariance is not None
+        error = record.translation - STATE.translation
+        assert (np.abs(error) < 4.0 * np.sqrt(np.diag(record.covariance))[3:]).all()
+    assert "outlier scans 5" in called("edge", tmp_path / "said.npz", "--out", tmp_path / "said")[1]
