@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.handeye.corners import poses_from_corners, refine_with_corners
+from weldcal.calibration.handeye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
 from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
 from weldcal.calibration.handeye.files import PosePairs, read_pairs
@@ -26,7 +26,7 @@ from weldcal.calibration.handeye.problem import Problem, full_problem
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.calibration.handeye.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 
 Array = NDArray[np.float64]
@@ -165,15 +165,16 @@ def run_hand_eye(
         problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
         result = solve_pairs(pairs, config)
-    said, adopted = [], False
+    said: list[str] = []
+    adopted = False
+    optional = corners is None
     if corners is None:
         corners = pairs.has_corners and not motions and found.name in ("eye_in_hand", "eye_on_base")
     if corners:
         if motions or found.name == "co_manipulation":
             raise InputError("Corners (--corners) go with the poses of one robot.")
-        refined = refine_with_corners(pairs, config)
-        said.append(refined.sentence)
-        if refined.accepted:
+        refined = _refined(pairs, config, said, optional=optional)
+        if refined is not None and refined.accepted:
             adopted = True
             result = replace(refined.result, labels=found.labels, equation=found.equation, warnings=result.warnings)
             pairs = replace(pairs, camera=poses_from_corners(pairs, refined.shift_px))
@@ -195,6 +196,19 @@ def run_hand_eye(
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
     return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), told)
+
+
+def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:
+    """What the corners add, told in ``said``; where nobody asked for them, corners that are of no use leave the poses as given."""
+    try:
+        refined = refine_with_corners(pairs, config)
+    except WeldcalError as problem:
+        if not optional:
+            raise
+        said.append(f"Corners: not used, and the poses are as given. {problem}")
+        return None
+    said.append(refined.sentence)
+    return refined
 
 
 def _no_advice(view: View, arm: Chain | None) -> str:

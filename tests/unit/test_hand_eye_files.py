@@ -213,3 +213,16 @@ def test_samples_that_repeat_others_are_said(tmp_path: Path, poses: tuple[Array,
     path = write("npz", tmp_path, np.concatenate([F, F[:3]]), np.concatenate([G, G[:3]]))
     report = run_hand_eye("ax-yb", path, tmp_path / "out")
     assert any(w.startswith("3 of 15 samples repeat") for w in report.result.warnings)
+
+
+def test_corners_that_are_of_no_use_leave_the_poses_as_given(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    marker = np.array([[-0.05, 0.05, 0.0], [0.05, 0.05, 0.0], [0.05, -0.05, 0.0], [-0.05, -0.05, 0.0]])
+    seen = {"obj": marker, "K": np.diag([600.0, 600.0, 1.0])}
+    for count, sentence in ((len(F), "only 4 corners"), (len(F) - 1, "it must be")):
+        path = tmp_path / "marker.npz"
+        np.savez(path, A=F, B=G, mode="eye_in_hand", img=np.ones((count, 4, 2)), **seen)
+        report = run_hand_eye("ax-yb", path, tmp_path / "out", corners=None)
+        assert sentence in report.corners
+        with pytest.raises(DatasetError, match=sentence):
+            run_hand_eye("ax-yb", path, tmp_path / "out", corners=True)
