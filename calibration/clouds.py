@@ -1,11 +1,13 @@
-"""Point clouds from PLY, PCD and NPZ files, refused with a reason when empty, truncated or full of NaN."""
+"""Point clouds from PLY, PCD, NPZ, NPY and text files, refused with a reason when empty, truncated or full of NaN."""
 
 from __future__ import annotations
 
 import re
 import zipfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
@@ -15,7 +17,11 @@ from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
 
-SUFFIXES = (".ply", ".pcd", ".npz")
+_TEXT = (".csv", ".txt", ".xyz")
+SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *_TEXT)
+NO_NOTES = tuple(
+    s for s in SUFFIXES if s not in (".csv", ".txt")
+)  # such a file beside the clouds is a cloud, not somebody's notes
 _MIN_POINTS = 30
 
 
@@ -29,9 +35,9 @@ class CloudError(InputError):
 
 def find_cloud(folder: Path, id: str) -> Path:
     """The one cloud file of an id. Raises CloudError when there is none or more than one."""
-    found = [folder / f"{id}{s}" for s in SUFFIXES if (folder / f"{id}{s}").is_file()]
+    found = sorted(p for p in folder.iterdir() if p.stem == id and p.suffix.lower() in SUFFIXES)
     if not found:
-        raise CloudError(f"There is no cloud for this pose; add clouds/{id}.pcd, .ply or .npz.")
+        raise CloudError(f"There is no cloud for this pose; add clouds/{id}.pcd, .ply, .npz, .npy or .csv.")
     if len(found) > 1:
         raise CloudError(f"There is more than one cloud for this pose ({', '.join(p.name for p in found)}); keep one.")
     return found[0]
@@ -41,11 +47,12 @@ def read_cloud(path: Path) -> Array:
     """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in the file's unit.
 
     NPZ: ``points`` (N, 3) or (H, W, 3), or ``depth`` (H, W) with ``intrinsics`` (fx, fy, cx, cy) or ``K`` (3, 3), pixel
-    centres at whole numbers; zero or NaN depth is invalid. NaN stands for a missing pixel in organised files.
+    centres at whole numbers; zero or NaN depth is invalid. NPY: such points alone. Text: x, y, z are the first three columns,
+    below a header or none. NaN stands for a missing pixel in organised files.
     Raises CloudError: unreadable, truncated, empty, NaN in a list of points, infinite coordinates.
     """
     try:
-        points, declared = _read_npz(path) if path.suffix.lower() == ".npz" else _read_open3d(path)
+        points, declared = _READERS.get(path.suffix.lower(), _read_open3d)(path)
     except CloudError:
         raise
     except (OSError, ValueError, RuntimeError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as e:
@@ -136,15 +143,39 @@ def _number(pattern: str, text: str) -> int | None:
     return None if found is None else int(found.group(1))
 
 
+def _read_npy(path: Path) -> tuple[Array, None]:
+    return _points(path, "The array", np.load(path, allow_pickle=False)), None
+
+
+def _read_text(path: Path) -> tuple[Array, None]:
+    lines = [re.split(r"[\s,;]+", s.strip().strip(",;")) for s in path.read_text(encoding="utf-8-sig").splitlines()]
+    rows = [line for line in lines if line != [""] and not line[0].startswith(("#", "//"))]
+    if rows and not _is_number(rows[0][0]):
+        rows = rows[1:]
+    if any(len(row) < 3 for row in rows):
+        raise CloudError(f"The file {path.name} has a row of fewer than three numbers; x, y and z are needed.")
+    return np.array([row[:3] for row in rows], dtype=float).reshape(-1, 3), None
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _points(path: Path, name: str, value: Any) -> Array:
+    points = np.asarray(value, dtype=float)
+    if points.ndim not in (2, 3) or points.shape[-1] != 3:
+        raise CloudError(f"{name} in {path.name} has the shape {points.shape}; (N, 3) or (H, W, 3) is needed.")
+    return points
+
+
 def _read_npz(path: Path) -> tuple[Array, int | None]:
     with np.load(path, allow_pickle=False) as data:
         if "points" in data:
-            points = np.asarray(data["points"], dtype=float)
-            if points.ndim not in (2, 3) or points.shape[-1] != 3:
-                raise CloudError(
-                    f"'points' in {path.name} has the shape {points.shape}; (N, 3) or (H, W, 3) is needed."
-                )
-            return points, None
+            return _points(path, "'points'", data["points"]), None
         if "depth" not in data:
             raise CloudError(f"{path.name} holds neither 'points' nor 'depth'.")
         depth = np.asarray(data["depth"], dtype=float)
@@ -166,3 +197,8 @@ def _read_npz(path: Path) -> tuple[Array, int | None]:
     z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]]
     return np.stack([z * (u - cx) / fx, z * (v - cy) / fy, z], axis=-1), None
+
+
+_READERS: dict[str, Callable[[Path], tuple[Array, int | None]]] = {
+    ".npz": _read_npz, ".npy": _read_npy, **dict.fromkeys(_TEXT, _read_text)
+}  # fmt: skip

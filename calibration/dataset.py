@@ -14,9 +14,11 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.clouds import SUFFIXES, CloudError, find_cloud, read_cloud, save_cloud
+from weldcal.calibration.clouds import NO_NOTES, CloudError, find_cloud, read_cloud, save_cloud
 from weldcal.calibration.dataset_header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
+from weldcal.models.errors import InputError
+from weldcal.models.tables import read_rows
 
 Array = NDArray[np.float64]
 
@@ -73,9 +75,12 @@ def load_dataset(folder: Path) -> Dataset:
     Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
     unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
     whose size shows the wrong unit. A cloud without a pose is an error; a pose without a cloud is refused by name;
-    clouds themselves are read later.
+    clouds themselves are read later. A scan
+    that repeats another one to the last digit is refused by name.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise DatasetError(f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml.")
     if not folder.is_dir():
         raise DatasetError(
             f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."
@@ -87,18 +92,22 @@ def load_dataset(folder: Path) -> Dataset:
         hashes["poses.csv"] = _sha256(folder / "poses.csv")
         poses = _poses(folder / "poses.csv", scale)
         clouds, refused = _match(folder / "clouds", poses)
+        content = {id: _sha256(cloud) for id, cloud in clouds.items()}
+        again = _repeated({id: (content[id], *poses[id].GetAsMatrix34().ravel()) for id in clouds})
+        clouds = {id: cloud for id, cloud in clouds.items() if id not in dict(again)}
         if not clouds:
             raise DatasetError(
                 f"No pose in '{folder.name}/poses.csv' has a cloud in clouds/; name the files after the ids, for "
                 f"example {next(iter(poses), 'pose01')}.pcd."
             )
-        hashes.update({f"clouds/{path.name}": _sha256(path) for path in clouds.values()})
-        return Dataset(folder, header, poses, clouds, (), refused, hashes)
+        hashes.update({f"clouds/{path.name}": content[id] for id, path in clouds.items()})
+        return Dataset(folder, header, poses, clouds, (), refused + again, hashes)
     if (folder / "pairs.csv").is_file():
         hashes["pairs.csv"] = _sha256(folder / "pairs.csv")
-        return Dataset(
-            folder, header, {}, {}, _pairs(folder / "pairs.csv", scale, UNITS[header.units.clouds]), (), hashes
-        )
+        pairs = _pairs(folder / "pairs.csv", scale, UNITS[header.units.clouds])
+        again = _repeated({p.id: (*p.X_BR.GetAsMatrix34().ravel(), *p.p_CR) for p in pairs})
+        pairs = tuple(p for p in pairs if p.id not in dict(again))
+        return Dataset(folder, header, {}, {}, pairs, again, hashes)
     raise DatasetError(
         f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz."
     )
@@ -164,15 +173,9 @@ def _header(path: Path) -> DatasetHeader:
 
 def _rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream, skipinitialspace=True)
-            names = [n.strip() for n in reader.fieldnames or []]
-            rows = [
-                {(k or "").strip(): (v or "").strip() for k, v in row.items() if not isinstance(v, list)}
-                for row in reader
-            ]
-    except (UnicodeDecodeError, csv.Error) as e:
-        raise DatasetError(f"'{path.name}' is not a CSV text file.") from e
+        names, rows = read_rows(path)
+    except InputError as e:
+        raise DatasetError(str(e)) from e
     missing = [c for c in required if c not in names]
     if missing:
         raise DatasetError(
@@ -273,7 +276,11 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
             clouds[id] = find_cloud(folder, id)
         except CloudError as e:
             refused.append((id, e.reason))
-    orphans = [p for p in sorted(folder.iterdir()) if p.suffix.lower() in SUFFIXES and p.stem not in poses]
+    orphans = [
+        p
+        for p in sorted(folder.iterdir())
+        if p.suffix.lower() in NO_NOTES and p.stem not in poses and not p.name.startswith(".")
+    ]
     if orphans:
         names = ", ".join(p.name for p in orphans[:5])
         raise DatasetError(
@@ -281,6 +288,16 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
             "cloud away."
         )
     return clouds, tuple(refused)
+
+
+def _repeated(scans: Mapping[str, tuple[object, ...]]) -> tuple[tuple[str, str], ...]:
+    """Scans that are another one to the last digit: they would count twice, and be foretold by their own copy."""
+    first: dict[tuple[object, ...], str] = {}
+    again = []
+    for id, scan in scans.items():
+        if (of := first.setdefault(scan, id)) != id:
+            again.append((id, f"It repeats {of} to the last digit; it counts once."))
+    return tuple(again)
 
 
 def _sha256(path: Path) -> str:

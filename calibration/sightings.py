@@ -52,7 +52,7 @@ def see_flanges(
     InputError, before any work, naming the first cloud file that is damaged.
     """
     if data.pairs:
-        return Sightings(tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, ())
+        return Sightings(tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, data.refused)
     _check_clouds(data)
     observations: list[Observation] = []
     fits: dict[str, FlangeFit] = {}

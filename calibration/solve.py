@@ -27,6 +27,7 @@ _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion
 _WIDEST_GATE = 10.0  # so many times wider at most, where three spare numbers or fewer set the scale
 _HUBER = 2.0
 _WORST_SHARE = 0.1  # of the spread of the poses: residuals beyond it are no calibration
+_WORST_TILT_RAD = 0.17  # of the normals' median: no arm, scanner or fit is ten degrees off
 _POSITION_FLOOR_M = 1e-6  # below any scanner or arm: keeps exact synthetic data from dividing by zero
 _NORMAL_FLOOR_RAD = 1e-6
 USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
@@ -113,6 +114,12 @@ def estimate_eye_on_base(
             data.b[inliers], data.has[inliers], min_poses=config.min_poses, allow_coplanar=config.allow_coplanar
         )
     residual, tilt = _residuals(data, solution.X_BC)
+    used = inliers & data.has
+    if used.any() and float(np.median(tilt[used])) > _WORST_TILT_RAD:
+        raise InconsistentPoses(
+            f"The faces seen are turned by {np.degrees(np.median(tilt[used])):.0f} degrees from where the poses have the flange's z axis:"
+            " check the quaternion order (qw, qx, qy, qz) and that the poses are those of the flange, not of a tool."
+        )
     held_out = HeldOut(residual.copy(), tilt.copy())
     if config.leave_one_out:
         held_out = _leave_one_out(data, inliers, solution, held_out, config.usual_weight)
@@ -120,7 +127,7 @@ def estimate_eye_on_base(
     if not inliers.all():
         names = ", ".join(o.id for o, keep in zip(observations, inliers, strict=True) if not keep)
         warnings.append(f"{n - int(inliers.sum())} of {n} poses disagree with the rest and were left out: {names}.")
-    used = [o for o, keep in zip(observations, inliers, strict=True) if keep]
+    kept = [o for o, keep in zip(observations, inliers, strict=True) if keep]
     sigma_p = float(np.sqrt(solution.var_p))
     return CalibrationEstimate(
         X_BC=solution.X_BC,
@@ -131,7 +138,7 @@ def estimate_eye_on_base(
         held_out=held_out,
         sigma_position_m=sigma_p,
         sigma_normal_rad=float(np.sqrt(solution.var_n)),
-        unobservable=unobservable_sentences([o.X_BR for o in used], sigma_p, bool(data.has.any())),
+        unobservable=unobservable_sentences([o.X_BR for o in kept], sigma_p, bool(data.has.any())),
         warnings=tuple(warnings),
     )
 

@@ -152,6 +152,10 @@ def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStanda
     """
     flange = STANDARDS.get(name.strip().lower().replace(" ", "-").replace(",", "."))
     if flange is None:
+        if not name:
+            raise InputError(
+                f"No flange is named: write 'flange:' in dataset.yaml, or add --flange; known are {', '.join(STANDARDS)}."
+            )
         raise InputError(f"Flange '{name}' is not known: use one of {', '.join(STANDARDS)}.")
     return flange if pin_angle_rad is None else replace(flange, pin_angle_rad=pin_angle_rad)
 

@@ -177,7 +177,11 @@ def calibrate_dataset(
     algorithm1, verifier, icp = compare_algorithm1(observations, inliers, clouds, fits, standard, seed)
     curve = convergence(inliers, verifier, orders=8, seed=seed)
     warnings = list(estimate.warnings)
-    if turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
+    if data.pairs and not any(p.has_orientation for p in data.pairs):
+        warnings.append(
+            "The pairs have no orientations: whether a constant error of the flange centre hides in the figures cannot be told."
+        )
+    elif turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
             "The poses hardly differ in orientation: a constant error of the flange centre would not show in these "
             "figures."

@@ -21,8 +21,32 @@ TrialOption = Annotated[
 RobotSigma = Annotated[
     float, typer.Option("--sigma-robot", metavar="MM", help="The robot's position, one sigma per axis.")
 ]
-XSigma = Annotated[float, typer.Option("--sigma-x", metavar="MM", help="A profile point along the line, one sigma.")]
 ZSigma = Annotated[float, typer.Option("--sigma-z", metavar="MM", help="A profile point in depth, one sigma.")]
+OF_POINTS = "the file's, else what the points show, {} at least"
+EdgeRobotSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma-robot",
+        metavar="MM",
+        help="The robot's position, one sigma per axis.",
+        show_default=OF_POINTS.format(0.03),
+    ),
+]
+EdgeXSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma-x",
+        metavar="MM",
+        help="A profile point along the line, one sigma.",
+        show_default=OF_POINTS.format(0.05),
+    ),
+]
+EdgeZSigma = Annotated[
+    float | None,
+    typer.Option(
+        "--sigma-z", metavar="MM", help="A profile point in depth, one sigma.", show_default=OF_POINTS.format(0.06)
+    ),
+]
 PlanOption = Annotated[int, typer.Option("--plan", metavar="N", min=0, help="Also name N poses to add next.")]
 RadiusOption = Annotated[
     float | None, typer.Option("--radius", metavar="MM", help="The sphere's, where the file has none.")
@@ -58,9 +82,9 @@ def edge(
     ] = "joint",
     feature: Annotated[str, typer.Option("--feature", metavar="KIND", help="In raw profiles: bar, step or apex.")] = "",
     side: Annotated[str, typer.Option("--side", metavar="S", help="End of the near face: left or right.")] = "left",
-    sigma_robot: RobotSigma = 0.03,
-    sigma_x: XSigma = 0.05,
-    sigma_z: ZSigma = 0.06,
+    sigma_robot: EdgeRobotSigma = None,
+    sigma_x: EdgeXSigma = None,
+    sigma_z: EdgeZSigma = None,
     plan: PlanOption = 0,
     out: OutOption = None,
     seed: SeedOption = 0,
@@ -69,14 +93,17 @@ def edge(
 ) -> None:
     """The profiler's pose on the flange, from points of one straight edge seen in any poses; no guess is needed."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import Sigmas, calibrate_edge, write_calibration
+        from weldcal.tools.profiler import calibrate_edge, write_calibration
         from weldcal.tools.profiler_files import read_profiler_file
+        from weldcal.tools.profiler_noise import Sigmas
 
-        sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_x, 1e-3 * sigma_z)
+        given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
+        robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
+        sigmas = Sigmas(robot, x, z, stated=any(v is not None for v in given))
         data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
         record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=seed)
         folder = _folder(out, file, seed)
-        write_calibration(record, folder)
+        found |= write_calibration(record, folder)
     _report("profiler edge", found, folder, json)
 
 
@@ -84,6 +111,7 @@ def edge(
 def sphere(
     file: FileArgument,
     unit: UnitOption = None,
+    dataset: SetOption = "",
     trial: TrialOption = None,
     radius: RadiusOption = None,
     model: Annotated[str, typer.Option("--model", metavar="M", help="auto, rigid, affine or affine+joints.")] = "auto",
@@ -100,15 +128,16 @@ def sphere(
 ) -> None:
     """The profiler's pose on the flange, from raw profiles of a sphere; no sides, no pure translations, no guess."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import Sigmas, calibrate_sphere, write_calibration
+        from weldcal.tools.profiler import calibrate_sphere, write_calibration
+        from weldcal.tools.profiler_noise import Sigmas
 
         sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
         lost: list[int] = []
-        data, measured = _sphere(file, unit, trial, radius, arm, touches, tip, seed, lost)
+        data, measured = _sphere(file, unit, dataset, trial, radius, arm, touches, tip, seed, lost)
         record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=seed)
         found["without_sphere"] = lost
         folder = _folder(out, file, seed)
-        write_calibration(record, folder)
+        found |= write_calibration(record, folder)
     _report("profiler sphere", found, folder, json)
 
 
@@ -116,6 +145,7 @@ def sphere(
 def compensate(
     file: FileArgument,
     unit: UnitOption = None,
+    dataset: SetOption = "",
     trial: TrialOption = None,
     radius: RadiusOption = None,
     touches: TouchesOption = None,
@@ -132,10 +162,10 @@ def compensate(
     with console.boundary(json_wanted=json, debug=debug):
         from weldcal.tools.profiler import calibrate_compensate, write_calibration
 
-        data, measured = _sphere(file, unit, trial, radius, "", touches, tip, seed)
+        data, measured = _sphere(file, unit, dataset, trial, radius, "", touches, tip, seed)
         record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
         folder = _folder(out, file, seed)
-        write_calibration(record, folder)
+        found |= write_calibration(record, folder)
     if found["wrong_sides"]:
         console.emit_warning(
             f"The side of the sphere's centre is likely wrong in scans {found['wrong_sides']}: check their sign."
@@ -169,6 +199,7 @@ def seam(
 def _sphere(
     file: Path,
     unit: str | None,
+    dataset: str,
     trial: int | None,
     radius: float | None,
     arm: str,
@@ -189,7 +220,7 @@ def _sphere(
         raise InputError(f"The tip is three numbers in mm with commas between, as --tip 0,0,150, not '{tip}'.") from e
     if tip_m is not None and tip_m.shape != (3,):
         raise InputError(f"The tip is three numbers in mm with commas between, as --tip 0,0,150, not '{tip}'.")
-    data = read_profiler_file(file, unit=unit, trial=trial)
+    data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
     felt = None if touches is None else read_profiler_file(touches, unit=unit)
     radius_m = None if radius is None else 1e-3 * radius
     return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=seed)
@@ -201,10 +232,28 @@ def _folder(out: Path | None, file: Path, seed: int) -> Path:
     return out or fresh_folder("profiler", file.stem, seed)
 
 
+def _pose_rows(X_FS: list[list[float]]) -> dict[str, str]:
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_matrix([row[:3] for row in X_FS[:3]]).as_euler("xyz", degrees=True)
+    return {
+        "X_FS": "pose of the scan plane in the flange frame",
+        "position": "  ".join(f"{1e3 * row[3]:+.3f}" for row in X_FS[:3]) + "  mm",
+        "roll pitch yaw": "  ".join(f"{v:+.4f}" for v in turn) + "  deg",
+    }
+
+
 def _report(command: str, found: Mapping[str, object], folder: Path, json: bool) -> None:
     from weldcal.tools.cli_options import finish
 
-    rows = {}
+    rows: dict[str, str] = {}
+    X = found.get("X_FS")
+    if isinstance(X, list):
+        rows |= _pose_rows(X)
+    for key in ("outlier_scans", "wrong_scans", "without_feature", "without_sphere", "without_groove", "wrong_sides"):
+        numbers = found.get(key)
+        if isinstance(numbers, list) and numbers:
+            rows[key.replace("_", " ")] = ", ".join(map(str, numbers))
     after = found.get("next_poses")
     if isinstance(after, dict):
         for k, pose in enumerate(after["poses"]):

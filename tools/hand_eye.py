@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.handeye.corners import poses_from_corners, refine_with_corners
+from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
+from weldcal.calibration.handeye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
 from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
 from weldcal.calibration.handeye.files import PosePairs, read_pairs
@@ -26,7 +26,7 @@ from weldcal.calibration.handeye.problem import Problem, full_problem
 from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.calibration.handeye.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
-from weldcal.models.errors import InputError
+from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 
 Array = NDArray[np.float64]
@@ -100,10 +100,10 @@ class HandEyeReport:
                 + "  deg  +- "
                 + _sigmas(np.degrees(sigma[:3]), 57.3),
             ]
-        lines += [
-            "",
-            f"held out     {r.held_out.rms_deg:.4f} deg   {1e3 * r.held_out.rms_translation:.3f} mm (rms, 5 folds)",
-        ]
+        lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
+        if not r.inliers.all():
+            kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
+            lines += [f"             {_held_out(kept, 'without those left out, ')}"]
         lines += [f"weighting    {r.method}"]
         lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
         if self.corners:
@@ -165,15 +165,16 @@ def run_hand_eye(
         problem = problem_of_pairs(pairs)
         say(check_poses(problem).sentence())
         result = solve_pairs(pairs, config)
-    said, adopted = [], False
+    said: list[str] = []
+    adopted = False
+    optional = corners is None
     if corners is None:
         corners = pairs.has_corners and not motions and found.name in ("eye_in_hand", "eye_on_base")
     if corners:
         if motions or found.name == "co_manipulation":
             raise InputError("Corners (--corners) go with the poses of one robot.")
-        refined = refine_with_corners(pairs, config)
-        said.append(refined.sentence)
-        if refined.accepted:
+        refined = _refined(pairs, config, said, optional=optional)
+        if refined is not None and refined.accepted:
             adopted = True
             result = replace(refined.result, labels=found.labels, equation=found.equation, warnings=result.warnings)
             pairs = replace(pairs, camera=poses_from_corners(pairs, refined.shift_px))
@@ -195,6 +196,19 @@ def run_hand_eye(
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
     return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), told)
+
+
+def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:
+    """What the corners add, told in ``said``; where nobody asked for them, corners that are of no use leave the poses as given."""
+    try:
+        refined = refine_with_corners(pairs, config)
+    except WeldcalError as problem:
+        if not optional:
+            raise
+        said.append(f"Corners: not used, and the poses are as given. {problem}")
+        return None
+    said.append(refined.sentence)
+    return refined
 
 
 def _no_advice(view: View, arm: Chain | None) -> str:
@@ -230,8 +244,21 @@ def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEy
     mistake = likely_mistake(pairs, result, config)
     if mistake is not None:
         raise InconsistentPoses(mistake)
-    scale = scale_warning(problem, result)
-    return result if scale is None else replace(result, warnings=(*result.warnings, scale))
+    said = [w for w in (scale_warning(problem, result), _repeated(pairs)) if w is not None]
+    return replace(result, warnings=(*result.warnings, *said))
+
+
+def _repeated(pairs: PosePairs) -> str | None:
+    seen = np.hstack(
+        [X.reshape(len(X), -1) for X in (pairs.robot, pairs.camera, pairs.robot2, pairs.link) if X is not None]
+    )
+    again = len(seen) - len(np.unique(seen, axis=0))
+    if not again:
+        return None
+    return (
+        f"{again} of {len(seen)} samples repeat others to the last digit: they make the uncertainty and the held-out errors look smaller "
+        "than they are; take them out."
+    )
 
 
 def problem_of_pairs(pairs: PosePairs) -> Problem:
@@ -251,6 +278,12 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
                 )
             )
     return tuple(rows)
+
+
+def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
+    if not np.isfinite(held_out.rms_translation):
+        return "nothing: too few poses to leave some out"
+    return f"{held_out.rms_deg:.4f} deg   {1e3 * held_out.rms_translation:.3f} mm ({of}rms, 5 folds)"
 
 
 def _sigmas(values: Array, certain: float) -> str:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.edge_features import Kind, extract_edge
-from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge_joint import EdgeEstimate
 from weldcal.calibration.profiler.edge_linear import edge_linear
 from weldcal.calibration.profiler.edge_model import EdgeState
 from weldcal.calibration.profiler.errors import ArcNotFound, FeatureNotFound
@@ -27,7 +28,7 @@ from weldcal.calibration.profiler.plan import (
     sample_sphere_poses,
 )
 from weldcal.calibration.profiler.record import ProfilerRecord, load_record, save_record
-from weldcal.calibration.profiler.result import ProfilerEstimate
+from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, choose_model, sphere_joint
 from weldcal.calibration.profiler.sphere_linear import (
     compensate,
@@ -37,31 +38,21 @@ from weldcal.calibration.profiler.sphere_linear import (
     wrong_sides,
 )
 from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.calibration.result import matrix4
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.profiler_files import ProfilerFile
+from weldcal.tools.profiler_noise import Sigmas, edge_by_noise
 from weldcal.tools.report.render import write_atomic
 
 CANDIDATES = 300
 POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried
+FAR_FROM_EDGE_MM = 1.0
 RADIUS_OFF_M = 0.1e-3
 ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
 Estimate = TypeVar("Estimate", EdgeEstimate, SphereEstimate)
 MODELS = ("auto", "rigid", "affine", "affine+joints")
 FEATURES = ("bar", "step", "apex")
-
-
-@dataclass(frozen=True)
-class Sigmas:
-    """What is known of sensor and robot, m."""
-
-    robot_m: float = 0.03e-3
-    x_m: float = 0.05e-3
-    z_m: float = 0.06e-3
-
-    def __post_init__(self) -> None:
-        if not (self.robot_m >= 0.0 and self.x_m > 0.0 and self.z_m > 0.0):
-            raise InputError("The sigmas of x and z must be positive, and the robot's not negative.")
 
 
 def calibrate_edge(
@@ -92,11 +83,19 @@ def calibrate_edge(
         group = file.arrays["group"][keep] if "group" in file.arrays else rotation_groups(poses)
         linear = edge_linear(poses.rotation, poses.translation, points, group)
         found |= {"mean_distance_mm": 1e3 * float(linear.distances_m.mean())}
+        if found["mean_distance_mm"] > FAR_FROM_EDGE_MM:
+            found["warnings"] = [
+                f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average: scan one edge only, and check unit and poses."
+            ]
         return ProfilerRecord(
             "edge, linear", linear.rotation, linear.translation, figures=found, data_sha256=file.digest
         ), found
-    xz = np.array([sigmas.x_m, sigmas.z_m])
-    e = _widened(edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=sigmas.robot_m, sigma_xz_m=xz))
+    if not sigmas.stated and "sigma" in file.arrays:
+        robot, x, z = (float(v) for v in file.arrays["sigma"])
+        sigmas = Sigmas(robot, x, z)
+    e, sigmas = edge_by_noise(poses, points, sigmas)
+    e, xz = _widened(e), np.array([sigmas.x_m, sigmas.z_m])
+    found["sigmas_mm"] = {"robot": 1e3 * sigmas.robot_m, "x": 1e3 * sigmas.x_m, "z": 1e3 * sigmas.z_m}
     found |= _figures(e) | {"outlier_scans": [int(k) for k in np.flatnonzero(keep)[~e.inliers]]}
     if plan:
         state = EdgeState(e.rotation, e.translation, e.point, e.direction)
@@ -225,8 +224,7 @@ def calibrate_sphere(
 
 
 def _widened(e: Estimate) -> Estimate:
-    """With the covariance that its residuals speak for, where they are larger than the sigmas stated."""
-    return replace(e, covariance=e.covariance * max(1.0, e.reduced_chi2 if np.isfinite(e.reduced_chi2) else 1.0))
+    return replace(e, covariance=believed_covariance(e))
 
 
 def _refuse_turned_round(data: SphereData, s: SphereSigmas) -> None:
@@ -385,6 +383,9 @@ def _next(candidates: FlangePoses, chosen: tuple[int, ...], rms_m: Floats) -> di
     }
 
 
-def write_calibration(record: ProfilerRecord, folder: Path) -> None:
-    """profiler.yaml and X_FS.json."""
+def write_calibration(record: ProfilerRecord, folder: Path) -> dict[str, Any]:
+    """profiler.yaml and X_FS.json; the pose as the JSON object has it."""
     save_record(record, folder)
+    return {
+        "X_FS": matrix4(RigidTransform(RotationMatrix.ProjectToRotationMatrix(record.rotation), record.translation))
+    }

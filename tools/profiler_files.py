@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import zipfile
 from dataclasses import dataclass
@@ -15,9 +14,11 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
+from weldcal.models.tables import read_rows
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 NEAR_M = 0.02  # nor always this near
+LONGEST_TURN = 7.0  # rad: a whole turn and a little
 FAR_M = 20.0  # no robot's flange is this far from its base
 
 # other names of the same things: of files with one axis more, for trials or worlds
@@ -29,7 +30,7 @@ DIMENSIONS = {
     "T": 3, "rotation": 3, "translation": 2, "points": 2, "profiles": 3, "sign": 1, "translated": 1, "group": 1, "q": 2,
     "touch_T": 3, "touch_q": 2, "tip": 1, "dh": 2, "scan_kind": 1, "dh_nominal": 2,
 }  # fmt: skip
-LENGTHS = ("translation", "points", "profiles", "tip", "radius")
+LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,11 +131,16 @@ def _from_npz(
     if dataset and not sets:
         raise InputError(f"The file has no sets: leave --set {dataset} away.")
     if dataset:
+        level = raw.get(f"sigma_{dataset.rsplit('_', 1)[-1]}")  # of the noise that the set is named after
         raw = {
             name.removeprefix(f"{dataset}_"): v
             for name, v in raw.items()
             if name.startswith(f"{dataset}_") or name == "radius"
         }
+        if level is not None:
+            raw["sigma"] = level
+    if "sigma" in raw and np.shape(raw["sigma"]) != (3,):
+        raise InputError("The file's 'sigma' holds three numbers: of the robot, of a profile's x and of its z.")
     arrays: dict[str, Floats] = {}
     for name, value in raw.items():
         if value.dtype.kind not in "fiub":
@@ -155,11 +161,17 @@ def _from_npz(
         arrays["dh"] = arrays["dh"] * [scale, 1.0, scale, 1.0]
     profiles = None
     if "n" in arrays and "xz" in raw:
+        if raw["xz"].ndim != 2 or raw["xz"].shape[1] != 2:
+            raise InputError(f"'xz' holds profile points [x, z] (n, 2), not an array of shape {raw['xz'].shape}.")
         n = arrays["n"].astype(int)
         if n.sum() != len(raw["xz"]):
             raise InputError(f"The profiles' lengths 'n' add up to {n.sum()}, and 'xz' has {len(raw['xz'])} points.")
         profiles = tuple(np.split(np.asarray(raw["xz"], float) * scale, np.cumsum(n)[:-1]))
     elif "profiles" in arrays:
+        if arrays["profiles"].ndim != 3 or arrays["profiles"].shape[2] != 2:
+            raise InputError(
+                f"Profiles hold points [x, z] (n, m, 2), not an array of shape {arrays['profiles'].shape}."
+            )
         profiles = tuple(arrays["profiles"])
     return arrays, profiles
 
@@ -176,31 +188,37 @@ def _of_trial(value: Floats, trial: int | None) -> Floats:
 
 def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
     """One row for each profile point: the flange's x, y, z and rotation vector, then the point; scans by a column `scan`."""
-    try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
-        table = np.array([[float(v) for v in row] for row in rows[1:] if row], float)
-    except (ValueError, UnicodeDecodeError) as e:
-        raise InputError(
-            f"'{path.name}' has a cell that is no number, or is no text: one header line, then numbers."
-        ) from e
-    header = [name.strip() for name in rows[0]] if rows else []
-    if table.ndim != 2 or table.shape[1] != len(header):
-        raise InputError(f"'{path.name}' needs a header and rows of as many numbers as it has names.")
+    header, rows = read_rows(path)
+    if not rows:
+        raise InputError(f"'{path.name}' needs a header and a row of numbers for each profile point.")
     unit = next((u for u in UNITS if f"x_{u}" in header), None)
     wanted = [] if unit is None else [f"{v}_{unit}" for v in "xyz"] + ["rx_rad", "ry_rad", "rz_rad"]
     if unit is None or not set(wanted) <= set(header):
         raise InputError(
             "The CSV's header needs x_mm, y_mm, z_mm (or _m) and rx_rad, ry_rad, rz_rad, the flange's rotation vector."
         )
-    pose = table[:, [header.index(name) for name in wanted]]
+
+    def columns(*names: str) -> Floats:
+        try:
+            return np.array([[float(row[name] or "nan") for name in names] for row in rows])
+        except ValueError as e:
+            raise InputError(f"'{path.name}' has a cell that is no number in {', '.join(names)}: {e}.") from e
+
+    pose = columns(*wanted)
+    turn = float(np.nanmax(np.linalg.norm(pose[:, 3:], axis=1), initial=0.0))
+    if turn > LONGEST_TURN:
+        raise InputError(
+            f"The rotation vectors rx_rad, ry_rad, rz_rad of '{path.name}' are up to {turn:.0f} long, more than a whole turn: they look "
+            "like degrees; write radians."
+        )
     seen = [f"px_{unit}", f"pz_{unit}"]
     points: NDArray[np.float64] | None = None
     if set(seen) <= set(header):
-        points = table[:, [header.index(name) for name in seen]] * UNITS[unit]
-    first = np.arange(len(table))
+        points = columns(*seen) * UNITS[unit]
+    first = np.arange(len(rows))
     profiles = None
     if "scan" in header:
-        scan = table[:, header.index("scan")]
+        scan = columns("scan")[:, 0]
         _, first, of = np.unique(scan, return_index=True, return_inverse=True)
         if points is not None:
             profiles = tuple(points[of == k] for k in range(len(first)))

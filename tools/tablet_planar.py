@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses as dc
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ _SCALE_LEAST = 2.5e-3
 _OTHER_UNIT = 5.0  # lengths that differ by more than this factor are in different units
 _BETTER = 0.4  # what a changed sign must leave of the residuals to be told
 _BAD_M = 2e-3  # residuals above this are no noise
+_CONTRADICTION = 0.1  # residuals that are this share of the landmarks' spread are no calibration
+_LIKE_A_UNIT = 0.2  # of the logarithm: a factor this near one of units is one
+_ONE_ORDER = "check that uv, hand, theta_deg, delta_px and tablet_px hold the landmarks in one order"
 _LEAST_TO_DOUBT = 6  # landmarks, so that five still check each other when one is doubted
 _LEAST_DOUBTED_M = 0.5e-3  # residuals below this are nobody's mistake
 
@@ -79,11 +82,11 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
         rows = ", ".join(map(str, visit.left_out))
         warnings.append(f"Left out, for want of finite numbers: landmark {rows}.")
     odd = _other_signs(touches, sign, planar.sigma_m) + _odd_landmarks(visit, planar, config)
+    if not odd:
+        _refuse_contradictions(fits, touches)
+        odd = _mirrored(touches)
     if planar.sigma_m > _BAD_M and not odd:
-        odd = [
-            f"The touches fit to {1e3 * planar.sigma_m:.1f} mm only: check that uv, hand, theta_deg, delta_px and tablet_px hold the "
-            "landmarks in one order."
-        ]
+        odd = [f"The touches fit to {1e3 * planar.sigma_m:.1f} mm only: {_ONE_ORDER}."]
     warnings += odd
     return VisitFits(visit, fits, tuple(warnings), step_m)
 
@@ -111,10 +114,40 @@ def _fit_planar(touches: TabletTouches, config: PlanarConfig, thorough: bool) ->
 def _same_units(planar: PlanarFit) -> None:
     scale = planar.free_scale[0]
     if not 1.0 / _OTHER_UNIT < scale < _OTHER_UNIT:
+        unit = min(abs(np.log(scale * k)) for k in (1e3, 1e-3, 10.0, 0.1, 25.4, 1 / 25.4)) < _LIKE_A_UNIT
         raise InputError(
             f"The hand moved {scale:.3g} times as far as the tablet's landmarks lie apart: write hand and hand_capture in "
             "millimetres, and mm_per_px in millimetres per pixel of tablet_px."
+            if unit
+            else f"Hands and landmarks do not belong together (the hand moved {scale:.3g} times as far): {_ONE_ORDER}."
         )
+
+
+def _refuse_contradictions(fits: Mapping[str, PlanarFit | LinearFit], touches: TabletTouches) -> None:
+    """Touches that no model explains are no calibration.
+
+    Raises:
+        InputError: what is left of them is a good part of where they are.
+    """
+    left, spread = min(fit.sigma_m for fit in fits.values()), _spread_m(touches)
+    if left > _CONTRADICTION * spread:
+        raise InputError(
+            f"The touches contradict each other: they fit to {1e3 * left:.0f} mm only, on landmarks {1e3 * spread:.0f} mm from their "
+            f"middle: {_ONE_ORDER}, x before y."
+        )
+
+
+def _mirrored(touches: TabletTouches) -> list[str]:
+    """A camera sees a page from its front: what runs clockwise on the page does so in the picture."""
+    page = np.column_stack([touches.landmark_px, np.ones(len(touches.landmark_px))])
+    turned = np.linalg.det(np.linalg.lstsq(page, touches.uv_px, rcond=None)[0][:2])
+    return [
+        "uv shows the page as in a mirror: u and v are exchanged, or one of them is counted the other way. Check the file."
+    ] * bool(turned < 0.0)
+
+
+def _spread_m(touches: TabletTouches) -> float:
+    return float(np.sqrt(((touches.landmark_m - touches.landmark_m.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str]:
@@ -139,7 +172,7 @@ def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str
         if sign is Sign.PRINTED and what.startswith("delta_px"):
             continue
         left = fit_planar(other, PlanarConfig(sign=sign), leave_one_out=False).sigma_m
-        if left < _BETTER * sigma_m:
+        if left < min(_BETTER * sigma_m, _CONTRADICTION * _spread_m(touches)):
             found.append(
                 f"The touches fit to {1e3 * left:.2f} mm instead of {1e3 * sigma_m:.2f} with {what}. Check the file."
             )

@@ -29,6 +29,8 @@ Progress = Callable[[str, float], None]
 
 _FEW = 4
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a verification
+_GROSS = 10.0  # times the usual error: a scan of something else
+_WORST_TILT_DEG = 10.0
 _SAME_MM = 1e-6  # a scan of the same name whose error repeats the recorded residual to a nanometre is the same scan
 _EVIDENT = 4.0  # standard errors of a scale error that is worth naming
 
@@ -208,11 +210,23 @@ def _doubts(
         )
     stated = result.held_out_mm.get("p95")
     median = float(np.median([p.error_mm for p in poses]))
-    if stated is not None and n >= _FEW and median > stated:
+    if stated is not None and median > (stated if n >= _FEW else _GROSS * stated):
         out.append(
             f"The median error, {median:.2f} mm, is larger than what the calibration stated for 95 % of its own held-out "
             f"scans ({stated:.2f} mm): scanner, robot or flange has changed, or these scans lie elsewhere; calibrate "
             "again."
+        )
+    gross = [p for p in poses if p.error_mm > _GROSS * max(median, stated or 0.0)]
+    if gross:
+        names = ", ".join(f"{p.id} by {p.error_mm:.1f} mm" for p in gross[:8]) + (" ..." if len(gross) > 8 else "")
+        out.append(
+            f"{len(gross)} of the {n} scans {'is' if len(gross) == 1 else 'are'} far off while the others are not: {names}."
+        )
+    tilts = [p.tilt_deg for p in poses if p.tilt_deg is not None]
+    if tilts and float(np.median(tilts)) > _WORST_TILT_DEG:
+        out.append(
+            f"The faces seen are turned by {np.median(tilts):.0f} degrees from where the poses have the flange's z axis: check the "
+            "quaternion order (qw, qx, qy, qz), that the poses are the flange's, and the calibration."
         )
     if result.scanner_correction is None:
         out.append(_uncorrected(result, observations))

@@ -42,10 +42,17 @@ class CornerRefinement:
 def poses_from_corners(pairs: PosePairs, shift_px: Array) -> Array:
     """Poses (n, 4, 4) of the board in the camera that reproject best, the principal point moved by ``shift_px``.
 
-    Raises DatasetError where the file has no corners or fewer than six in an image.
+    Raises DatasetError where the file has no corners, fewer than six in an image, or arrays that do not belong together.
     """
     if pairs.img is None or pairs.obj is None or pairs.K is None:
         raise DatasetError(f"'{pairs.source}' holds no corners (img, obj, K): leave out --corners.")
+    n, m = len(pairs.camera), len(pairs.obj)
+    wanted = {"img": (n, m, 2), "obj": (m, 3), "K": (3, 3)}
+    for name, array in (("img", pairs.img), ("obj", pairs.obj), ("K", pairs.K)):
+        if array.shape != wanted[name]:
+            raise DatasetError(
+                f"'{name}' of '{pairs.source}' has the shape {array.shape}, and it must be {wanted[name]}."
+            )
     K = pairs.K.copy()
     K[:2, 2] += shift_px
     dist = np.zeros(5) if pairs.dist is None else pairs.dist

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import csv
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,18 @@ from weldcal.calibration.hand_eye import as_poses
 from weldcal.calibration.handeye.mountings import chain, get_mounting
 from weldcal.calibration.handeye.se3 import exp_rotation, inverse, pose
 from weldcal.models.errors import InputError
+from weldcal.models.tables import read_rows
 
 Array = NDArray[np.float64]
 
+_NAMES = {
+    "robot": ("A", "robot", "X_BF", "X_base_gripper"), "camera": ("B", "camera", "X_CM", "X_camera_target"),
+    "robot2": ("C", "robot2", "X_DE"), "link": ("L", "link", "X_BL"),
+}  # fmt: skip
+_WHO = ("robot", "camera", "robot2", "link")
+_JOINTS = tuple(f"q{i}" for i in range(1, 10))
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+_LONGEST_TURN = 7.0  # rad: a whole turn and a little
 _FAR_M = 20.0  # no arm and no camera on one reach this far: the numbers are not metres
 
 
@@ -82,6 +91,8 @@ def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = 
     ending = path.suffix.lower()
     if ending == ".npz":
         raw = _npz(path)
+    elif ending in (".npy", ".mat", ".pkl", ".bag", ".db3"):
+        raise DatasetError(f"'{path.name}' cannot be read: give npz, CSV, JSON, or samples of easy_handeye2 or MoveIt.")
     elif ending in (".csv", ".txt"):
         raw = _csv(path)
     else:
@@ -120,12 +131,14 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
         raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
     if len(robot) != len(camera):
         raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(camera)} camera poses.")
-    for X, name in ((robot, "robot"), (camera, "camera")):
-        far = float(np.median(np.linalg.norm(X[:, :3, 3], axis=1)))
-        if far > _FAR_M:
-            raise DatasetError(
-                f"The {name} positions of '{path.name}' are {far:.0f} m away, as metres; if they are millimetres, add --unit mm."
-            )
+    far = {n: float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) for X, n in ((robot, "robot"), (camera, "camera"))}
+    for name, distance in far.items():
+        if distance > _FAR_M:
+            other = min(far.values())
+            mend = f"the others {other:.2g} m: bring both to one unit"
+            if other > 1e-2 * distance:
+                mend = "if they are millimetres, add --unit mm"
+            raise DatasetError(f"The {name} positions of '{path.name}' are {distance:.0f} m away, as metres; {mend}.")
     if raw.get("inverted") and mode == "eye_on_base":  # easy_handeye2 then stores the base in the hand
         robot = inverse(robot)
     X_true = raw.get("X_true")
@@ -155,13 +168,16 @@ def _npz(path: Path) -> dict[str, Any]:
     try:
         with np.load(path, allow_pickle=False) as z:
             raw = {k: z[k] for k in z.files}
-    except (OSError, ValueError) as e:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as e:
         raise DatasetError(f"'{path.name}' is not an npz file of plain arrays.") from e
     out: dict[str, Any] = {k: raw[k] for k in ("X_true", "img", "obj", "K", "dist", "q") if k in raw}
-    out["robot"], out["camera"] = raw.get("A", raw.get("robot")), raw.get("B", raw.get("camera"))
-    out["robot2"], out["link"] = raw.get("C", raw.get("robot2")), raw.get("L", raw.get("link"))
-    out["mode"] = str(raw.get("mode", raw.get("configuration", "")))
-    out["unit"] = str(raw.get("unit", ""))
+    for key, known in _NAMES.items():
+        out[key] = next((raw[name] for name in known if name in raw), None)
+    out["mode"], out["unit"] = _word(raw, "mode", "configuration"), _word(raw, "unit")
+    if "hand" in raw and "eye" in raw and out["robot"] is None:
+        raise DatasetError(
+            f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B (n, 4, 4)."
+        )
     if out["robot"] is None or out["camera"] is None:
         raise DatasetError(
             f"'{path.name}' has no arrays A and B (n, 4, 4): A = pose of the flange in the base, B = of the target in the camera."
@@ -169,31 +185,38 @@ def _npz(path: Path) -> dict[str, Any]:
     return out
 
 
+def _word(raw: dict[str, Array], *keys: str) -> str:
+    """A word of an npz: a string, bytes, or an array that holds one of them."""
+    value = next((raw[k] for k in keys if k in raw), None)
+    if value is None or np.size(value) != 1:
+        return ""
+    word = np.ravel(value)[0]
+    return word.decode("utf-8", "replace") if isinstance(word, bytes) else str(word)
+
+
 def _csv(path: Path) -> dict[str, Any]:
-    with path.open(newline="", encoding="utf-8-sig") as stream:
-        rows = [r for r in csv.reader(stream) if r and not r[0].lstrip().startswith("#")]
-    if not rows:
+    try:
+        names, rows = read_rows(path)
+    except InputError as e:
+        raise DatasetError(str(e)) from e
+    if not names:
         raise DatasetError(f"'{path.name}' is empty.")
-    names = [c.strip().lower() for c in rows[0]]
     wanted = "robot_x,robot_y,robot_z,robot_qw,robot_qx,robot_qy,robot_qz,camera_x, ... camera_qz"
     if not any(n.startswith("robot_") for n in names):
         raise DatasetError(f"The first line of '{path.name}' must name its columns: {wanted} (or _rx,_ry,_rz).")
+    if not rows:
+        raise DatasetError(f"'{path.name}' has a header and no samples.")
+    mine = [n for n in names if n.split("_")[0] in _WHO or n in _JOINTS]
     try:
-        table = np.array(
-            [
-                [float(c) if c.strip() else np.nan for c in (r + [""] * len(names))[: len(names)]]
-                for r in ([c if names[i] != "id" else "0" for i, c in enumerate(r)] for r in rows[1:])
-            ]
-        )
+        table = np.array([[float(row[n]) if row[n] else np.nan for n in mine] for row in rows])
     except ValueError as e:
         raise DatasetError(f"'{path.name}' holds something that is not a number: {e}.") from e
-    if len(table) == 0:
-        raise DatasetError(f"'{path.name}' has a header and no samples.")
+    names = mine
     out: dict[str, Any] = {}
-    for who in ("robot", "camera", "robot2", "link"):
+    for who in _WHO:
         if f"{who}_x" in names:
             out[who] = _columns(path, names, table, who)
-    joints = [names.index(f"q{i}") for i in range(1, 10) if f"q{i}" in names]
+    joints = [names.index(q) for q in _JOINTS if q in names]
     if joints:
         out["q"] = table[:, joints]
     return out
@@ -210,8 +233,17 @@ def _columns(path: Path, names: list[str], table: Array, who: str) -> Array:
         raise DatasetError(
             f"'{path.name}' lacks {who}_x, _y, _z with {who}_qw, _qx, _qy, _qz or {who}_rx, _ry, _rz (rad)."
         )
-    if not np.isfinite(p).all() or not np.isfinite(q if q is not None else r if r is not None else p).all():
-        raise DatasetError(f"'{path.name}' has empty or non-finite cells in the {who} columns.")
+    cells = np.hstack([v for v in (p, q if q is not None else r) if v is not None])
+    if not np.isfinite(cells).all():
+        bad = int(np.flatnonzero(~np.isfinite(cells).all(axis=1))[0])
+        raise DatasetError(
+            f"'{path.name}' has an empty or non-finite cell in the {who} columns, first in sample {bad}."
+        )
+    if q is None and np.linalg.norm(np.asarray(r), axis=1).max() > _LONGEST_TURN:
+        raise DatasetError(
+            f"The rotation vectors {who}_rx, _ry, _rz of '{path.name}' are up to {np.linalg.norm(np.asarray(r), axis=1).max():.0f} long, "
+            "more than a whole turn: they look like degrees; write radians."
+        )
     turned = _from_quaternions(path, q) if q is not None else exp_rotation(np.asarray(r))
     return pose(turned, p)
 

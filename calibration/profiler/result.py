@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.profiler.errors import DegenerateMotion
 from weldcal.calibration.profiler.motion import Floats, skew
 
+VAGUE_M = 0.02  # one sigma of a direction from which on there is no calibration
 LEVER_M = 0.1  # a turn is weighed against a shift at this distance from the flange
 
 
@@ -55,3 +57,22 @@ def worst_direction(normal_matrix: Floats) -> str:
     kind, part = ("rotation about", v[:3] / turn) if turn > shift else ("translation along", v[3:] / shift)
     part = part * np.sign(part[int(np.argmax(np.abs(part)))])
     return f"{kind} ({part[0]:.2f}, {part[1]:.2f}, {part[2]:.2f}) of the flange"
+
+
+def believed_covariance(estimate: ProfilerEstimate) -> Floats:
+    """The covariance (6, 6) that an estimate's residuals speak for, where they are larger than the sigmas stated.
+
+    Raises:
+        DegenerateMotion: a direction is so open that this is no calibration, though the motion is not quite degenerate.
+    """
+    chi2 = estimate.reduced_chi2
+    covariance = np.asarray(estimate.covariance * max(1.0, chi2 if np.isfinite(chi2) else 1.0))
+    unit = np.diag([LEVER_M] * 3 + [1.0] * 3)
+    sigma = float(np.sqrt(np.linalg.eigvalsh(unit @ covariance @ unit)[-1]))
+    if sigma > VAGUE_M:
+        open_one = worst_direction(np.asarray(np.linalg.inv(covariance)))
+        raise DegenerateMotion(
+            f"These scans leave the {open_one} almost open (one sigma {1e3 * sigma:.0f} mm): turn the flange about two different axes "
+            "between them, by more."
+        )
+    return covariance

@@ -213,9 +213,11 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     chi2 = float(np.median(np.abs(r[:m])) / 0.6745) ** 2
     felt = r[m : m + (0 if problem.data.touches is None else len(problem.data.touches))]
     if max(chi2, float(np.median(np.abs(felt)) / 0.6745) ** 2 if felt.size else 0.0) > 100.0:
+        touched = (
+            f" and touches {1e3 * problem.sigmas.touch_m * float(np.median(np.abs(felt))):.2f} mm" if felt.size else ""
+        )
         raise InconsistentData(
-            f"Profiles lie {1e3 * float(np.median(np.abs(distance))):.2f} mm and touches "
-            f"{1e3 * problem.sigmas.touch_m * float(np.median(np.abs(felt)) if felt.size else 0.0):.2f} mm off any sphere of "
+            f"Profiles lie {1e3 * float(np.median(np.abs(distance))):.2f} mm{touched} off any sphere of "
             f"{1e3 * problem.data.radius_m:.2f} mm: check the radius, the poses and that only the sphere is in the profiles."
         )
     every = [distance[problem.of == k] for k in range(len(problem.count))]

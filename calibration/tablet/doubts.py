@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 _SCALE_SIGMAS, _SCALE_LEAST = 3.0, 2.5e-3
 _BAD_TOUCH_M, _BAD_PIXEL = 1.5e-3, 2.0  # residuals above these are no noise
+_GOOD_TOUCH_M = 3e-3  # what the others must come to where one landmark alone is to blame
 _LEAST_TO_DOUBT = 6  # landmarks
 _BETTER = 0.4  # what a change must leave of the residuals to be told
 
@@ -80,7 +81,7 @@ def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> s
     if len(names) >= _LEAST_TO_DOUBT:
         without = [_misfit(data.pick(np.arange(len(names)) != k)) for k in range(len(names))]
         worst = int(np.argmin(without))
-        if without[worst] < _BETTER * left_m:
+        if without[worst] < min(_BETTER * left_m, _GOOD_TOUCH_M):  # else more than one of them is wrong
             return f"{plain}, without landmark {names[worst]} to {1e3 * without[worst]:.2f}: touch it again, or leave it out."
     changed = {
         "the quaternions' w where z is written": tuple(_rolled(X, 1) for X in data.X_BF),

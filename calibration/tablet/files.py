@@ -17,8 +17,9 @@ from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
 from weldcal.calibration.tablet.page_grid import find_page
-from weldcal.calibration.tablet.tables import Row, landmark, number, read_table
+from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist import WristTouches
+from weldcal.models.tables import Row
 
 Array = NDArray[np.float64]
 

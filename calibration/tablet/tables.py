@@ -1,45 +1,28 @@
-"""CSV tables as people and spreadsheets write them: comma, semicolon or tab, decimal comma, any case and blanks in the header."""
+"""The tablet's CSV tables: the columns that must be there, and their cells as numbers."""
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from weldcal.calibration.tablet.errors import TabletDataError
-
-Row = dict[str, str]
+from weldcal.models.errors import InputError
+from weldcal.models.tables import Row, read_rows
 
 
 def read_table(path: Path, columns: Sequence[str]) -> list[Row]:
-    """Rows of a CSV file that has at least these columns (lower case), names and values stripped; empty rows are left out.
+    """Rows of a CSV file that has at least these columns (lower case); a cell that is missing is empty.
 
-    Raises TabletDataError: no such file, no text, a column missing, a row that is too short.
+    Raises TabletDataError: no such file, no text, a column missing.
     """
-    if not path.is_file():
-        raise TabletDataError(f"There is no file '{path}'.")
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise TabletDataError(f"'{path.name}' is no CSV text.") from error
-    lines = [line for line in lines if line.strip()]
-    header = lines[0] if lines else ""
-    delimiter = max(",;\t", key=header.count)
-    names = [name.strip().lower() for name in next(csv.reader([header], delimiter=delimiter), [])]
+        names, rows = read_rows(path)
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
     missing = [c for c in columns if c not in names]
     if missing:
         raise TabletDataError(f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}.")
-    rows = []
-    for values in csv.reader(lines[1:], delimiter=delimiter):
-        row = {name: value.strip() for name, value in zip(names, values, strict=False)}
-        if not any(row.values()):
-            continue
-        if any(c not in row for c in columns):
-            raise TabletDataError(f"'{path.name}' has a row with too few columns.")
-        if delimiter != ",":
-            row = {name: value.replace(",", ".") for name, value in row.items()}
-        rows.append(row)
     return rows
 
 

@@ -204,6 +204,12 @@ def test_pairs_are_judged_by_their_centres(tmp_path: Path) -> None:
     assert d["position_error_mm"]["median"] < 0.9
     again = verify_dataset(result, given, tmp_path / "again")
     assert all(p.used_before for p in again.poses)
+    rows = (kept / "pairs.csv").read_text().splitlines()
+    cells = rows[5].split(",")
+    rows[5] = ",".join([cells[0], str(float(cells[1]) + 0.08), *cells[2:]])
+    (kept / "pairs.csv").write_text("\n".join(rows))
+    warnings = verify_dataset(result, kept, tmp_path / "off").summary()["warnings"]
+    assert any(f"1 of the 23 scans is far off while the others are not: {cells[0]} by " in w for w in warnings)
 
 
 def _no_result(result: Path, _: Path) -> None:

@@ -215,3 +215,42 @@ def test_truncated_and_damaged_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "g.npz").write_bytes(b"PK\x03\x04 nothing")
     with pytest.raises(CloudError, match="cannot be read"):
         read_cloud(tmp_path / "g.npz")
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        POSES.replace(",", ";"),
+        POSES.replace(",", "\t"),
+        POSES.replace(",", ";").replace(".", ","),
+        "# poses of Monday\n" + POSES.replace("id,x,y,z", "ID, X, Y, Z") + ",,,,,,,\n",
+    ],
+    ids=["semicolons", "tabs", "decimal commas", "comment, case and an empty row"],
+)
+def test_a_table_is_read_as_spreadsheets_write_it(folder: Path, table: str) -> None:
+    plain = load_dataset(folder).poses
+    (folder / "poses.csv").write_text(table)
+    read = load_dataset(folder).poses
+    assert all(read[id].IsExactlyEqualTo(plain[id]) for id in ("a", "b"))
+
+
+def test_clouds_are_found_and_read_by_any_of_their_endings(folder: Path) -> None:
+    points = read_cloud(folder / "clouds" / "a.npz")
+    (folder / "clouds" / "a.npz").unlink()
+    np.save(folder / "clouds" / "a.npy", points)
+    (folder / "clouds" / "b.pcd").rename(folder / "clouds" / "b.PCD")
+    (folder / "clouds" / "._b.pcd").write_text("what a file manager leaves")
+    data = load_dataset(folder)
+    assert np.array_equal(data.cloud("a"), points)
+    assert len(data.cloud("b")) == 200
+    text = folder / "clouds" / "c.csv"
+    text.write_text("x;y;z;grey\n" + "".join(f"{x};{y};{z};7\n" for x, y, z in points))
+    assert np.array_equal(read_cloud(text), points)
+
+
+def test_a_scan_that_repeats_another_counts_once(folder: Path) -> None:
+    change(folder / "poses.csv", "b,0.5", "c,0.5,0.1,0.4,1,0,0,0\nb,0.5")
+    (folder / "clouds" / "c.npz").write_bytes((folder / "clouds" / "a.npz").read_bytes())
+    data = load_dataset(folder)
+    assert set(data.clouds) == {"a", "b"}
+    assert [id for id, _ in data.refused] == ["c"]

@@ -102,7 +102,7 @@ def test_a_bad_file_is_named_in_a_sentence(tmp_path: Path, poses: tuple[Array, A
     row = ",".join(map(str, numbers(F[0]) + numbers(G[0])))
     assert "add --mounting" in read_error(f"{HEADER}\n{row}", csv)
     assert "not a number" in read_error(f"{HEADER}\n{row.replace(row.split(',')[0], 'x', 1)}", csv)
-    assert "non-finite cells" in read_error(f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand")
+    assert "first in sample 0" in read_error(f"{HEADER}\n" + ",".join(row.split(",")[:9]), csv, mounting="eye_in_hand")
     assert "cannot be read as JSON" in read_error("{", tmp_path / "a.json")
     assert "no list of samples" in read_error("a: 1", tmp_path / "a.yaml")
     assert "Sample 0" in read_error("- effector_wrt_world: [1, 2]\n  object_wrt_sensor: [1]", tmp_path / "a.yaml")
@@ -173,3 +173,56 @@ def test_two_robots_want_their_own_equation(tmp_path: Path) -> None:
 def test_pairs_know_their_equation() -> None:
     F, G, _, _ = eye_in_hand(3, np.random.default_rng(2))
     np.testing.assert_allclose(PosePairs("a", F, G, "eye_on_base").F, inverse(F))
+
+
+def test_a_table_of_another_spreadsheet_is_the_same_table(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    plain = write("csv", tmp_path, F, G)
+    header, *rows = plain.read_text().splitlines()
+    other = tmp_path / "other.csv"
+    text = "\n".join(["# Monday", header.upper() + ",note", *(f"{row},fine" for row in rows), "," * 14])
+    other.write_text("\ufeff" + text.replace(",", ";").replace(".", ","), encoding="utf-8")
+    read, wanted = (read_pairs(f, mounting="eye_in_hand") for f in (other, plain))
+    assert np.array_equal(read.F, wanted.F)
+    assert np.array_equal(read.G, wanted.G)
+
+
+def test_a_file_that_no_pairs_can_be_in_is_named(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    (tmp_path / "a.npz").write_bytes(b"")
+    with pytest.raises(DatasetError, match="not an npz file"):
+        read_pairs(tmp_path / "a.npz")
+    np.savez(tmp_path / "streams.npz", hand=np.zeros((9, 8)), eye=np.zeros((9, 8)))
+    with pytest.raises(DatasetError, match="two streams"):
+        read_pairs(tmp_path / "streams.npz")
+    degrees = [[*X[:3, 3], *np.degrees(Rotation.from_matrix(X[:3, :3]).as_rotvec())] for X in (F[0], G[0])]
+    names = ",".join(f"{who}_{c}" for who in ("robot", "camera") for c in ("x", "y", "z", "rx", "ry", "rz"))
+    row = ",".join(str(v) for v in degrees[0] + degrees[1])
+    assert "look like degrees" in read_error(f"{names}\n{row}", tmp_path / "a.csv", mounting="eye_in_hand")
+
+
+def test_a_word_of_an_npz_may_be_bytes_or_an_array(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    for word in (np.bytes_(b"eye_in_hand"), np.array(["eye_in_hand"])):
+        np.savez(tmp_path / "a.npz", X_base_gripper=F, X_camera_target=G, mode=word)
+        assert read_pairs(tmp_path / "a.npz").mode == "eye_in_hand"
+
+
+def test_samples_that_repeat_others_are_said(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    path = write("npz", tmp_path, np.concatenate([F, F[:3]]), np.concatenate([G, G[:3]]))
+    report = run_hand_eye("ax-yb", path, tmp_path / "out")
+    assert any(w.startswith("3 of 15 samples repeat") for w in report.result.warnings)
+
+
+def test_corners_that_are_of_no_use_leave_the_poses_as_given(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    marker = np.array([[-0.05, 0.05, 0.0], [0.05, 0.05, 0.0], [0.05, -0.05, 0.0], [-0.05, -0.05, 0.0]])
+    seen = {"obj": marker, "K": np.diag([600.0, 600.0, 1.0])}
+    for count, sentence in ((len(F), "only 4 corners"), (len(F) - 1, "it must be")):
+        path = tmp_path / "marker.npz"
+        np.savez(path, A=F, B=G, mode="eye_in_hand", img=np.ones((count, 4, 2)), **seen)
+        report = run_hand_eye("ax-yb", path, tmp_path / "out", corners=None)
+        assert sentence in report.corners
+        with pytest.raises(DatasetError, match=sentence):
+            run_hand_eye("ax-yb", path, tmp_path / "out", corners=True)

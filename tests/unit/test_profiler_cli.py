@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from weldcal.calibration.profiler.edge_model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import sample_edge_poses
 from weldcal.calibration.profiler.record import load_record
+from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.models.errors import InputError
 from weldcal.tools.cli import app
 from weldcal.tools.studies.profiler_worlds import CLEAN, SphereWorld, sphere_trial
@@ -175,7 +177,7 @@ def test_a_mistake_is_named_in_one_sentence_and_nothing_is_written(
     Path("t.txt").write_text("x")
     Path("broken.npz").write_text("x")
     Path("bad.csv").write_text("a,b\n1,2\n")
-    Path("word.csv").write_text("x_mm,y_mm\n1,two\n")
+    Path("word.csv").write_text("x_mm,y_mm,z_mm,rx_rad,ry_rad,rz_rad\n1,two,3,0,0,0\n")
     edge_csv(Path("e.csv"))
     code, text = called(*words, "--out", "out")
     assert code == 1
@@ -195,3 +197,54 @@ def test_a_record_changed_by_hand_is_refused(tmp_path: Path) -> None:
     path.write_text("schema: 1\n")
     with pytest.raises(InputError, match="no profiler's calibration"):
         load_record(path)
+
+
+def test_a_table_of_another_spreadsheet_is_the_same_table_and_the_pose_is_printed(tmp_path: Path) -> None:
+    header, *rows = edge_csv(tmp_path / "plain.csv").read_text().splitlines()
+    text = "\n".join(["# bench 3", header.upper() + ",note", *(f"{row},fine" for row in rows), ",,,,,,,,"])
+    other = tmp_path / "other.csv"
+    other.write_text(text.replace(",", ";"))
+    answer = found("edge", other, "--out", tmp_path / "out")
+    assert np.allclose(np.array(answer["X_FS"])[:3, 3], STATE.translation, atol=1e-3)
+    degrees = [
+        ",".join([*r.split(",")[:3], *(str(57.3 * float(v)) for v in r.split(",")[3:6]), *r.split(",")[6:]])
+        for r in rows
+    ]
+    other.write_text("\n".join([header, *degrees]))
+    assert "look like degrees" in called("edge", other)[1]
+
+
+def test_points_of_three_numbers_are_refused(tmp_path: Path) -> None:
+    X = np.tile(np.eye(4), (6, 1, 1))
+    X[:, 0, 3] = 500.0
+    np.savez(tmp_path / "three.npz", T=X, xz=np.zeros((60, 3)), n=np.full(6, 10), radius=20.0, unit="mm")
+    code, said = called("sphere", tmp_path / "three.npz")
+    assert code == 1
+    assert "(60, 3)" in said
+    assert "Internal" not in said
+
+
+def test_a_direction_that_is_open_by_centimetres_is_refused() -> None:
+    vague = SimpleNamespace(reduced_chi2=1.0, covariance=np.diag([1e-6] * 3 + [1e-8, 1e-8, 0.4**2]))
+    with pytest.raises(
+        InputError, match=r"translation along \(0.00, 0.00, 1.00\) of the flange almost open \(one sigma 400 mm\)"
+    ):
+        believed_covariance(cast(ProfilerEstimate, vague))
+
+
+def test_a_noisier_sensor_is_no_outlier_and_an_outlier_is_named(tmp_path: Path) -> None:
+    poses, p = edge()
+    noisy = p + 2.5e-4 * np.random.default_rng(8).standard_normal(p.shape)
+    noisy[5] += [6e-3, -4e-3]
+    arrays = {"rotation": poses.rotation, "translation": poses.translation, "points": noisy, "unit": "m"}
+    np.savez(tmp_path / "noisy.npz", **arrays)
+    np.savez(tmp_path / "said.npz", **arrays, sigma=[3e-5, 2.5e-4, 2.5e-4])
+    for name in ("noisy", "said"):
+        answer = found("edge", tmp_path / f"{name}.npz", "--out", tmp_path / name)
+        record = load_record(tmp_path / name)
+        assert answer["outlier_scans"] == [5]
+        assert answer["sigmas_mm"]["z"] > 0.15
+        assert record.covariance is not None
+        error = record.translation - STATE.translation
+        assert (np.abs(error) < 4.0 * np.sqrt(np.diag(record.covariance))[3:]).all()
+    assert "outlier scans 5" in called("edge", tmp_path / "said.npz", "--out", tmp_path / "said")[1]

@@ -155,3 +155,14 @@ def test_closed_form_is_a_rotation_even_for_mirrored_noise() -> None:
     assert isinstance(fit_rigid(rng.standard_normal((5, 3)), rng.standard_normal((5, 3))).rotation(), RotationMatrix)
     with pytest.raises(ValueError, match="collinear"):
         fit_rigid(np.outer(np.arange(4.0), [1, 0, 0]), np.outer(np.arange(4.0), [0, 1, 0]))
+
+
+def test_normals_that_contradict_the_poses_are_refused_although_the_centres_agree() -> None:
+    # the quaternion's numbers in another order: one orientation for all poses, so that centres alone cannot show it
+    rolled = RigidTransform(RollPitchYaw(1.3, 0.4, 0.2), np.zeros(3))
+    turned = [
+        Observation(o.id, RigidTransform(rolled.rotation(), o.p_BR), o.p_CR, X_BC.rotation().matrix()[2])
+        for o in sightings(8, 5)
+    ]
+    with pytest.raises(InconsistentPoses, match="quaternion order"):
+        estimate_eye_on_base(turned)

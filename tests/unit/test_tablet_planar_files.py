@@ -132,7 +132,6 @@ def test_four_landmarks_are_enough_and_leave_nothing_out(tmp_path: Path) -> None
         (lambda d: {**d, "delta_px": -d["delta_px"]}, "delta_px reversed"),
         (lambda d: {**d, "tablet_px": d["tablet_px"] * [1, -1], "delta_px": d["delta_px"] * [1, -1]}, "up the page"),
         (lambda d: {**d, "hand": d["hand"] + np.outer(np.eye(9)[4], [12.0, 0.0])}, "Without landmark 4 the others fit"),
-        (lambda d: {**d, "hand": d["hand"][[1, 0, *range(2, 9)]]}, "in one order"),
         (lambda d: {**d, "mm_per_px": 1.03 * d["mm_per_px"]}, "differ by -3.0 % in length|differ by -2.* % in length"),
         (lambda d: {**d, "uv": np.where(np.arange(9)[:, None] == 2, np.nan, d["uv"])}, "Left out, .*: landmark 2"),
     ],
@@ -149,6 +148,7 @@ def test_what_looks_wrong_is_told(tmp_path: Path, changed: Callable[[Fields], Fi
     ("changed", "reason"),
     [
         (lambda d: only(d, [0, 2, 4]), "3 landmarks with finite numbers; at least 4"),
+        (lambda d: {**d, "hand": d["hand"][[1, 0, *range(2, 9)]]}, "contradict each other: .* in one order"),
         (lambda d: only(d, [0, 2, 4, 0, 2, 4]), r"3 landmarks are too few \(a landmark counts once\)"),
         (lambda d: {**d, "tablet_px": np.c_[100.0 * np.arange(9), np.full(9, 300.0)]}, "All landmarks lie on one line"),
         (lambda d: {**d, "theta_deg": np.full(9, 20.0)}, "rotation is nearly the same"),
@@ -172,3 +172,19 @@ def test_what_cannot_be_used_is_refused_with_one_sentence(
     assert said["state"] == "failed"
     assert re.search(reason, said["reason"]), said["reason"]
     assert not (tmp_path / "out").exists()
+
+
+def test_numbers_that_belong_to_other_landmarks_or_axes_are_named(tmp_path: Path) -> None:
+    d = fields(simulate_trial(3))
+    said = run(tmp_path, d | {"hand": d["hand"][:, ::-1]})
+    assert said["state"] == "failed"
+    assert "contradict each other" in said["reason"]
+    said = run(tmp_path, d | {"hand": d["hand"][np.roll(np.arange(len(d["hand"])), 4)]})
+    assert said["state"] == "failed"
+    assert "in one order" in said["reason"]
+    said = run(
+        tmp_path,
+        {key: value for key, value in d.items() if not key.endswith("_q")}
+        | {"uv": d["uv"][:, ::-1], "c": d["c"][::-1]},
+    )
+    assert any("as in a mirror" in w for w in said["warnings"])

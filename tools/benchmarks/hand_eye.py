@@ -298,9 +298,13 @@ def run_hand_eye_benchmark(
         pairs = read_pairs(path)
         row = dataset_row(path.parent.name, pairs.F, pairs.G, pairs.X_true, opencv=not quick)
         if pairs.X_true is not None and pairs.img is not None:
-            refined = refine_with_corners(pairs)
-            nees = refined.result.normalised_error("X", as_transform(pairs.X_true))
-            row = replace(row, truth_nees_corners=nees, corners=refined.sentence)
+            try:
+                refined = refine_with_corners(pairs)
+            except WeldcalError as problem:
+                row = replace(row, corners=f"Corners: not used. {problem}")
+            else:
+                nees = refined.result.normalised_error("X", as_transform(pairs.X_true))
+                row = replace(row, truth_nees_corners=nees, corners=refined.sentence)
         report.rows.append(row)
         progress(path.parent.name, 0.3 * (k + 1) / len(sets))
     tries = [outliers(seed + k) for k in range(3 if quick else 20)]

@@ -19,14 +19,21 @@ from weldcal.calibration.observation import Observation
 Array = NDArray[np.float64]
 
 OURS, REFUSED = "#1d5f8a", "#9aa3ab"
+_GROSS = 10.0  # times the median: a bar of something else
 _PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.0}  # keeps a label readable on a bar
 
 
 def error_bars(
-    ids: Sequence[str], error: Array, keep: NDArray[np.bool_], label: str, *, stated: tuple[float, str] | None = None
+    ids: Sequence[str],
+    error: Array,
+    keep: NDArray[np.bool_],
+    label: str,
+    *,
+    stated: tuple[float, str] | None = None,
+    median_of: str = "",
 ) -> bytes:
-    """One bar a pose (n,), grey where not ``keep``; the median as a line, and ``stated`` (a height and its name) as
-    another."""
+    """One bar a pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` says of which), and ``stated``
+    (a height and its name) as another. Bars that would flatten all others end at the top, with their number."""
     x = np.arange(len(error))
     figure = Figure(figsize=(8.2, 3.2), layout="constrained")
     axes = figure.subplots()
@@ -37,13 +44,12 @@ def error_bars(
         return svg(figure, axes)
     axes.bar(x, error, color=[OURS if k else REFUSED for k in keep], width=0.7)
     median = float(np.median(error[keep])) if keep.any() else float(np.nanmedian(error))
-    axes.axhline(median, color="#444", linewidth=1, linestyle="--")
-    beside = ("axes fraction", "data")  # right of the bars, which it would hide
-    axes.annotate(
-        f"median\n{median:.2f}", (1.01, median), xycoords=beside, fontsize=9, va="center", annotation_clip=False
-    )
     # gross outliers would flatten every other bar
-    top = 1.25 * float(np.nanmax(error[keep] if keep.any() else error))
+    usual = np.isfinite(error) & (
+        error <= _GROSS * max(float(np.nanmedian(error)), stated[0] if stated is not None else 0.0)
+    )
+    shown = usual & keep if (usual & keep).any() else usual
+    top = 1.25 * float(error[shown].max())
     if stated is not None:
         axes.axhline(stated[0], color="#a8402f", linewidth=1, linestyle=":")
         axes.annotate(
@@ -55,11 +61,18 @@ def error_bars(
             bbox=_PLATE,
         )
         top = max(top, 1.25 * stated[0])
+    axes.axhline(median, color="#444", linewidth=1, linestyle="--")
+    if median <= top:
+        said, beside = (
+            f"median\n{median_of}{median:.2f}",
+            ("axes fraction", "data"),
+        )  # right of the bars, which it would hide
+        axes.annotate(said, (1.01, median), xycoords=beside, fontsize=9, va="center", annotation_clip=False)
     step = max(1, len(x) // 25)
     axes.set_xticks(x[::step], list(ids)[::step], rotation=60, ha="right", fontsize=8)
     axes.set_ylim(0.0, max(top, 1e-9))
     for i in np.nonzero(error > top)[0]:
-        axes.annotate(f"{error[i]:.1f}", (float(i), top), fontsize=8, ha="center", va="top", color="#333")
+        axes.annotate(f"{error[i]:.1f}", (float(i), top), fontsize=8, ha="center", va="top", color="#333", bbox=_PLATE)
     axes.set_ylabel(label)
     return svg(figure, axes)
 

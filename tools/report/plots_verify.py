@@ -19,6 +19,7 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
     """The whole report as one self-contained HTML text."""
     ids = [p.id for p in report.poses]
     fresh = np.array([not p.used_before for p in report.poses])
+    median_of = "of the new scans " if fresh.any() and not fresh.all() else ""
     tilts = np.array([np.nan if p.tilt_deg is None else p.tilt_deg for p in report.poses])
     seen = np.isfinite(tilts)
     stated = report.result.held_out_mm.get("median")
@@ -55,6 +56,7 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
             fresh,
             "position error, mm",
             stated=None if stated is None else (stated, "stated by the calibration"),
+            median_of=median_of,
         ),
         tilt_bars=error_bars(
             [i for i, s in zip(ids, seen, strict=True) if s],
@@ -62,6 +64,7 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
             fresh[seen],
             "tilt, deg",
             stated=None if stated_tilt is None else (stated_tilt, "stated by the calibration"),
+            median_of=median_of,
         )
         if seen.any()
         else None,

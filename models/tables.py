@@ -1,0 +1,44 @@
+"""CSV tables as people and spreadsheets write them: any usual separator, decimal commas, comments, any case of the header."""
+
+from __future__ import annotations
+
+import csv
+import re
+from pathlib import Path
+
+from weldcal.models.errors import InputError
+
+Row = dict[str, str]
+
+_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?")
+
+
+def read_rows(path: Path) -> tuple[list[str], list[Row]]:
+    """Names of the columns (lower case) and the rows by name, all stripped; a cell that is missing is empty.
+
+    The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #, empty
+    lines and rows without a value are left out. Decimal commas become points where the comma separates nothing. Raises
+    InputError: no such file, no text.
+    """
+    if not path.is_file():
+        raise InputError(f"There is no file '{path}'.")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as e:
+        raise InputError(f"'{path.name}' is no CSV text.") from e
+    if "\0" in text:
+        raise InputError(f"'{path.name}' is no CSV text.")
+    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not lines:
+        return [], []
+    separator = max(",;\t", key=lines[0].count)
+    if separator not in lines[0] and len(lines[0].split()) > 1:
+        separator, lines = " ", [" ".join(line.split()) for line in lines]
+    table = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)]
+    names, rows = [name.lower() for name in table[0]], []
+    for values in table[1:]:
+        if separator != ",":
+            values = [v.replace(",", ".") if _DECIMAL_COMMA.fullmatch(v) else v for v in values]
+        if any(values):
+            rows.append(dict.fromkeys(names, "") | dict(zip(names, values, strict=False)))
+    return names, rows
