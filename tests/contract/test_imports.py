@@ -69,7 +69,10 @@ def test_imports_point_one_way() -> None:
 def test_the_import_name_is_always_weldcal() -> None:
     bare = {*MAY_IMPORT, "tests", "pytest", "hypothesis", "selenium"}
     wrong = [
-        f"{name}: {module}" for name, tree in trees().items() for module in imported(tree) if module.split(".")[0] in bare
+        f"{name}: {module}"
+        for name, tree in trees().items()
+        for module in imported(tree)
+        if module.split(".")[0] in bare
     ]
     assert wrong == []
 
@@ -87,7 +90,9 @@ def test_no_algorithm_speaks_of_the_simulations_truth() -> None:
 
 def test_nothing_prints_and_nothing_changes_globals() -> None:
     assert [name for name, tree in trees().items() if "print" in called(tree)] == []
-    assert [name for name, tree in trees().items() if any(isinstance(node, ast.Global) for node in ast.walk(tree))] == []
+    assert [
+        name for name, tree in trees().items() if any(isinstance(node, ast.Global) for node in ast.walk(tree))
+    ] == []
 
 
 def test_each_file_says_its_one_idea_first() -> None:
