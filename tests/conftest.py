@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import subprocess
 import sys
@@ -16,12 +17,21 @@ from tests.short_job import short_jobs
 
 __all__ = ["browser", "short_jobs"]
 
+# Imports and collected tests stay for good: to look through all of them again and again takes a third of what collecting takes.
+gc.disable()
+
 SLOWEST = ("test_cell.py", "test_readme.py")  # a core that is left with one of these at the end keeps the other waiting
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes longest comes first: files are dealt to the cores one by one, in this order."""
     items.sort(key=lambda item: (item.path.name not in SLOWEST, item.path.parent.name != "scenario"))
+
+
+def pytest_collection_finish() -> None:
+    """From here on garbage is collected, of what the tests themselves make."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -10,14 +10,14 @@ import pytest
 from weldcal.systems.scenario import Scenario, load_scenario
 from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario
 
-SHORT_SEAM = "welding: {seam_length_mm: 30.0}"
+SHORTER = "welding: {seam_length_mm: 30.0}\ncalibration: {minimum_scans: 4}"
 SHORT_JOB_SEED = 5
 
 
 def short_job_scenario(preset: str) -> Scenario:
-    """The S groove with another scanner; its first 30 mm are welded."""
+    """The S groove with another scanner, calibrated from as few scans as there may be; its first 30 mm are welded."""
     scanner = f"scanner: !RenderedScanner {{preset: {preset}, width: 824, height: 616}}"
-    return load_scenario("s_groove", f"{SHORT_SEAM}\n{scanner}")
+    return load_scenario("s_groove", f"{SHORTER}\n{scanner}")
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -49,13 +50,16 @@ def names(tree: ast.Module) -> set[str]:
     return plain | attributes | {name.rsplit(".", 1)[-1] for name in imported(tree)}
 
 
-TREES = {name: ast.parse(path.read_text(), filename=name) for name, path in FILES.items()}
+@cache
+def trees() -> dict[str, ast.Module]:
+    """Every file, parsed: when the first test asks, for collecting happens in every process of a run."""
+    return {name: ast.parse(path.read_text(), filename=name) for name, path in FILES.items()}
 
 
 def test_imports_point_one_way() -> None:
     wrong = [
         f"{name} imports {module}"
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         for module in imported(tree)
         if module.startswith("weldcal.") and module.split(".")[1] not in MAY_IMPORT[name.split("/")[0]]
     ]
@@ -65,13 +69,16 @@ def test_imports_point_one_way() -> None:
 def test_the_import_name_is_always_weldcal() -> None:
     bare = {*MAY_IMPORT, "tests", "pytest", "hypothesis", "selenium"}
     wrong = [
-        f"{name}: {module}" for name, tree in TREES.items() for module in imported(tree) if module.split(".")[0] in bare
+        f"{name}: {module}"
+        for name, tree in trees().items()
+        for module in imported(tree)
+        if module.split(".")[0] in bare
     ]
     assert wrong == []
 
 
 def test_diagram_systems_live_in_systems_only() -> None:
-    holders = [name for name, tree in TREES.items() if names(tree) & {"LeafSystem", "VectorSystem"}]
+    holders = [name for name, tree in trees().items() if names(tree) & {"LeafSystem", "VectorSystem"}]
     assert holders, "the cell has systems"
     assert [name for name in holders if not name.startswith("systems/")] == []
 
@@ -82,12 +89,14 @@ def test_no_algorithm_speaks_of_the_simulations_truth() -> None:
 
 
 def test_nothing_prints_and_nothing_changes_globals() -> None:
-    assert [name for name, tree in TREES.items() if "print" in called(tree)] == []
-    assert [name for name, tree in TREES.items() if any(isinstance(node, ast.Global) for node in ast.walk(tree))] == []
+    assert [name for name, tree in trees().items() if "print" in called(tree)] == []
+    assert [
+        name for name, tree in trees().items() if any(isinstance(node, ast.Global) for node in ast.walk(tree))
+    ] == []
 
 
 def test_each_file_says_its_one_idea_first() -> None:
-    silent = [name for name, tree in TREES.items() if len((ast.get_docstring(tree) or "").split("\n")[0]) < 16]
+    silent = [name for name, tree in trees().items() if len((ast.get_docstring(tree) or "").split("\n")[0]) < 16]
     assert silent == []
 
 

@@ -94,7 +94,7 @@ def test_a_report_needs_no_network_and_is_readable_light_and_dark(browser: Brows
         browser.open(path)
         assert browser.console_messages() == []
         assert browser.outside_addresses() == []
-        shots.append(browser.screenshot(tmp_path / f"report-{dark}.png"))
+        shots.append(browser.screenshot(tmp_path / f"report-{dark}.png", until=lambda picture: colours(picture) > 8))
     browser.dark(False)
     light, night = shots
     assert light.mean() > 0.8 > 0.4 > night.mean()

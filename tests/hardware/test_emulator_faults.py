@@ -51,6 +51,23 @@ def run(script: str) -> None:
         time.sleep(0.01)
 
 
+def logged(robot: Emulator, words: str) -> bool:
+    """Whether the controller writes this down; what it is sent takes a moment to reach it."""
+    until = time.monotonic() + 5.0
+    while words not in robot.log() and time.monotonic() < until:
+        time.sleep(0.005)
+    return words in robot.log()
+
+
+def least_lag(robot: Emulator, client: Rtde) -> float:
+    """How old the newest state is (s), the least of ten: a busy computer only adds to it."""
+    lags = []
+    for _ in range(10):
+        newest = client.during(0.01)[-1]["timestamp"]
+        lags.append(robot.state()["timestamp"] - newest)
+    return min(lags)
+
+
 def move(robot: Emulator) -> None:
     """The base turns at a constant speed until somebody stops it."""
     run(f"speedj([{SPEED_RAD_S}, 0, 0, 0, 0, 0], a=10, t=1000)")
@@ -119,7 +136,7 @@ def test_delay_makes_packages_late_and_keeps_their_order(robot: Emulator) -> Non
     with Rtde().watch("timestamp") as client:
         robot.fault("delay", seconds=0.05, jitter=0.02)
         stamps = [row["timestamp"] for row in client.during(0.15)]
-        lag = robot.state()["timestamp"] - stamps[-1]
+        lag = least_lag(robot, client)
     assert np.diff(stamps) == pytest.approx(FRAME_S)
     assert 0.048 < lag < 0.09  # 50 to 70 ms, a frame of grid, and the moment at which the test asks
 
@@ -127,9 +144,8 @@ def test_delay_makes_packages_late_and_keeps_their_order(robot: Emulator) -> Non
 def test_a_delay_may_end(robot: Emulator) -> None:
     with Rtde().watch("timestamp") as client:
         fault = robot.fault("delay", seconds=0.02, **{"for": 0.05})
-        while time.monotonic() < fault + 0.15:
-            last = client.next()["timestamp"]
-        assert robot.state()["timestamp"] - last < 0.015
+        client.during(fault + 0.15 - time.monotonic())
+        assert least_lag(robot, client) < 0.015
 
 
 def test_a_frozen_connection_delivers_everything_afterwards(robot: Emulator) -> None:
@@ -159,9 +175,9 @@ def test_a_frozen_controller_stands_still_with_its_clock(robot: Emulator) -> Non
 def test_muted_inputs_are_lost(robot: Emulator) -> None:
     with Rtde().watch("input_int_register_21") as client:
         client.send(b"I", b"input_int_register_21")
-        robot.fault("mute_input", seconds=0.05)
+        robot.fault("mute_input", seconds=0.15)
         client.put(b"U", struct.pack(">Bi", 1, 5))
-        assert {row["input_int_register_21"] for row in client.during(0.1)} == {0}
+        assert {row["input_int_register_21"] for row in client.during(0.2)} == {0}
         client.put(b"U", struct.pack(">Bi", 1, 6))
         client.until("input_int_register_21", 6)
 
@@ -249,7 +265,7 @@ def test_a_robot_that_is_not_running_has_no_program(robot: Emulator, mode: int) 
         client.until("runtime_state", 1)
     at_rest(robot, injected)
     run("movej([0, 0, 0, 0, 0, 0])")
-    assert "the robot is not running" in robot.log()
+    assert logged(robot, "the robot is not running")
 
 
 @pytest.mark.parametrize(("fault", "state"), [("stop_program", 1), ("pause_program", 4)])
@@ -286,7 +302,7 @@ def test_local_mode_ignores_scripts_and_refuses_the_dashboard(robot: Emulator) -
     assert remote == "false"
     assert stop.startswith("Failed")
     assert power.startswith("Failed")
-    assert "local mode" in robot.log()
+    assert logged(robot, "local mode")
     assert robot.state()["runtime_state"] == "STOPPED"
 
 
@@ -338,12 +354,16 @@ def test_a_reboot_takes_the_ports_away_and_forgets(robot: Emulator) -> None:
         client.watch("timestamp")
         client.send(b"I", b"input_int_register_22")
         client.put(b"U", struct.pack(">Bi", 1, 9))
-        robot.fault("reboot", seconds=0.2)
+        robot.fault("reboot", seconds=0.3)
         with pytest.raises(ConnectionError):
-            client.during(0.1)
+            client.during(2.0)
     with pytest.raises(ConnectionRefusedError):
         connect("rtde")
-    time.sleep(0.25)
+    until = time.monotonic() + 5.0
+    while time.monotonic() < until:
+        with contextlib.suppress(ConnectionError), connect("rtde"):
+            break
+        time.sleep(0.01)
     with Rtde().watch("timestamp", "input_int_register_22", "robot_mode", "runtime_state") as client:
         found = client.next()
     assert found["timestamp"] < 1.0
@@ -354,7 +374,7 @@ def test_a_refused_upload_is_dropped_and_a_slow_one_starts_late(robot: Emulator)
     before = robot.state()["programs_started"]
     robot.fault("refuse_upload")
     run("def one():\nsync()\nend")
-    assert "uploads are refused" in robot.log()
+    assert logged(robot, "uploads are refused")
     robot.fault("refuse_upload", on=False)
     robot.fault("slow_start", seconds=0.1)
     begin = robot.state()
@@ -367,7 +387,9 @@ def test_a_refused_upload_is_dropped_and_a_slow_one_starts_late(robot: Emulator)
 def test_tracking_lag_trails_the_target_by_speed_times_lag(robot: Emulator) -> None:
     robot.fault("tracking_lag", seconds=0.05)
     move(robot)
-    time.sleep(0.3)  # six time constants
+    begin = robot.state()["timestamp"]
+    while robot.state()["timestamp"] < begin + 0.3:  # six time constants, of the robot's time
+        time.sleep(0.01)
     with Rtde().watch("target_q", "actual_q") as client:
         row = client.next()
     assert row["target_q"][0] - row["actual_q"][0] == pytest.approx(0.05 * SPEED_RAD_S, rel=0.02)

@@ -222,7 +222,9 @@ receive = rtde_receive.RTDEReceiveInterface({HOST!r})
 seen = []
 for on in (True, False):
     assert io.setStandardDigitalOut(5, on)
-    time.sleep(0.1)
+    until = time.monotonic() + 5.0
+    while receive.getActualDigitalOutputBits() >> 5 & 1 != on and time.monotonic() < until:
+        time.sleep(0.01)
     seen.append(receive.getActualDigitalOutputBits() >> 5 & 1)
 print(seen)
 """

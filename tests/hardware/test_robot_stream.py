@@ -10,7 +10,7 @@ import pytest
 
 from weldcal.tools.benchmarks.robot import MISSED_S, RATE_HZ, STEP_S, StreamReport, run_robot_benchmark
 
-SECONDS = 10.0
+SECONDS = 6.0
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ NOMINAL = Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml
 
 SEED = 5  # its planned poses lie near each other
 SHORTEST = """
-welding: {seam_length_mm: 20.0}
+welding: {seam_length_mm: 20.0, speed_mm_s: 16.0}
 calibration: {minimum_scans: 4, maximum_scans: 4}
 scanner: !RenderedScanner {preset: ideal, width: 824, height: 616}
 """

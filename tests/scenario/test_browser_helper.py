@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,11 @@ def test_a_page_that_needs_the_network_is_caught(browser: Browser, tmp_path: Pat
     page.write_text('<p>text</p><script src="http://localhost:9/missing.js"></script>')
     browser.open(page)
     assert browser.outside_addresses() == ["http://localhost:9/missing.js"]
-    assert any("missing.js" in message for message in browser.console_messages())
+    messages: list[str] = []
+    until = time.monotonic() + 10.0
+    while not any("missing.js" in message for message in messages) and time.monotonic() < until:
+        messages += browser.console_messages()  # the browser's log comes in its own time
+    assert any("missing.js" in message for message in messages)
 
 
 def test_a_blank_page_has_one_colour(browser: Browser, tmp_path: Path) -> None:
