@@ -36,6 +36,7 @@ class CloudError(InputError):
 def find_cloud(folder: Path, id: str) -> Path:
     """The one cloud file of an id. Raises CloudError when there is none or more than one."""
     found = sorted(p for p in folder.iterdir() if p.stem == id and p.suffix.lower() in SUFFIXES)
+    found = [p for p in found if p.suffix.lower() in NO_NOTES] or found
     if not found:
         raise CloudError(f"There is no cloud for this pose; add clouds/{id}.pcd, .ply, .npz, .npy or .csv.")
     if len(found) > 1:
