@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from array import array
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from weldcal.tools.benchmarks.robot import MISSED_S, RATE_HZ, STEP_S, StreamReport, run_robot_benchmark
+from weldcal.tools.benchmarks.robot import MISSED_S, RATE_HZ, STEP_S, StreamReport, Tap, run_robot_benchmark
 
 SECONDS = 6.0
 
@@ -75,3 +77,17 @@ def test_what_was_measured_fits_together(streamed: tuple[StreamReport, Path]) ->
     # a step that a busy computer delays may still be on its way when the next one is sent
     assert 1 <= summary["velocity_steps"] <= SECONDS / STEP_S
     assert summary["worker_worst_period_ms"] >= 4.0
+
+
+def test_a_new_link_that_has_heard_nothing_yet_gives_no_echo() -> None:
+    def link(*heard: int) -> SimpleNamespace:
+        states = iter([SimpleNamespace(heard=k, echo_latency_s=1e-3 * k, age_s=0.0) for k in heard])
+        return SimpleNamespace(state=lambda: next(states))
+
+    tap = Tap(link(0, 1, 1, 2), array("d", [0.0]))  # type: ignore[arg-type]
+    for _ in range(4):
+        tap.state()
+    tap.restart(link(0, 3))  # type: ignore[arg-type]
+    for _ in range(2):
+        tap.state()
+    assert list(tap.echoes) == [1e-3, 2e-3, 3e-3]
