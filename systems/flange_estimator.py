@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange_fit import FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.verification import face_cloud
+from weldcal.calibration.warm_up import warm_up
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
@@ -49,6 +50,7 @@ class FlangeEstimator(LeafSystem):
         period_s: float = 0.02,
     ) -> None:
         super().__init__()
+        warm_up()
         self._arm, self._X_FR, self._standard = arm, X_FR, standard
         self._X_BC_guess, self._guess_radius_m = X_BC_guess, guess_radius_m
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))

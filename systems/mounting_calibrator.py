@@ -21,6 +21,7 @@ from weldcal.calibration.mounting_poses import MountingPose, information, prior,
 from weldcal.calibration.mounting_scene import FLANGE, MountingScene
 from weldcal.calibration.rigid import skew
 from weldcal.calibration.stated_noise import information_of, with_stated_noise
+from weldcal.calibration.warm_up import warm_up
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.flange_estimator import LIVE_FIT
@@ -71,6 +72,7 @@ class MountingCalibrator(LeafSystem):
         period_s: float = 0.02,
     ) -> None:
         super().__init__()
+        warm_up()
         self._scene, self._config, self._plan = scene, config, tuple(plan)
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._state = self.DeclareAbstractInputPort("state", AbstractValue.Make(MountingState()))

@@ -60,6 +60,9 @@ def test_the_same_job_on_the_emulated_robot_ends_with_the_same_figures(
     assert simulated["state"] == "done", simulated.get("reason")
     for key in ("X_BC_error_mm", "X_BC_error_at_work_mm", "torch_mean_mm", "torch_max_mm", "plan_max_mm"):
         assert emulated[key] == pytest.approx(simulated[key], abs=SAME_MM), key
+    # The demo's promise, with a perfect scanner.
+    assert simulated["X_BC_error_mm"] < 0.15
+    assert simulated["torch_max_mm"] < 0.8
     # Not only are the errors of one size: it is the same scanner at the same place.
     ours, theirs = np.array(emulated["X_BC"]), np.array(simulated["X_BC"])
     assert np.linalg.norm(ours[:3, 3] - theirs[:3, 3]) < 1e-3 * SAME_MM

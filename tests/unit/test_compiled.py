@@ -12,7 +12,13 @@ from scipy.special import ndtr
 
 from weldcal.calibration.border_likelihood import WRONG, border_likelihood
 from weldcal.calibration.circle_steps import circle_steps, middle, solved
-from weldcal.calibration.track_loops import plane_steps
+from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
+from weldcal.calibration.holes import find_holes
+from weldcal.calibration.track_loops import borders, near_edge, plane_steps, ring_points
+from weldcal.calibration.warm_up import warm_up
+from weldcal.models.flanges import get_flange
+from weldcal.models.scanners import get_scanner
+from weldcal.tools.studies.flange_frames import facing, flange_frame
 
 
 @settings(deadline=None)  # the first call compiles
@@ -74,3 +80,21 @@ def test_the_machine_code_is_kept_for_the_next_process() -> None:
     middle(np.array([1.0]))
     kept = Path(middle.stats.cache_path)  # type: ignore[attr-defined]
     assert list(kept.glob("circle_steps.middle-*.nbc"))
+
+
+def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
+    loops = (circle_steps, ring_points, plane_steps, borders, near_edge, border_likelihood)
+
+    def compiled() -> list[int]:
+        return [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
+
+    warm_up()
+    ready = compiled()
+    assert all(n > 0 for n in ready)
+    standard = get_flange("iso9409-1-80-6-m8")
+    X_CR = facing(np.array([0.0, 0.02, 0.8]), 0.2, 0.0, 0.0)
+    scene = flange_frame(get_scanner("phoxi_m", 824), standard, np.random.default_rng(0), X_CR=X_CR).points_C
+    found = fit_flange(scene, standard)
+    fit_flange(scene, standard, guess=FlangeGuess(found.center_C, 0.7 * standard.outer_m, found.normal_C))
+    find_holes(scene, found, standard)
+    assert compiled() == ready
