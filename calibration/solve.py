@@ -100,8 +100,8 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position; check units, pose order and that "
-            "the camera did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to {100 * config.max_outliers:.0f} % wrong ones are "
+            "left out); check units, pose order and that the camera did not move."
         )
     spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
