@@ -11,6 +11,7 @@ from weldcal.calibration.circle import CircleFit, refine_circles
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.face import Face, FlangeFitConfig
 from weldcal.calibration.plane import PlaneFit
+from weldcal.calibration.plane_moments import weighted_moments
 from weldcal.calibration.rim import plane_axes, sector_count
 from weldcal.models.flanges import FlangeStandard
 
@@ -117,16 +118,9 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
         if k:
             spread = np.abs(d if k < 2 else d[:: max(1, d.size // _FEW)])
             scale = max(_MAD * float(np.partition(spread, len(spread) // 2)[len(spread) // 2]), 2e-5)
-        t = d * np.float32(1.0 / (_TUKEY * scale))
-        w = np.float32(1.0) - t * t
-        np.maximum(w, np.float32(0.0), out=w)
-        w *= w
-        total = w.sum()
-        if not total > 0.3 * points.shape[1]:
+        share, at, moments = weighted_moments(points, d, _TUKEY * scale)
+        if not share > 0.3:
             return None, d
-        weighted = points * w
-        at = weighted.sum(axis=1) / total
-        moments = (weighted @ points.T / total - np.outer(at, at)).astype(np.float64)
         values, vectors = np.linalg.eigh(moments)
         normal = vectors[:, 0].astype(np.float32)
         if k == 1:

@@ -14,6 +14,7 @@ from weldcal.calibration.border_likelihood import WRONG, border_likelihood
 from weldcal.calibration.circle_steps import circle_steps, middle, solved
 from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
 from weldcal.calibration.holes import find_holes
+from weldcal.calibration.plane_moments import weighted_moments
 from weldcal.calibration.track_loops import borders, near_edge, plane_steps, ring_points
 from weldcal.calibration.warm_up import warm_up
 from weldcal.models.flanges import get_flange
@@ -83,7 +84,7 @@ def test_the_machine_code_is_kept_for_the_next_process() -> None:
 
 
 def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
-    loops = (circle_steps, ring_points, plane_steps, borders, near_edge, border_likelihood)
+    loops = (circle_steps, weighted_moments, ring_points, plane_steps, borders, near_edge, border_likelihood)
 
     def compiled() -> list[int]:
         return [len(loop.signatures) for loop in loops]  # type: ignore[attr-defined]
@@ -97,4 +98,5 @@ def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
     found = fit_flange(scene, standard)
     fit_flange(scene, standard, guess=FlangeGuess(found.center_C, 0.7 * standard.outer_m, found.normal_C))
     find_holes(scene, found, standard)
+    fit_flange(scene[np.linalg.norm(scene - found.center_C, axis=2) < 0.6 * standard.outer_m], standard)
     assert compiled() == ready
