@@ -17,6 +17,7 @@ from weldcal.systems.calibration_pose_planner import NextPose
 from weldcal.systems.job_sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
 from weldcal.systems.welding_velocity_servo import ServoReport
+from weldcal.tools.simulation import SHARES
 from weldcal.welding.seam import SeamCurve
 
 from .cells import Q_HOME
@@ -326,3 +327,13 @@ def test_the_system_passes_its_command_on_to_everyone() -> None:
     system.GetInputPort("hold").FixValue(context, [1.0])
     simulator.AdvanceTo(0.55)
     assert system.GetOutputPort("job").Eval(context).held
+
+
+def test_the_progress_told_of_a_run_never_falls_from_phase_to_phase() -> None:
+    told = [SHARES[phase] for phase in PHASES if phase in SHARES]
+    assert told == sorted(told)
+    assert set(PHASES) - set(SHARES) == {
+        "move_to_verification_cloud",
+        "scan_verification_cloud",
+        "scan_pose",
+    }, "these and move_to_pose are told by the number of scans"

@@ -337,13 +337,15 @@ def few(
                     "median_mm": median,
                     "median_sigma_mm": sigma,
                     "p95_mm": p95,
-                    "tilt_deg": tilt,
+                    "tilt_deg": tilt if np.isfinite(tilt) else None,
                     "corrected": r.corrected,
                     "refused": r.refused,
                 }
             )
             lines[f"{r.scans} scan{'s' * (r.scans > 1)}"] = (
-                f"{median:.3f} +- {sigma:.3f} mm, 95 % {p95:.3f}, tilt {tilt:.3f} degrees; scanner corrected in {100 * r.corrected:.0f} %"
+                f"{median:.3f} +- {sigma:.3f} mm, 95 % {p95:.3f}"
+                + (f", tilt {tilt:.3f} degrees" if np.isfinite(tilt) else "")
+                + f"; scanner corrected in {100 * r.corrected:.0f} %"
                 + (f"; {r.refused} refused" if r.refused else "")
             )
     _finish("benchmark flange-few", {"state": "done", "draws": draws, "rows": rows}, lines, out, json)

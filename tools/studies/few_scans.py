@@ -33,8 +33,8 @@ _BOOTSTRAPS = 2000
 
 @dataclass(frozen=True)
 class Draws:
-    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad) of every draw on the scans that it did not
-    use, how many were refused, and the share of the others that corrected the scanner."""
+    """Calibrations from ``scans`` random scans each: median error (m) and tilt (rad; NaN where no normals are known) of every draw on
+    the scans that it did not use, how many were refused, and the share of the others that corrected the scanner."""
 
     scans: int
     position_m: Array
@@ -79,7 +79,8 @@ def study_few_scans(
                 continue
             judged = [correction.observation(o) for o in kept]
             errors.append(float(np.median(position_errors(X, judged))))
-            tilts.append(float(np.nanmedian(tilt_errors(X, judged))))
+            tilt = tilt_errors(X, judged)
+            tilts.append(float(np.median(tilt[np.isfinite(tilt)])) if np.isfinite(tilt).any() else float("nan"))
             corrected += correction != ScannerCorrection()
         rows.append(Draws(n, np.array(errors), np.array(tilts), draws - len(errors), corrected / max(len(errors), 1)))
     return rows
