@@ -116,6 +116,8 @@ class DemoResult:
         if self.run.clock is not None:
             found["late_ms"], found["thinking_ms"] = 1e3 * self.run.clock.late_s, 1e3 * self.run.clock.thinking_s
             found["reanchored"] = self.run.clock.reanchored
+            if (behind := self.run.clock.sentence()) is not None:
+                found["fell_behind"] = behind
         return found
 
     def calibration_summary(self) -> dict[str, object]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from weldcal.systems.drivers.picture_worker import PICTURE_THREAD
+from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY
 
 LATE_S = 0.020  # of the Diagram's time
 
@@ -20,7 +21,7 @@ class WallClock:
     A robot obeys what it is told when it is told it: a Diagram that hurried after a delay would send the past. So a delay of
     more than LATE_S moves the anchor, and the Diagram goes on from there at its pace. Lateness is in seconds of the Diagram's
     time: `late_s` is the worst while the arm was commanded to move, `thinking_s` the worst while it stood still, where a cell
-    may compute as long as it likes; `reanchored` counts how often the anchor moved while the arm moved.
+    may compute as long as it likes; `reanchored` counts how often the anchor moved while the arm moved, `lost_s` is by how much in all.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class WallClock:
         self.late_s = 0.0
         self.thinking_s = 0.0
         self.reanchored = 0
+        self.lost_s = 0.0
 
     def wait_for(self, diagram_time: float, moving: bool) -> None:
         """Return when the wall clock has come to this time of the Diagram. `moving`: the arm is commanded to move."""
@@ -52,6 +54,17 @@ class WallClock:
         if late > LATE_S:
             self._anchor = (now, diagram_time)
             self.reanchored += int(moving)
+            self.lost_s += late if moving else 0.0
+
+    def sentence(self) -> str | None:
+        """What a person should know of a run that did not keep up with its robot; None where it did."""
+        if not self.reanchored:
+            return None
+        times = "once" if self.reanchored == 1 else f"{self.reanchored} times"
+        return (
+            f"The computer fell behind the robot {times} while the arm moved, by {1e3 * self.lost_s:.0f} ms in all: meanwhile the arm "
+            "went on as it was told last, and the times of the run are too short by that. Close other programs."
+        )
 
 
 @contextmanager
@@ -89,7 +102,7 @@ def real_time_priority() -> Iterator[None]:
     before = {thread: (os.sched_getscheduler(thread), os.sched_getparam(thread)) for thread in (0, *drawing)}
     try:
         for thread in before:
-            os.sched_setscheduler(thread, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+            os.sched_setscheduler(thread, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(CELL_PRIORITY))
     except OSError:
         yield
         return

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from pydrake.systems.framework import Context, Diagram, EventStatus, InputPort, 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenario
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY, LOOP_PRIORITY
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.station import make_station
@@ -127,6 +130,29 @@ def test_the_ports_have_the_names_types_and_sizes_of_the_simulated_station(drive
     simulated = build(SimulatedUr()).station
     assert port_kinds(drive.station.diagram) == port_kinds(simulated.diagram)
     assert ("in", SPEEDS) in port_kinds(simulated.diagram)
+
+
+def workers() -> list[Path]:
+    """/proc folders of this process's workers."""
+    children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+    folders = [Path("/proc") / child for child in children]
+    return [folder for folder in folders if b"weldcal.systems.drivers.ur.worker" in (folder / "cmdline").read_bytes()]
+
+
+def test_only_the_loop_of_a_worker_runs_before_the_cell_not_the_threads_that_poll(
+    backend: Backend, drive: PacedDrive
+) -> None:
+    if backend.name == "simulated":
+        assert workers() == []
+        return
+    (worker,) = workers()
+    loop = int(worker.name)
+    polling = [int(task.name) for task in (worker / "task").iterdir() if int(task.name) != loop]
+    assert len(polling) >= 2, "one for each connection of ur_rtde"
+    if os.sched_getscheduler(loop) != os.SCHED_RR:
+        pytest.skip("this system gives no real-time priority to this user")
+    assert os.sched_getparam(loop).sched_priority == LOOP_PRIORITY > CELL_PRIORITY
+    assert [os.sched_getparam(thread).sched_priority for thread in polling] == [CELL_PRIORITY] * len(polling)
 
 
 def test_the_position_is_held_from_the_start_and_zero_moves_nothing(drive: PacedDrive) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.precedence import poll_beside_the_cell, take_priority
 from weldcal.systems.drivers.ur.shared import Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
 
@@ -162,15 +163,6 @@ class Worker:
         self._memory.state.write(values)
 
 
-def take_priority() -> None:
-    """Run before everything that is not real time, where the system lets us; else as politely placed as it allows."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(2))
-    except OSError:
-        with contextlib.suppress(OSError):
-            os.nice(-10)
-
-
 def main() -> None:
     """`python -m weldcal.systems.drivers.ur.worker FD`, with a pickled WorkerConfig on stdin."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupted cell asks its worker to stop, in order
@@ -190,6 +182,7 @@ def main() -> None:
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
+        poll_beside_the_cell()  # not before: ur_rtde's calls of the start wait for these threads without a pause
     except Refused as refused:
         worker.refuse(refused.fault)
         os._exit(1)
