@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from weldcal.calibration.profiler.errors import DegenerateMotion, TooFewRotations, TooFewTranslations
+from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewRotations, TooFewTranslations
 from weldcal.calibration.profiler.motion import (
     FlangePoses,
     Floats,
@@ -27,6 +27,10 @@ MINIMUM_TRANSLATIONS = 3
 SMALL_M = 1e-3  # rms of a group's translations across their main direction: below, they are hardly more than noise
 PLANAR = 0.05  # second over first singular value of a group's translations: below, they lie on a line
 ONE_AXIS = 0.05  # of the axes between the orientations
+ONE_EDGE_M = (
+    2e-3  # rms of the orientations' middles off the edge: an arm is better than that, another edge is farther off
+)
+ONE_EDGE = 2.0  # and over the rms within orientations, which noise and outliers raise likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +56,7 @@ def edge_linear(
         InputError: shapes, numbers that are not finite, no rotation.
         TooFewRotations, TooFewTranslations: fewer than three orientations, or than three positions in one.
         DegenerateMotion: positions of a group on a line, or orientations about one axis only.
+        InconsistentData: the orientations do not see one edge.
     """
     poses = FlangePoses.checked(rotation, translation)
     p = checked_points(points, len(poses))
@@ -63,8 +68,9 @@ def edge_linear(
     p_S = np.column_stack([p[:, 0], np.zeros(len(p)), p[:, 1]])
     R = _rotation(poses, p_S, groups)
     e = _direction(poses, p_S, groups, R)
-    t, distances = _translation(poses, p_S, R, e)
-    return EdgeLinear(R, t, e, distances)
+    t, off = _translation(poses, p_S, R, e)
+    _refuse_two_edges(off, groups)
+    return EdgeLinear(R, t, e, np.linalg.norm(off, axis=1))
 
 
 def _refuse_degenerate(poses: FlangePoses, groups: list[np.ndarray]) -> None:
@@ -88,6 +94,17 @@ def _refuse_degenerate(poses: FlangePoses, groups: list[np.ndarray]) -> None:
     if rotation_axes_spread(poses.rotation[[g[0] for g in groups]]) < ONE_AXIS:
         raise DegenerateMotion(
             "The flange turns about one axis only, which leaves the translation along it open: tilt it as well."
+        )
+
+
+def _refuse_two_edges(off: Floats, groups: list[np.ndarray]) -> None:
+    middles = np.array([off[g].mean(axis=0) for g in groups])
+    within = np.concatenate([off[g] - off[g].mean(axis=0) for g in groups])
+    between = float(np.sqrt((middles**2).sum(axis=1).mean()))
+    if between > max(ONE_EDGE_M, ONE_EDGE * float(np.sqrt((within**2).sum(axis=1).mean()))):
+        raise InconsistentData(
+            f"The orientations do not see one edge: they differ by {1e3 * between:.1f} mm (rms). Take one straight edge that stays in "
+            "place, and the flange poses of these profiles."
         )
 
 
@@ -122,10 +139,13 @@ def _direction(poses: FlangePoses, p_S: Floats, groups: list[np.ndarray], R: Flo
 
 
 def _translation(poses: FlangePoses, p_S: Floats, R: Floats, e: Floats) -> tuple[Floats, Floats]:
-    """Eq. 34 over all pairs is the centred system: rows less their mean (shown in docs/profiler.md), and n^2 times faster."""
+    """p_FS and how far each point (n, 3) is off the edge, across it.
+
+    Eq. 34 over all pairs is the centred system: rows less their mean (shown in docs/profiler.md), and n^2 times faster.
+    """
     P = np.eye(3) - np.outer(e, e)
     A = P @ poses.rotation
     b = -(np.einsum("nij,nj->ni", poses.rotation, p_S @ R.T) + poses.translation) @ P
     A_c, b_c = A - A.mean(axis=0), b - b.mean(axis=0)
     t = np.linalg.lstsq(A_c.reshape(-1, 3), b_c.ravel(), rcond=None)[0]
-    return t, np.asarray(np.linalg.norm(A_c @ t - b_c, axis=1))
+    return t, np.asarray(A_c @ t - b_c)

@@ -238,11 +238,12 @@ def _rms(errors: list[np.ndarray]) -> tuple[float, float]:
         ("degen_one_rotation", TooFewRotations),
         ("degen_two_rotations", TooFewRotations),
         ("degen_one_axis", DegenerateMotion),
+        ("degen_two_edges", InconsistentData),
     ],
 )
 def test_the_papers_method_is_kept_from_answering_where_it_cannot(name: str, refusal: type[Exception]) -> None:
     data = np.load(DATA / "edge_features.npz")
-    for k in range(2):
+    for k in range(len(data[f"{name}_Rb"])):
         with pytest.raises(refusal):
             edge_linear(data[f"{name}_Rb"][k], data[f"{name}_Tb"][k] * MM, data[f"{name}_ps"][k] * MM)
 

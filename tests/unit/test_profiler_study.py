@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from weldcal.tools.studies.profiler_edge import edge_rows
 from weldcal.tools.studies.profiler_pieces import groove_mesh, scan_groove
+from weldcal.tools.studies.profiler_rest import rest_lines, told
 from weldcal.tools.studies.profiler_sets import made_edge_trials
 from weldcal.tools.studies.profiler_sphere import METHODS, WorldData, measure
 from weldcal.tools.studies.profiler_worlds import SphereWorld, sphere_trial
@@ -37,6 +40,20 @@ def test_in_another_world_touches_help_the_paper_and_the_joint_method_needs_no_s
 def test_the_groove_is_as_wide_and_deep_as_drawn() -> None:
     low, high = np.min(groove_mesh().vertices, axis=0), np.max(groove_mesh().vertices, axis=0)
     assert (low[2], high[2]) == pytest.approx((-0.060, 0.0))
+
+
+def test_what_the_fixed_files_hold_besides_both_papers_tables_is_met(shared_data: Path) -> None:
+    lines = rest_lines(shared_data / "profiler", lambda _, __: None)
+    assert len(lines) == 34
+    assert [line for line in lines if not line[2] <= line[3]] == []
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(0.0, "of 12", "0 of 12"), (3.0, "points", "3 points"), (0.1234, "mm", "0.123 mm"), (2.6e-13, "deg", "2.6e-13 deg"), (5.918, "", "5.918")],
+)  # fmt: skip
+def test_a_figure_is_told_with_its_unit(value: float, unit: str, text: str) -> None:
+    assert told(value, unit) == text
 
 
 def test_everything_random_follows_from_the_seed() -> None:

@@ -92,8 +92,10 @@ def profiler(
     if json:
         console.emit_json(study.summary())
     else:
+        from weldcal.tools.studies.profiler_rest import told
+
         rows = {
-            what: f"{v:.3f} {unit}, target {limit:g}: {verdict}" for what, unit, v, limit, verdict in study.targets()
+            what: f"{told(v, unit)}, target {limit:g}: {verdict}" for what, unit, v, limit, verdict in study.targets()
         }
         console.emit_summary("reproduce profiler: done", {**rows, "written to": str(folder)})
     if not study.met:

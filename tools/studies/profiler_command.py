@@ -15,6 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.profiler_edge import TARGETS, TITLES, EdgeRow, all_sets, ball_points
+from weldcal.tools.studies.profiler_rest import Line, published_lines, rest_lines
 from weldcal.tools.studies.profiler_sets import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 from weldcal.tools.studies.profiler_sphere import (
     METHODS,
@@ -43,13 +44,14 @@ class ProfilerStudyOptions:
 
 @dataclass(frozen=True, eq=False)
 class ProfilerStudy:
-    """Everything that the study found; `ball` are a ball's profiles brought together by the joint method."""
+    """Everything that the study found; `ball` are a ball's profiles brought together by the joint method, `rest` what only the fixed files hold."""
 
     options: ProfilerStudyOptions
     names: tuple[str, ...]
     edge: tuple[EdgeRow, ...]
     sphere: tuple[WorldResult, ...]
     ball: np.ndarray
+    rest: tuple[Line, ...]
     wall_seconds: float
 
     @property
@@ -82,6 +84,7 @@ class ProfilerStudy:
             ("length", "angle"), ("mm", "deg"), np.max(errors, axis=0), TARGET_BOSS, strict=True
         ):
             lines.append((f"boss, {name} (worst)", unit, float(value), limit))
+        lines += self.rest
         return [(*line, "met" if line[2] <= line[3] else "MISSED") for line in lines]
 
     @property
@@ -131,15 +134,21 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     def trials_of(name: str) -> Iterator[EdgeTrial]:
         return made_edge_trials(name, TRIALS, options.seed) if data is None else fixed_edge_trials(data, name)
 
-    rows = all_sets(trials_of, names, lambda name, share: progress(f"edge {name}", 0.5 * share))
+    rows = all_sets(trials_of, names, lambda name, share: progress(f"edge {name}", 0.4 * share))
     made = made_worlds(worlds, options.seed, GROOVES, BOSSES) if data is None else fixed_worlds(data, worlds)
-    results = all_worlds(made, worlds, lambda name, share: progress(f"sphere, {name}", 0.5 + 0.5 * share))
+    results = all_worlds(made, worlds, lambda name, share: progress(f"sphere, {name}", 0.4 + 0.4 * share))
+    rest: list[Line] = []
+    if data is not None and not options.quick:
+        rest = [
+            *published_lines(results),
+            *rest_lines(data, lambda name, share: progress(name, 0.8 + 0.2 * share)),
+        ]
     first = next(iter(trials_of(names[0])))
     e = edge_joint(
         first.poses.rotation, first.poses.translation, first.points, sigma_robot_m=first.noise.robot_m, sigma_xz_m=first.noise.xz_m
     )  # fmt: skip
     cloud = ball_points(first, e.rotation, e.translation)
-    study = ProfilerStudy(options, names, tuple(rows), tuple(results), cloud, time.monotonic() - start)
+    study = ProfilerStudy(options, names, tuple(rows), tuple(results), cloud, tuple(rest), time.monotonic() - start)
     from weldcal.tools.studies.profiler_report import profiler_report
 
     write_atomic(study.folder / "table.json", json.dumps(plain(study.summary()), allow_nan=False, indent=1) + "\n")

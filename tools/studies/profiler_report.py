@@ -11,6 +11,7 @@ from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies import profiler_edge as edge
 from weldcal.tools.studies import profiler_plots as plots
 from weldcal.tools.studies import profiler_sphere as sphere
+from weldcal.tools.studies.profiler_rest import told
 
 if TYPE_CHECKING:
     from weldcal.tools.studies.profiler_command import ProfilerStudy
@@ -20,10 +21,7 @@ Lines = list[tuple[str, ...]]
 
 def target_lines(study: ProfilerStudy) -> Lines:
     """What, reached, target, verdict."""
-    return [
-        (what, f"{fixed(v, 3)} {unit}", f"≤ {limit:g} {unit}", verdict)
-        for what, unit, v, limit, verdict in study.targets()
-    ]
+    return [(what, told(v, unit), f"≤ {limit:g} {unit}", verdict) for what, unit, v, limit, verdict in study.targets()]
 
 
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
