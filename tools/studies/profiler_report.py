@@ -101,6 +101,7 @@ def profiler_report(study: ProfilerStudy) -> str:
         study=study,
         source="the fixed files" if fixed_files else f"worlds made from seed {study.options.seed}",
         lines=lines,
+        papers=len(lines) - len(study.rest),
         missed=sum(line[3] != "met" for line in lines),
         alpha=alpha, d=d, radius=radius, errors=error_lines(study), points=points, seam=seam, boss=boss,
         fig_alpha=plots.against_rotations(rows, study.names, "alpha", "deg", _short()),
