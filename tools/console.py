@@ -66,6 +66,10 @@ NAMES = {
     "peak_omega": "peak turning rate (rad/s)",
     "next_pose": "next best pose",
     "wall_seconds": "seconds",
+    "late_ms": "late while moving, most (ms)",
+    "thinking_ms": "thinking at rest, most (ms)",
+    "reanchored": "times fallen behind",
+    "fell_behind": "mind",
 }
 """What a person calls a number of the JSON object, where its key says it too briefly."""
 

@@ -54,10 +54,10 @@ class _Error:
 
 
 def told(value: float, unit: str) -> str:
-    """A figure with its unit, as tables show it: counts whole, nothing as 0, tiny ones by their power of ten."""
+    """A figure with its unit, as tables show it: counts whole, what is tiny by its power of ten."""
     if unit == "points" or unit.startswith("of "):
         return f"{value:.0f} {unit}"
-    return (f"{value:.3f}" if value >= 5e-4 else f"{value:.1e}") + (f" {unit}" if unit else "")
+    return (f"{value:.3f}" if value >= 5e-4 or value == 0.0 else f"{value:.1e}") + (f" {unit}" if unit else "")
 
 
 def rest_lines(folder: Path, progress: Callable[[str, float], None]) -> list[Line]:

@@ -26,8 +26,11 @@ def poll_beside_the_cell() -> None:
 
     Each connection of ur_rtde has a thread that looks for data, sleeps for 0.1 ms and looks again. With the loop's priority
     they would take the processor from the cell 7000 times a second, which on two cores makes it two to three times slower.
-    With the cell's they run on another core, or after it; ordinary threads might not run at all while it computes.
+    With the cell's they run on another core, or after it; ordinary threads might not run at all while it computes. On one core
+    they would wait until it is done, and stay as they are.
     """
+    if len(os.sched_getaffinity(0)) < 2:
+        return
     for thread in map(int, os.listdir("/proc/self/task")):
         if thread != threading.get_native_id() and os.sched_getscheduler(thread) == os.SCHED_RR:
             with contextlib.suppress(OSError):
