@@ -69,7 +69,7 @@ NAMES = {
     "late_ms": "late while moving, most (ms)",
     "thinking_ms": "thinking at rest, most (ms)",
     "reanchored": "times fallen behind",
-    "fell_behind": "mind",
+    "fell_behind": "note",
 }
 """What a person calls a number of the JSON object, where its key says it too briefly."""
 

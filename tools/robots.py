@@ -21,9 +21,7 @@ from weldcal.tools.ur_emulator.process import HOST as EMULATOR_HOST
 from weldcal.tools.ur_emulator.process import emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
-EMULATED_PACE = (
-    0.7  # two cores keep up at 1 where they have cell, worker and emulator to themselves, at this beside other work
-)
+EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this they do beside other work
 SLOWEST_PACE = 0.05
 
 

@@ -27,9 +27,7 @@ MINIMUM_TRANSLATIONS = 3
 SMALL_M = 1e-3  # rms of a group's translations across their main direction: below, they are hardly more than noise
 PLANAR = 0.05  # second over first singular value of a group's translations: below, they lie on a line
 ONE_AXIS = 0.05  # of the axes between the orientations
-ONE_EDGE_M = (
-    2e-3  # rms of the orientations' middles off the edge: an arm is better than that, another edge is farther off
-)
+ONE_EDGE_M = 2e-3  # rms of the orientations' middles off the edge: more than an arm is wrong by
 ONE_EDGE = 2.0  # and over the rms within orientations, which noise and outliers raise likewise
 
 

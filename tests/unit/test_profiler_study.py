@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from weldcal.models.errors import InputError
+from weldcal.tools.studies.profiler_command import ProfilerStudyOptions, run_profiler_study
 from weldcal.tools.studies.profiler_edge import edge_rows
+from weldcal.tools.studies.profiler_fixed import fixed_lines, told
 from weldcal.tools.studies.profiler_pieces import groove_mesh, scan_groove
-from weldcal.tools.studies.profiler_rest import rest_lines, told
 from weldcal.tools.studies.profiler_sets import made_edge_trials
 from weldcal.tools.studies.profiler_sphere import METHODS, WorldData, measure
 from weldcal.tools.studies.profiler_worlds import SphereWorld, sphere_trial
@@ -43,9 +45,16 @@ def test_the_groove_is_as_wide_and_deep_as_drawn() -> None:
 
 
 def test_what_the_fixed_files_hold_besides_both_papers_tables_is_met(shared_data: Path) -> None:
-    lines = rest_lines(shared_data / "profiler", lambda _, __: None)
+    lines = fixed_lines(shared_data / "profiler", lambda _, __: None)
     assert len(lines) == 34
     assert [line for line in lines if not line[2] <= line[3]] == []
+
+
+def test_a_fixed_file_that_is_missing_is_named_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "edge_features.npz").touch()
+    with pytest.raises(InputError, match=r"There is no edge_sphere\.npz"):
+        run_profiler_study(ProfilerStudyOptions(tmp_path / "out", tmp_path), lambda _, __: None)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,7 @@ def profiler(
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.profiler_rest import told
+        from weldcal.tools.studies.profiler_fixed import told
 
         rows = {
             what: f"{told(v, unit)}, target {limit:g}: {verdict}" for what, unit, v, limit, verdict in study.targets()

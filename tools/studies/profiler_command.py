@@ -15,7 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.profiler_edge import TARGETS, TITLES, EdgeRow, all_sets, ball_points
-from weldcal.tools.studies.profiler_rest import Line, published_lines, rest_lines
+from weldcal.tools.studies.profiler_fixed import Line, fixed_lines, published_lines, require_files
 from weldcal.tools.studies.profiler_sets import SETS, EdgeTrial, fixed_edge_trials, made_edge_trials
 from weldcal.tools.studies.profiler_sphere import (
     METHODS,
@@ -44,14 +44,15 @@ class ProfilerStudyOptions:
 
 @dataclass(frozen=True, eq=False)
 class ProfilerStudy:
-    """Everything that the study found; `ball` are a ball's profiles brought together by the joint method, `rest` what only the fixed files hold."""
+    """Everything that the study found; `ball` are a ball's profiles brought together by the joint method, `fixed` the targets of
+    what only the fixed files hold."""
 
     options: ProfilerStudyOptions
     names: tuple[str, ...]
     edge: tuple[EdgeRow, ...]
     sphere: tuple[WorldResult, ...]
     ball: np.ndarray
-    rest: tuple[Line, ...]
+    fixed: tuple[Line, ...]
     wall_seconds: float
 
     @property
@@ -84,7 +85,7 @@ class ProfilerStudy:
             ("length", "angle"), ("mm", "deg"), np.max(errors, axis=0), TARGET_BOSS, strict=True
         ):
             lines.append((f"boss, {name} (worst)", unit, float(value), limit))
-        lines += self.rest
+        lines += self.fixed
         return [(*line, "met" if line[2] <= line[3] else "MISSED") for line in lines]
 
     @property
@@ -128,6 +129,9 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     data = options.data
     if data is not None and not data.is_dir():
         raise InputError(f"There is no folder '{data}': give the one with edge_features.npz and sphere.npz.")
+    whole = None if options.quick else data
+    if whole is not None:
+        require_files(whole)
     names = QUICK_SETS if options.quick else SETS
     worlds = (2 if data is None else 3) if options.quick else WORLDS
 
@@ -137,18 +141,18 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     rows = all_sets(trials_of, names, lambda name, share: progress(f"edge {name}", 0.4 * share))
     made = made_worlds(worlds, options.seed, GROOVES, BOSSES) if data is None else fixed_worlds(data, worlds)
     results = all_worlds(made, worlds, lambda name, share: progress(f"sphere, {name}", 0.4 + 0.4 * share))
-    rest: list[Line] = []
-    if data is not None and not options.quick:
-        rest = [
+    fixed: list[Line] = []
+    if whole is not None:
+        fixed = [
             *published_lines(results),
-            *rest_lines(data, lambda name, share: progress(name, 0.8 + 0.2 * share)),
+            *fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share)),
         ]
     first = next(iter(trials_of(names[0])))
     e = edge_joint(
         first.poses.rotation, first.poses.translation, first.points, sigma_robot_m=first.noise.robot_m, sigma_xz_m=first.noise.xz_m
     )  # fmt: skip
     cloud = ball_points(first, e.rotation, e.translation)
-    study = ProfilerStudy(options, names, tuple(rows), tuple(results), cloud, tuple(rest), time.monotonic() - start)
+    study = ProfilerStudy(options, names, tuple(rows), tuple(results), cloud, tuple(fixed), time.monotonic() - start)
     from weldcal.tools.studies.profiler_report import profiler_report
 
     write_atomic(study.folder / "table.json", json.dumps(plain(study.summary()), allow_nan=False, indent=1) + "\n")

@@ -11,7 +11,7 @@ from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies import profiler_edge as edge
 from weldcal.tools.studies import profiler_plots as plots
 from weldcal.tools.studies import profiler_sphere as sphere
-from weldcal.tools.studies.profiler_rest import told
+from weldcal.tools.studies.profiler_fixed import told
 
 if TYPE_CHECKING:
     from weldcal.tools.studies.profiler_command import ProfilerStudy
@@ -101,7 +101,7 @@ def profiler_report(study: ProfilerStudy) -> str:
         study=study,
         source="the fixed files" if fixed_files else f"worlds made from seed {study.options.seed}",
         lines=lines,
-        papers=len(lines) - len(study.rest),
+        papers=len(lines) - len(study.fixed),
         missed=sum(line[3] != "met" for line in lines),
         alpha=alpha, d=d, radius=radius, errors=error_lines(study), points=points, seam=seam, boss=boss,
         fig_alpha=plots.against_rotations(rows, study.names, "alpha", "deg", _short()),

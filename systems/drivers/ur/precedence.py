@@ -25,7 +25,7 @@ def poll_beside_the_cell() -> None:
     """Give all other threads of this process the cell's own priority, where the system lets us.
 
     Each connection of ur_rtde has a thread that looks for data, sleeps for 0.1 ms and looks again. With the loop's priority
-    they would take the processor from the cell 7000 times a second, which on two cores makes it two to three times slower.
+    they would take the processor from the cell thousands of times a second, and two cores could not keep up with half of real time.
     With the cell's they run on another core, or after it; ordinary threads might not run at all while it computes. On one core
     they would wait until it is done, and stay as they are.
     """

@@ -33,6 +33,9 @@ DEGENERATE = {
     "one_axis": "one axis of turning",
     "two_edges": "points of two edges",
 }
+FILES = (
+    "edge_features.npz", "edge_sphere.npz", "edge_profiles.npz", "sphere.npz", "groove.npz", "boss.npz", "real_sphere15_a.npz",
+)  # fmt: skip
 FREE = {"nominal": (0.107, 0.123), "paper": (0.36, 0.42)}
 RAW: tuple[tuple[str, Literal["bar", "step", "apex"], tuple[float, float]], ...] = (
     ("bar", "bar", (0.050, 0.031)),
@@ -60,12 +63,27 @@ def told(value: float, unit: str) -> str:
     return (f"{value:.3f}" if value >= 5e-4 or value == 0.0 else f"{value:.1e}") + (f" {unit}" if unit else "")
 
 
-def rest_lines(folder: Path, progress: Callable[[str, float], None]) -> list[Line]:
+def require_files(folder: Path) -> None:
+    """Say what is missing before any work.
+
+    Raises:
+        InputError: a file of FILES is not there.
+    """
+    for name in FILES:
+        if not (folder / name).is_file():
+            raise InputError(
+                f"There is no {name} in '{folder}': give the folder of all fixed files, take --quick, or leave --data away to make "
+                "trials from seeds."
+            )
+
+
+def fixed_lines(folder: Path, progress: Callable[[str, float], None]) -> list[Line]:
     """All of it.
 
     Raises:
         InputError: a file is not there.
     """
+    require_files(folder)
     steps: tuple[tuple[str, Callable[[], Iterator[Line]]], ...] = (
         ("without noise", lambda: _exact(folder)),
         ("free poses", lambda: _free(folder)),
@@ -176,10 +194,7 @@ def _degenerate(folder: Path) -> Iterator[Line]:
 
 
 def _raw(folder: Path) -> Iterator[Line]:
-    path = folder / "edge_profiles.npz"
-    if not path.is_file():
-        raise InputError(f"There is no {path.name} in '{folder}'.")
-    with np.load(path) as d:
+    with np.load(folder / "edge_profiles.npz") as d:
         for name, kind, limits in RAW:
             errors = [
                 extract_edge(profile * MM, kind)[0] / MM - truth
@@ -222,10 +237,7 @@ def _arcs(folder: Path) -> Iterator[Line]:
 
 
 def _real(folder: Path) -> Iterator[Line]:
-    path = folder / "real_sphere15_a.npz"
-    if not path.is_file():
-        raise InputError(f"There is no {path.name} in '{folder}'.")
-    with np.load(path) as z:
+    with np.load(folder / "real_sphere15_a.npz") as z:
         T, parts = z["T_base_flange"], np.split(z["xz"] * MM, np.cumsum(z["n"])[:-1])
     data = SphereData(FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM), [p[::8] for p in parts], 40 * MM)
     off = float(np.sqrt((leave_one_out_m(data, "rigid") ** 2).mean())) / MM
