@@ -19,7 +19,12 @@ from weldcal.tools.ur_emulator.process import Emulator, emulator_process
 HOST = "127.0.0.41"
 SAME_MM = 0.05
 PACE = 0.5  # a faster one leaves the link less time than a busy machine of two cores may take
-STOOD_STILL = ("LINK: no new state", "COMMAND LATE")
+# how it shows that the computer stood still: in the worker, in the cell, or in the controller while the worker's core did
+STOOD_STILL = (
+    "LINK: no new state",
+    "COMMAND LATE",
+    "GUARD: the script on the controller stopped the arm, because no new command",
+)
 FELL_BEHIND_S = 1.0  # of the job's forty
 NOMINAL = Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml"
 
