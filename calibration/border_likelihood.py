@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.compiled import compiled
+from weldcal.calibration.geometry.compiled import compiled
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

@@ -12,8 +12,8 @@ from scipy.special import ndtr
 
 from weldcal.calibration.border_likelihood import WRONG as _WRONG
 from weldcal.calibration.border_likelihood import border_likelihood
-from weldcal.calibration.circle import CircleFit
 from weldcal.calibration.errors import CircleFitError
+from weldcal.calibration.geometry.circle import CircleFit
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from weldcal.calibration.rigid import skew
+from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.scanner_model import ScannerCorrection
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.circle import CircleFit, fit_circle
 from weldcal.calibration.edge_labels import refine_circle
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
-from weldcal.calibration.plane import PlaneFit, fit_plane
+from weldcal.calibration.geometry.circle import CircleFit, fit_circle
+from weldcal.calibration.geometry.plane import PlaneFit, fit_plane
 from weldcal.calibration.rim import EdgePoints, FacePixels, coverage, plane_axes, sector_edges
 from weldcal.calibration.scene import Scene
 from weldcal.models.flanges import FlangeStandard

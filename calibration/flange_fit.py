@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.circle import fuse
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.face import Face, FlangeFitConfig, Refusal, faces_on_plane
 from weldcal.calibration.frame_search import search_frame, typical_pitches, window_about
-from weldcal.calibration.plane import local_planes
+from weldcal.calibration.geometry.circle import fuse
+from weldcal.calibration.geometry.plane import local_planes
 from weldcal.calibration.rim import plane_axes
 from weldcal.calibration.scene import Scene, crop, islands
 from weldcal.calibration.segmented import fit_segmented

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import f as fisher
 
 from weldcal.calibration.errors import UndeterminedPoses
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.handeye.choose import CANDIDATES, Candidate, solve
 from weldcal.calibration.handeye.determinacy import (
     Diversity,
@@ -20,7 +21,6 @@ from weldcal.calibration.handeye.determinacy import (
     without_drift,
 )
 from weldcal.calibration.handeye.problem import NAMES, Problem, State, residuals
-from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.models.errors import InputError, WeldcalError
 
 Array = NDArray[np.float64]
@@ -121,7 +121,7 @@ class HandEyeResult:
 
 def pose_difference(estimate: RigidTransform, truth: RigidTransform) -> Array:
     """Change (6,) [rotation; translation] on the parent's side that moves the estimate to the truth."""
-    from weldcal.calibration.handeye.se3 import difference
+    from weldcal.calibration.geometry.se3 import difference
 
     return difference(np.asarray(estimate.GetAsMatrix4()), np.asarray(truth.GetAsMatrix4()))
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.circle import CircleFit, refine_circles
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.flange_fit import FlangeFit
 from weldcal.calibration.frame_search import typical_pitches, window_about
+from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.rim import plane_axes
 from weldcal.models.flanges import FlangeStandard
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
+from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.handeye.problem import linearise
 from weldcal.calibration.handeye.scaled import inverse_information
-from weldcal.calibration.handeye.se3 import exp_rotation
 from weldcal.calibration.mounting_scene import FLANGE, Bodies, MountingScene
-from weldcal.calibration.rigid import skew
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import jacobian, sigma_min
 

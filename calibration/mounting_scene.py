@@ -11,9 +11,9 @@ from pydrake.math import RigidTransform
 from scipy.spatial.distance import cdist
 
 from weldcal.calibration.clearance import Body, arm_bodies, lowest_point, occludes
+from weldcal.calibration.geometry.se3 import IDENTITY
 from weldcal.calibration.handeye.mountings import Mounting, Sighting, get_mounting, problem_of
 from weldcal.calibration.handeye.problem import Problem, State
-from weldcal.calibration.handeye.se3 import IDENTITY
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.scanners import ScannerPreset
 

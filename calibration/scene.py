@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from weldcal.calibration.plane import PlaneFit
+from weldcal.calibration.geometry.plane import PlaneFit
 from weldcal.calibration.rim import (
     EdgePoints,
     FacePixels,

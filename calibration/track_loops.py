@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.circle_steps import MAD, TUKEY, middle, solved
-from weldcal.calibration.compiled import compiled
+from weldcal.calibration.geometry.circle_steps import MAD, TUKEY, middle, solved
+from weldcal.calibration.geometry.compiled import compiled
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.blindness import COMPONENTS, blind_components, information, sigmas, surface_normals
 from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
 from weldcal.calibration.observation import Observation
-from weldcal.calibration.rigid import exp_rotation, rotation_vector
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 

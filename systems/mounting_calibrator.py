@@ -15,11 +15,11 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from weldcal.calibration.base_circle_fit import fit_base_circle
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.handeye.scaled import inverse_information
 from weldcal.calibration.mounting_poses import MountingPose, information, prior, work_point
 from weldcal.calibration.mounting_scene import FLANGE, MountingScene
-from weldcal.calibration.rigid import skew
 from weldcal.calibration.stated_noise import information_of, with_stated_noise
 from weldcal.calibration.warm_up import warm_up
 from weldcal.models.errors import WeldcalError

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.handeye.corners import CornerRefinement, poses_from_corners, refine_with_corners
 from weldcal.calibration.handeye.determinacy import check_poses
@@ -23,7 +24,6 @@ from weldcal.calibration.handeye.mountings import Mounting, get_mounting
 from weldcal.calibration.handeye.next_pose import NextPose, next_pose
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.handeye.problem import Problem, full_problem
-from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.calibration.handeye.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError

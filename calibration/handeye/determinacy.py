@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
+from weldcal.calibration.geometry.se3 import log_rotation, nearest_rotation
 from weldcal.calibration.handeye.problem import NAMES, Problem, State
 from weldcal.calibration.handeye.scaled import RANK
-from weldcal.calibration.handeye.se3 import log_rotation, nearest_rotation
 
 Array = NDArray[np.float64]
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
+from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, log_rotation, mean_pose, pose
 from weldcal.calibration.hand_eye import (
     HandEyeConfig,
     HandEyeHeldOut,
@@ -22,7 +23,6 @@ from weldcal.calibration.handeye.mountings import chain as mounted
 from weldcal.calibration.handeye.mountings import get_mounting
 from weldcal.calibration.handeye.problem import NAMES, Problem, State, full_problem, linearise, residuals
 from weldcal.calibration.handeye.scaled import TINY, inverse_information
-from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse, log_rotation, mean_pose, pose
 from weldcal.models.arms.chain import Chain
 from weldcal.models.errors import InputError, WeldcalError
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.handeye.choose import CANDIDATES, most_promising
 from weldcal.calibration.handeye.determinacy import diversity
@@ -17,7 +18,6 @@ from weldcal.calibration.handeye.files import PosePairs
 from weldcal.calibration.handeye.fit import descend
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise, residuals
 from weldcal.calibration.handeye.scaled import inverse_information
-from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.calibration.handeye.starts import grid, kronecker, with_positions
 from weldcal.models.errors import WeldcalError
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.handeye.problem import Problem, State
-from weldcal.calibration.handeye.se3 import IDENTITY, inverse
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation
 from weldcal.calibration.hand_eye import HandEyeResult, as_transform
 from weldcal.calibration.handeye.mountings import Mounting
 from weldcal.calibration.handeye.problem import Problem, State, linearise
 from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
-from weldcal.calibration.handeye.se3 import exp_rotation, inverse, log_rotation
 from weldcal.calibration.handeye.view import View, view_of
-from weldcal.calibration.rigid import skew
 from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import known_arms, load_arm

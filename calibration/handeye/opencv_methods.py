@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse, nearest_rotation, pose
 from weldcal.calibration.hand_eye import HandEyeHeldOut, fold_labels
 from weldcal.calibration.handeye.problem import Problem, residuals
-from weldcal.calibration.handeye.se3 import IDENTITY, inverse, nearest_rotation, pose
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import inverse, log_rotation, nearest_rotation, pose
 from weldcal.calibration.handeye.problem import Problem, State
-from weldcal.calibration.handeye.se3 import inverse, log_rotation, nearest_rotation, pose
 
 Array = NDArray[np.float64]
 Rotations = tuple[Array, Array, Array]

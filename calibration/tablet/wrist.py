@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import least_squares
 
-from weldcal.calibration.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.rigid import exp_rotation, skew
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import check_layout, check_turns

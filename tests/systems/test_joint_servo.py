@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.rigid import rotation_vector
+from weldcal.calibration.geometry.rigid import rotation_vector
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.handeye.se3 import exp_rotation, inverse, pose
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from weldcal.calibration.circle import fit_circle, fuse
 from weldcal.calibration.errors import CircleFitError
+from weldcal.calibration.geometry.circle import fit_circle, fuse
 
 
 def arc(rng: np.random.Generator, n: int, noise: float, turn: float = 2.0 * np.pi) -> np.ndarray:

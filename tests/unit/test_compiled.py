@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from weldcal.calibration.border_likelihood import WRONG, border_likelihood
-from weldcal.calibration.circle_steps import circle_steps, middle, solved
 from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
+from weldcal.calibration.geometry.circle_steps import circle_steps, middle, solved
+from weldcal.calibration.geometry.plane_moments import weighted_moments
 from weldcal.calibration.holes import find_holes
-from weldcal.calibration.plane_moments import weighted_moments
 from weldcal.calibration.track_loops import borders, near_edge, plane_steps, ring_points
 from weldcal.calibration.warm_up import warm_up
 from weldcal.models.flanges import get_flange

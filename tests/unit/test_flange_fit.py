@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.geometry.rigid import rotation_vector
 from weldcal.calibration.observation import observation_from_fit
-from weldcal.calibration.rigid import rotation_vector
 from weldcal.calibration.solve import estimate_eye_on_base
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange

@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 from weldcal.calibration.blindness import COMPONENTS
 from weldcal.calibration.dataset import load_dataset, save_dataset
 from weldcal.calibration.dataset_header import DatasetHeader
+from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.iterative import algorithm1_start, algorithm1_step
 from weldcal.calibration.observation import Observation
-from weldcal.calibration.rigid import fit_rigid
 from weldcal.calibration.verification import VerificationError
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange

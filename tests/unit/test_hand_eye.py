@@ -16,6 +16,7 @@ from weldcal.calibration.errors import (
     TooFewPoses,
     UndeterminedPoses,
 )
+from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, log_rotation, pose
 from weldcal.calibration.hand_eye import (
     HandEyeConfig,
     HandEyeResult,
@@ -26,7 +27,6 @@ from weldcal.calibration.hand_eye import (
     solve_problem,
 )
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
-from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse, log_rotation, pose
 from weldcal.models.errors import InputError, WeldcalError
 
 from .hand_eye_poses import Array, co_manipulation, eye_in_hand, random_poses

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse
 from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, as_transform, solve_problem
 from weldcal.calibration.handeye.choose import CANDIDATES
 from weldcal.calibration.handeye.mountings import Sighting, get_mounting, problem_of
 from weldcal.calibration.handeye.problem import Problem, State
-from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse
 from weldcal.calibration.stated_noise import with_stated_noise
 from weldcal.models.errors import InputError
 

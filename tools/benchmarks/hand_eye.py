@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye import (
     HandEyeConfig,
     as_transform,
@@ -24,7 +25,6 @@ from weldcal.calibration.handeye.mountings import MOUNTINGS
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out, opencv_solve
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
 from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
-from weldcal.calibration.handeye.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.result import write_atomically
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.benchmarks.hand_eye_fuzz import fuzz

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.circle_steps import MAD as _MAD
-from weldcal.calibration.circle_steps import TUKEY as _TUKEY
-from weldcal.calibration.circle_steps import circle_steps
 from weldcal.calibration.errors import CircleFitError
+from weldcal.calibration.geometry.circle_steps import MAD as _MAD
+from weldcal.calibration.geometry.circle_steps import TUKEY as _TUKEY
+from weldcal.calibration.geometry.circle_steps import circle_steps
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.rigid import skew
+from weldcal.calibration.geometry.rigid import skew
 
 Array = NDArray[np.float64]
 
