@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.clouds import CloudError
-from weldcal.calibration.dataset import Dataset
+from weldcal.calibration.data.clouds import CloudError
+from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange_fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.holes import HolePattern, find_holes

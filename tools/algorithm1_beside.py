@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.flange_fit import FlangeFit
-from weldcal.calibration.observation import Observation
-from weldcal.calibration.result import (
+from weldcal.calibration.data.results import (
     IcpRecord,
 )
+from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.observation import Observation
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import (
     Algorithm1Run,

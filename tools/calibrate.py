@@ -16,14 +16,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.advice import sampling_advice
-from weldcal.calibration.dataset import load_dataset
-from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.flange_fit import FlangeFit
-from weldcal.calibration.holes import HolePattern
-from weldcal.calibration.observability import turn_deg
-from weldcal.calibration.observation import Observation
-from weldcal.calibration.result import (
+from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.results import (
     CalibrationResult,
     PoseRecord,
     export_all,
@@ -31,6 +25,12 @@ from weldcal.calibration.result import (
     save_result,
     software_version,
 )
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
+from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.observability import turn_deg
+from weldcal.calibration.observation import Observation
 from weldcal.calibration.self_calibration import SelfCalibration, apply_self_calibration, calibrate_corrected
 from weldcal.calibration.sightings import see_flanges
 from weldcal.calibration.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.results import matrix4
 from weldcal.calibration.profiler.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.edge_features import Kind, extract_edge
@@ -38,7 +39,6 @@ from weldcal.calibration.profiler.sphere_linear import (
     wrong_sides,
 )
 from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
-from weldcal.calibration.result import matrix4
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.profiler_files import ProfilerFile

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
-from weldcal.models.tables import read_rows
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 NEAR_M = 0.02  # nor always this near

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.dataset import save_dataset
-from weldcal.calibration.dataset_header import DatasetHeader, Feature, ScannerGuess
-from weldcal.calibration.result import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.data.dataset import save_dataset
+from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.solve import CalibrationEstimate
 from weldcal.systems.cell import Cell, feature_standard
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner

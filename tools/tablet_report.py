@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
+from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
 from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.tablet_cell import TabletCell, TabletVisit
 from weldcal.tools.report.pictures import OURS, svg

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.result import software_version
+from weldcal.calibration.data.results import software_version
 from weldcal.calibration.tablet.files import file_hash
 from weldcal.calibration.tablet.planar_files import PlanarFile
 from weldcal.calibration.tablet.two_stage import Sign

@@ -10,9 +10,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.hand_eye import HandEyeResult
-from weldcal.calibration.handeye.mountings import Mounting, Unknown
-from weldcal.calibration.result import (
+from weldcal.calibration.data.results import (
     export_ros2,
     export_ur_pose,
     export_urdf,
@@ -20,6 +18,8 @@ from weldcal.calibration.result import (
     software_version,
     write_atomically,
 )
+from weldcal.calibration.hand_eye import HandEyeResult
+from weldcal.calibration.handeye.mountings import Mounting, Unknown
 
 RESULT_FILE = "hand_eye.yaml"
 

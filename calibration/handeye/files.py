@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_load
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye import as_poses
 from weldcal.calibration.handeye.mountings import chain, get_mounting
 from weldcal.models.errors import InputError
-from weldcal.models.tables import read_rows
 
 Array = NDArray[np.float64]
 

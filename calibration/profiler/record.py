@@ -11,12 +11,12 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.results import matrix4, software_version, write_atomically
 from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.calibration.profiler.sphere_joint import SphereEstimate
 from weldcal.calibration.profiler.sphere_model import corrected
-from weldcal.calibration.result import matrix4, software_version, write_atomically
 from weldcal.models.errors import InputError
 
 RECORD_FILE = "profiler.yaml"

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.tables import Row
 from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
 from weldcal.calibration.tablet.page_grid import find_page
 from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist import WristTouches
-from weldcal.models.tables import Row
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.result import (
+from weldcal.calibration.data.results import (
     export_ros2,
     export_ur_pose,
     export_urdf,

@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from weldcal.calibration.data.tables import Row, read_rows
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.models.errors import InputError
-from weldcal.models.tables import Row, read_rows
 
 
 def read_table(path: Path, columns: Sequence[str]) -> list[Row]:

@@ -12,10 +12,10 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.results import load_result
 from weldcal.calibration.flange_fit import fit_flange
 from weldcal.calibration.observation import Observation
-from weldcal.calibration.result import load_result
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import position_errors
 from weldcal.models.errors import InputError
@@ -112,7 +112,7 @@ def test_result_folder_is_complete_and_reads_back(aubo: CalibrationReport) -> No
 
 
 def test_franka_ply_in_millimetres_is_read_and_fitted() -> None:
-    from weldcal.calibration.dataset import load_dataset
+    from weldcal.calibration.data.dataset import load_dataset
 
     points = load_dataset(DATA / "franka_phoxi_m").cloud("pose04")
     fit = fit_flange(points, get_flange("iso9409-1-50-4-m6"))

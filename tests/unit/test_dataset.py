@@ -9,9 +9,9 @@ import open3d as o3d
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.clouds import CloudError, read_cloud, save_cloud
-from weldcal.calibration.dataset import load_dataset, save_dataset
-from weldcal.calibration.dataset_header import DatasetHeader
+from weldcal.calibration.data.clouds import CloudError, read_cloud, save_cloud
+from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.errors import DatasetError
 
 HEADER = """\

@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from weldcal.calibration.blindness import COMPONENTS
-from weldcal.calibration.dataset import load_dataset, save_dataset
-from weldcal.calibration.dataset_header import DatasetHeader
+from weldcal.calibration.data.dataset import load_dataset, save_dataset
+from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.iterative import algorithm1_start, algorithm1_step
 from weldcal.calibration.observation import Observation

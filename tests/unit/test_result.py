@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.geometry.rigid import exp_rotation
-from weldcal.calibration.result import (
+from weldcal.calibration.data.results import (
     CalibrationResult,
     IcpRecord,
     PoseRecord,
@@ -24,6 +23,7 @@ from weldcal.calibration.result import (
     save_result,
     write_atomically,
 )
+from weldcal.calibration.geometry.rigid import exp_rotation
 from weldcal.models.errors import InputError
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

@@ -139,7 +139,7 @@ def parts(
 ) -> None:
     """How far do two parts of one cloud disagree about the flange's centre, and how far must they?"""
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-parts") as progress:
-        from weldcal.calibration.dataset import load_dataset
+        from weldcal.calibration.data.dataset import load_dataset
         from weldcal.models.errors import InputError
         from weldcal.models.flanges import get_flange
         from weldcal.tools.studies.flange_halves import study_parts

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.results import write_atomically
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye import (
     HandEyeConfig,
@@ -25,7 +26,6 @@ from weldcal.calibration.handeye.mountings import MOUNTINGS
 from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out, opencv_solve
 from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
 from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
-from weldcal.calibration.result import write_atomically
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.benchmarks.hand_eye_fuzz import fuzz
 from weldcal.tools.simulation import Progress, no_progress

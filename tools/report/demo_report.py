@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from weldcal.calibration.result import export_ros2, export_ur_pose, software_version
+from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
 from weldcal.tools.outcome import heat_input_kJ_mm, planned_seam
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render

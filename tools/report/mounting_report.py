@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.result import software_version
+from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, render
 

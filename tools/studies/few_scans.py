@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.holes import HolePattern

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.dataset import Dataset
+from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.flange_fit import fit_flange
 from weldcal.calibration.iterative import Algorithm1State, algorithm1_start, algorithm1_step
 from weldcal.calibration.observation import Observation

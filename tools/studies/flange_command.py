@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from weldcal.calibration.dataset import Dataset, load_dataset
+from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi
 
-from weldcal.calibration.dataset import load_dataset
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.holes import HolePattern
 from weldcal.calibration.observation import Observation

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from weldcal.calibration.result import software_version
+from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies import profiler_edge as edge
 from weldcal.tools.studies import profiler_plots as plots

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from weldcal.calibration.result import software_version
+from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.tablet_paper import STAGE_1, STAGE_2, TABLE_NUMBER, TOUCHING_MM, published_touches
 from weldcal.tools.studies.tablet_plots import SIGN_WORDS, sign_residuals, unseen_errors

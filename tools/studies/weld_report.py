@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from weldcal.calibration.result import software_version
+from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.plots_weld import along_the_weld, paths
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.plots import weld_trace

@@ -14,11 +14,11 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.clouds import NO_NOTES, CloudError, find_cloud, read_cloud, save_cloud
-from weldcal.calibration.dataset_header import DatasetHeader
+from weldcal.calibration.data.clouds import NO_NOTES, CloudError, find_cloud, read_cloud, save_cloud
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.errors import InputError
-from weldcal.models.tables import read_rows
 
 Array = NDArray[np.float64]
 

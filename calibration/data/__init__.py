@@ -1,0 +1,1 @@
+"""Datasets, clouds, tables and results: reading and writing, every refusal named."""
