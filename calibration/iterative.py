@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.verification import FAILED, VerificationError, Verifier
 from weldcal.models.errors import InputError
 

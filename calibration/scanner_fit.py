@@ -11,9 +11,9 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, skew
-from weldcal.calibration.holes import HolePattern
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.scanner_model import TERMS, ScannerCorrection
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 

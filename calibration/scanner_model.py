@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

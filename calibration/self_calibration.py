@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
 from weldcal.calibration.estimate import CalibrationEstimate, HeldOut, with_scanner
-from weldcal.calibration.holes import HolePattern
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.scanner_fit import (
     CIRCLE_OWN,
     CorrectionEstimate,

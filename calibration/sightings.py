@@ -12,9 +12,9 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
-from weldcal.calibration.holes import HolePattern, find_holes
-from weldcal.calibration.observation import Observation, observation_from_fit
+from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.holes import HolePattern, find_holes
+from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.verification import face_cloud
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard

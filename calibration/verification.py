@@ -10,10 +10,10 @@ import open3d as o3d
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.blindness import COMPONENTS, blind_components, information, sigmas, surface_normals
-from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.flange.unobservable import COMPONENTS, blind_components, information, sigmas, surface_normals
 from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
-from weldcal.calibration.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 

@@ -10,9 +10,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
+from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.verification import face_cloud
-from weldcal.calibration.warm_up import warm_up
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan

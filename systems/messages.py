@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.iterative import Algorithm1State
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.solve import CalibrationEstimate
 from weldcal.calibration.verification import Verification
 from weldcal.welding.seam import SeamCurve

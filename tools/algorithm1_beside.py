@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import (
     IcpRecord,
 )
-from weldcal.calibration.flange_fit import FlangeFit
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import (
     Algorithm1Run,

@@ -27,10 +27,10 @@ from weldcal.calibration.data.results import (
 )
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.flange_fit import FlangeFit
-from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.observability import turn_deg
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.self_calibration import SelfCalibration, apply_self_calibration, calibrate_corrected
 from weldcal.calibration.sightings import see_flanges
 from weldcal.calibration.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base

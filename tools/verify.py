@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
-from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.observability import turn_deg
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.scanner_model import ScannerCorrection, correction_from_document
 from weldcal.calibration.sightings import see_flanges
 from weldcal.calibration.validation import position_errors, tilt_errors

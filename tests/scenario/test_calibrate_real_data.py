@@ -14,8 +14,8 @@ import pytest
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
-from weldcal.calibration.flange_fit import fit_flange
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import position_errors
 from weldcal.models.errors import InputError

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result, save_result
-from weldcal.calibration.flange_fit import fit_flange
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.self_calibration import apply_self_calibration
 from weldcal.calibration.sightings import see_flanges
 from weldcal.calibration.solve import estimate_eye_on_base

@@ -10,7 +10,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
-from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.pose_planning import PlannedPose
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics

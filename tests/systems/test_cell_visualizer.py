@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from scipy.spatial import ConvexHull
 
-from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
 from weldcal.models.workpieces import make_workpiece

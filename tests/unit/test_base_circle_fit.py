@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.base_circle_fit import fit_base_circle
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeGuess
+from weldcal.calibration.flange.base_circle import fit_base_circle
+from weldcal.calibration.flange.fit import FlangeGuess
 from weldcal.models.base_circles import base_circle
 from weldcal.models.errors import InputError
 

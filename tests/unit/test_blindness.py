@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.blindness import COMPONENTS, blind_components, information, sigmas, surface_normals
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.flange.unobservable import COMPONENTS, blind_components, information, sigmas, surface_normals
 from weldcal.calibration.verification import CentreVerification, icp_error, make_verification
 from weldcal.models.flanges import face_points, flange_mesh, get_flange
 

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from weldcal.calibration.border_likelihood import WRONG, border_likelihood
-from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.border_likelihood import WRONG, border_likelihood
+from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.holes import find_holes
+from weldcal.calibration.flange.track_loops import borders, near_edge, plane_steps, ring_points
+from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.geometry.circle_steps import circle_steps, middle, solved
 from weldcal.calibration.geometry.plane_moments import weighted_moments
-from weldcal.calibration.holes import find_holes
-from weldcal.calibration.track_loops import borders, near_edge, plane_steps, ring_points
-from weldcal.calibration.warm_up import warm_up
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.flange_frames import facing, flange_frame

@@ -8,9 +8,9 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.few_poses import axis_turn, estimate_from_whole_poses
-from weldcal.calibration.flange_fit import fit_flange
-from weldcal.calibration.holes import HolePattern, find_holes
-from weldcal.calibration.observation import Observation, observation_from_fit
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.calibration.flange.holes import HolePattern, find_holes
+from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.models.flanges import face_points, get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
+from weldcal.calibration.flange.observation import observation_from_fit
 from weldcal.calibration.geometry.rigid import rotation_vector
-from weldcal.calibration.observation import observation_from_fit
 from weldcal.calibration.solve import estimate_eye_on_base
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange
@@ -194,7 +194,7 @@ def test_millimetres_for_metres_are_named() -> None:
 def test_a_half_hidden_face_is_fitted_and_says_how_much_less_it_knows(monkeypatch: pytest.MonkeyPatch) -> None:
     # what real edges are out of round is stated too; these here are round, and their noise alone must account for the errors
     with monkeypatch.context() as plain:
-        plain.setattr("weldcal.calibration.flange_fit._OUT_OF_ROUND_M", 0.0)
+        plain.setattr("weldcal.calibration.flange.fit._OUT_OF_ROUND_M", 0.0)
         centre, normalised, _, _ = errors(20, 6, hidden=0.5)
     # half an arc leaves a centre 2.3 times as uncertain along the axis of symmetry as a whole circle's 0.05 mm
     assert np.sqrt((centre**2).sum(axis=1).mean()) < 2.3 * 5e-5 * 1.5

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.flanges import STANDARDS, face_points, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.coverage import study_coverage

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import get_flange
 from weldcal.tools.studies.flange_halves import center_bound, edge_blur, study_parts
 

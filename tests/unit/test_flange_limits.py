@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.tools.studies.few_scans import study_few_scans
 from weldcal.tools.studies.ingredients import Ingredient, study_ingredients

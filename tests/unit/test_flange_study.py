@@ -10,12 +10,12 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
-from weldcal.calibration.blindness import COMPONENTS
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.flange.unobservable import COMPONENTS
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.iterative import algorithm1_start, algorithm1_step
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.verification import VerificationError
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange

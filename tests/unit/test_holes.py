@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
-from weldcal.calibration.flange_fit import fit_flange
-from weldcal.calibration.holes import find_holes
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.calibration.flange.holes import find_holes
 from weldcal.models.flanges import FlangeStandard, face_points, get_flange
 
 Array = NDArray[np.float64]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.iterative import (
     POOL_SIZE,
     algorithm1_start,
@@ -18,7 +19,6 @@ from weldcal.calibration.iterative import (
     translation_cost,
     work_radius_cost,
 )
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.solve import estimate_eye_on_base
 from weldcal.calibration.validation import convergence, k_fold, position_errors, run_algorithm1
 from weldcal.calibration.verification import FAILED, CentreVerification, VerificationError

@@ -7,8 +7,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import FlangeNotFound
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.iterative import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.published_circle import CircleParameters, circumcircles, search_circle
 from weldcal.calibration.published_pipeline import (
     PublishedParameters,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.scanner_model import ScannerCorrection, correction_from_document
 from weldcal.models.errors import InputError
 

@@ -10,9 +10,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.stats import chi2
 
 from weldcal.calibration.estimate import with_scanner
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import rotation_vector
-from weldcal.calibration.holes import HolePattern
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.scanner_model import ScannerCorrection
 from weldcal.calibration.self_calibration import (
     SelfCalibration,

@@ -7,8 +7,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import CoplanarPoses, InconsistentPoses, RepeatedPoses, TooFewPoses
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, fit_rigid, rotation_vector
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.models.errors import InputError
 

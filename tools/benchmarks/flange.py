@@ -10,7 +10,7 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.simulation import Progress, no_progress

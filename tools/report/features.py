@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from weldcal.calibration.flange_fit import FlangeFit
-from weldcal.calibration.holes import HolePattern
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.holes import HolePattern
 from weldcal.tools.report.render import fixed
 
 HEADER = ("pose", "plane, mm", "outer edge, mm", "bore, mm", "holes", "holes, mm", "rotation about the axis, ± deg")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,10 @@ from scipy.stats import binom, chi2
 
 from weldcal.calibration.errors import CoplanarPoses
 from weldcal.calibration.estimate import with_scanner
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
-from weldcal.calibration.holes import HolePattern
 from weldcal.calibration.observability import check_diversity
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.scanner_fit import from_motion
 from weldcal.calibration.scanner_model import ScannerCorrection
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base, point_error_covariance

@@ -13,8 +13,8 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.holes import HolePattern
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.scanner_model import ScannerCorrection
 from weldcal.calibration.self_calibration import apply_self_calibration
 from weldcal.calibration.sightings import see_flanges

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.iterative import Algorithm1State, algorithm1_start, algorithm1_step
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.published_circle import search_circle
 from weldcal.calibration.published_pipeline import (
     Method,

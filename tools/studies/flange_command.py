@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress, plain

@@ -12,7 +12,7 @@ from scipy.special import ndtr
 from scipy.stats import norm
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import FlangeFit, fit_flange
+from weldcal.calibration.flange.fit import FlangeFit, fit_flange
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.simulation import Progress, no_progress
 

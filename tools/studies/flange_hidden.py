@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange_fit import fit_flange
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
 from weldcal.tools.simulation import Progress, no_progress

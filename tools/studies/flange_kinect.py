@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published_pipeline import all_pairs
 from weldcal.calibration.validation import k_fold, position_errors
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_all_rigid_sets
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.tools.console import Progress
 

@@ -12,8 +12,8 @@ from scipy.stats import chi
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.holes import HolePattern
-from weldcal.calibration.observation import Observation
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.scanner_fit import from_holes, from_motion
 from weldcal.calibration.scanner_model import ScannerCorrection
 from weldcal.calibration.self_calibration import held_out_errors

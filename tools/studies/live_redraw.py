@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, skew
-from weldcal.calibration.observation import Observation
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.face import Face, FlangeFitConfig, Refusal
-from weldcal.calibration.rim import plane_axes
-from weldcal.calibration.window import measure_window
+from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal
+from weldcal.calibration.flange.rim import plane_axes
+from weldcal.calibration.flange.window import measure_window
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.face import Face, FlangeFitConfig
+from weldcal.calibration.flange.face import Face, FlangeFitConfig
+from weldcal.calibration.flange.rim import plane_axes, sector_count
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit
 from weldcal.calibration.geometry.plane_moments import weighted_moments
-from weldcal.calibration.rim import plane_axes, sector_count
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]

@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.face import Face, FlangeFitConfig, Refusal, faces_on_plane
-from weldcal.calibration.frame_search import search_frame, typical_pitches, window_about
+from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal, faces_on_plane
+from weldcal.calibration.flange.rim import plane_axes
+from weldcal.calibration.flange.scene import Scene, crop, islands
+from weldcal.calibration.flange.search import search_frame, typical_pitches, window_about
+from weldcal.calibration.flange.segmented import fit_segmented
+from weldcal.calibration.flange.track import fit_tracked
+from weldcal.calibration.flange.window import measure_window
 from weldcal.calibration.geometry.circle import fuse
 from weldcal.calibration.geometry.plane import local_planes
-from weldcal.calibration.rim import plane_axes
-from weldcal.calibration.scene import Scene, crop, islands
-from weldcal.calibration.segmented import fit_segmented
-from weldcal.calibration.track import fit_tracked
-from weldcal.calibration.window import measure_window
 from weldcal.models.flanges import FlangeStandard
 
 __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit_flange"]

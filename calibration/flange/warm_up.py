@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from weldcal.calibration.flange_fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.flanges import get_flange
 
 _FLANGE = "iso9409-1-50-4-m6"

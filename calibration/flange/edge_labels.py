@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from weldcal.calibration.border_likelihood import WRONG as _WRONG
-from weldcal.calibration.border_likelihood import border_likelihood
 from weldcal.calibration.errors import CircleFitError
+from weldcal.calibration.flange.border_likelihood import WRONG as _WRONG
+from weldcal.calibration.flange.border_likelihood import border_likelihood
 from weldcal.calibration.geometry.circle import CircleFit
 
 Array = NDArray[np.float64]

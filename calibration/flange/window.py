@@ -8,12 +8,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.edge_labels import refine_circle
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
-from weldcal.calibration.face import Face, FlangeFitConfig, Measured, Refusal, clear_band, judge, lowered_by, thickness
+from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.face import (
+    Face,
+    FlangeFitConfig,
+    Measured,
+    Refusal,
+    clear_band,
+    judge,
+    lowered_by,
+    thickness,
+)
+from weldcal.calibration.flange.rim import RayModel, plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
-from weldcal.calibration.rim import RayModel, plane_axes
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]

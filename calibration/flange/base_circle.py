@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.edge_labels import refine_circle
 from weldcal.calibration.errors import CircleFitError, FlangeNotFound, PlaneFitError
-from weldcal.calibration.flange_fit import FlangeFit, FlangeGuess
-from weldcal.calibration.frame_search import window_about
+from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess
+from weldcal.calibration.flange.rim import RayModel, coverage, plane_axes
+from weldcal.calibration.flange.search import window_about
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, local_planes
-from weldcal.calibration.rim import RayModel, coverage, plane_axes
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.edge_labels import refine_circle
 from weldcal.calibration.errors import CircleFitError, PlaneFitError
+from weldcal.calibration.flange.edge_labels import refine_circle
+from weldcal.calibration.flange.rim import EdgePoints, FacePixels, coverage, plane_axes, sector_edges
+from weldcal.calibration.flange.scene import Scene
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane
-from weldcal.calibration.rim import EdgePoints, FacePixels, coverage, plane_axes, sector_edges
-from weldcal.calibration.scene import Scene
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]

@@ -8,13 +8,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.edge_labels import refine_pair
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.face import Face, FlangeFitConfig, Measured, Refusal, clear_band, judge, lowered_by, thickness
+from weldcal.calibration.flange.edge_labels import refine_pair
+from weldcal.calibration.flange.face import (
+    Face,
+    FlangeFitConfig,
+    Measured,
+    Refusal,
+    clear_band,
+    judge,
+    lowered_by,
+    thickness,
+)
+from weldcal.calibration.flange.rim import plane_axes
+from weldcal.calibration.flange.track_loops import borders, near_edge, plane_steps, ring_points
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, shared_noise
-from weldcal.calibration.rim import plane_axes
-from weldcal.calibration.track_loops import borders, near_edge, plane_steps, ring_points
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from weldcal.calibration.geometry.plane import PlaneFit
-from weldcal.calibration.rim import (
+from weldcal.calibration.flange.rim import (
     EdgePoints,
     FacePixels,
     RayModel,
@@ -20,6 +19,7 @@ from weldcal.calibration.rim import (
     organised_edges,
     plane_axes,
 )
+from weldcal.calibration.geometry.plane import PlaneFit
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

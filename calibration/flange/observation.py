@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.flange_fit import FlangeFit
+from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
