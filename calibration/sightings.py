@@ -15,7 +15,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.calibration.verification import face_cloud
+from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 

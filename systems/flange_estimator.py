@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.verification import face_cloud
+from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan

@@ -12,9 +12,15 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
-from weldcal.calibration.iterative import COST_AXES, Algorithm1State, algorithm1_start, algorithm1_step, named_cost
+from weldcal.calibration.published.algorithm1 import (
+    COST_AXES,
+    Algorithm1State,
+    algorithm1_start,
+    algorithm1_step,
+    named_cost,
+)
+from weldcal.calibration.published.icp import make_verification
 from weldcal.calibration.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
-from weldcal.calibration.verification import make_verification
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard

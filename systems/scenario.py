@@ -8,7 +8,7 @@ import numpy as np
 from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.iterative import COST_AXES, named_cost
+from weldcal.calibration.published.algorithm1 import COST_AXES, named_cost
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera

@@ -13,13 +13,7 @@ from weldcal.calibration.data.results import (
 )
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import (
-    Algorithm1Run,
-    position_errors,
-    run_algorithm1,
-)
-from weldcal.calibration.verification import (
+from weldcal.calibration.published.icp import (
     CentreVerification,
     Sight,
     Verification,
@@ -27,6 +21,12 @@ from weldcal.calibration.verification import (
     icp_error,
     make_verification,
     sight,
+)
+from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.validation import (
+    Algorithm1Run,
+    position_errors,
+    run_algorithm1,
 )
 from weldcal.models.flanges import FlangeStandard
 

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.flange.unobservable import COMPONENTS, blind_components, information, sigmas, surface_normals
-from weldcal.calibration.verification import CentreVerification, icp_error, make_verification
+from weldcal.calibration.published.icp import CentreVerification, icp_error, make_verification
 from weldcal.models.flanges import face_points, flange_mesh, get_flange
 
 STANDARD = get_flange("iso9409-1-50-4-m6")

@@ -15,8 +15,8 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.flange.unobservable import COMPONENTS
 from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.iterative import algorithm1_start, algorithm1_step
-from weldcal.calibration.verification import VerificationError
+from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step
+from weldcal.calibration.published.icp import VerificationError
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
 from weldcal.tools.cli import app

@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.iterative import (
+from weldcal.calibration.published.algorithm1 import (
     POOL_SIZE,
     algorithm1_start,
     algorithm1_step,
@@ -19,9 +19,9 @@ from weldcal.calibration.iterative import (
     translation_cost,
     work_radius_cost,
 )
+from weldcal.calibration.published.icp import FAILED, CentreVerification, VerificationError
 from weldcal.calibration.solve import estimate_eye_on_base
 from weldcal.calibration.validation import convergence, k_fold, position_errors, run_algorithm1
-from weldcal.calibration.verification import FAILED, CentreVerification, VerificationError
 from weldcal.models.errors import InputError
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

@@ -8,9 +8,10 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.iterative import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
-from weldcal.calibration.published_circle import CircleParameters, circumcircles, search_circle
-from weldcal.calibration.published_pipeline import (
+from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm1_step, axes_cost, work_radius_cost
+from weldcal.calibration.published.circle import CircleParameters, circumcircles, search_circle
+from weldcal.calibration.published.icp import VerificationError
+from weldcal.calibration.published.pipeline import (
     PublishedParameters,
     PublishedVerification,
     all_pairs,
@@ -19,8 +20,7 @@ from weldcal.calibration.published_pipeline import (
     published_calibration,
     published_model,
 )
-from weldcal.calibration.published_segmentation import SegmentationParameters, segment_flange
-from weldcal.calibration.verification import VerificationError
+from weldcal.calibration.published.segmentation import SegmentationParameters, segment_flange
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
 

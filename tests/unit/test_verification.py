@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation
-from weldcal.calibration.verification import CentreVerification, Verification, icp_error, make_verification, sight
+from weldcal.calibration.published.icp import CentreVerification, Verification, icp_error, make_verification, sight
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
 

@@ -12,9 +12,10 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.iterative import Algorithm1State, algorithm1_start, algorithm1_step
-from weldcal.calibration.published_circle import search_circle
-from weldcal.calibration.published_pipeline import (
+from weldcal.calibration.published.algorithm1 import Algorithm1State, algorithm1_start, algorithm1_step
+from weldcal.calibration.published.circle import search_circle
+from weldcal.calibration.published.icp import Verification, icp_error, make_verification, sight
+from weldcal.calibration.published.pipeline import (
     Method,
     PublishedVerification,
     all_pairs,
@@ -28,7 +29,6 @@ from weldcal.calibration.self_calibration import apply_self_calibration
 from weldcal.calibration.sightings import Sightings, see_flanges
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import position_errors
-from weldcal.calibration.verification import Verification, icp_error, make_verification, sight
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress

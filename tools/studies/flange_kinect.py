@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.published_pipeline import all_pairs
+from weldcal.calibration.published.pipeline import all_pairs
 from weldcal.calibration.validation import k_fold, position_errors
 
 Array = NDArray[np.float64]

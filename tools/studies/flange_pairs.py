@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid_sets
-from weldcal.calibration.published_pipeline import all_pairs
+from weldcal.calibration.published.pipeline import all_pairs
 from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.validation import k_fold, position_errors
 

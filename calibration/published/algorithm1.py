@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
-from weldcal.calibration.verification import FAILED, VerificationError, Verifier
+from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

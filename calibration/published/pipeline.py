@@ -14,10 +14,16 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid, rotation_vector
-from weldcal.calibration.iterative import Algorithm1State, Cost, algorithm1_start, algorithm1_step, translation_cost
-from weldcal.calibration.published_circle import CircleParameters, PublishedCircle, search_circle
-from weldcal.calibration.published_segmentation import SegmentationParameters, segment_flange
-from weldcal.calibration.verification import FAILED, VerificationError, Verifier
+from weldcal.calibration.published.algorithm1 import (
+    Algorithm1State,
+    Cost,
+    algorithm1_start,
+    algorithm1_step,
+    translation_cost,
+)
+from weldcal.calibration.published.circle import CircleParameters, PublishedCircle, search_circle
+from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
+from weldcal.calibration.published.segmentation import SegmentationParameters, segment_flange
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 
