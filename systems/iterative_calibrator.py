@@ -11,6 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.published.algorithm1 import (
     COST_AXES,
@@ -20,7 +21,6 @@ from weldcal.calibration.published.algorithm1 import (
     named_cost,
 )
 from weldcal.calibration.published.icp import make_verification
-from weldcal.calibration.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Algorithm1State
 from weldcal.calibration.published.icp import Verification
-from weldcal.calibration.solve import CalibrationEstimate
 from weldcal.welding.seam import SeamCurve
 
 

@@ -11,6 +11,12 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import (
     IcpRecord,
 )
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import (
+    Algorithm1Run,
+    position_errors,
+    run_algorithm1,
+)
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.icp import (
@@ -21,12 +27,6 @@ from weldcal.calibration.published.icp import (
     icp_error,
     make_verification,
     sight,
-)
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import (
-    Algorithm1Run,
-    position_errors,
-    run_algorithm1,
 )
 from weldcal.models.flanges import FlangeStandard
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.advice import sampling_advice
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import (
     CalibrationResult,
@@ -26,19 +25,24 @@ from weldcal.calibration.data.results import (
     software_version,
 )
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.flange.holes import HolePattern
-from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.observability import turn_deg
-from weldcal.calibration.self_calibration import SelfCalibration, apply_self_calibration, calibrate_corrected
-from weldcal.calibration.sightings import see_flanges
-from weldcal.calibration.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import (
+from weldcal.calibration.eye_on_base.advice import sampling_advice
+from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
+from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.self_calibration import (
+    SelfCalibration,
+    apply_self_calibration,
+    calibrate_corrected,
+)
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import (
     Convergence,
     convergence,
     k_fold,
 )
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.algorithm1_beside import Algorithm1Outcome, compare_algorithm1, summary_of

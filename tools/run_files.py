@@ -9,7 +9,7 @@ import numpy as np
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
-from weldcal.calibration.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.systems.cell import Cell, feature_standard
 from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
+from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection, correction_from_document
+from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.observability import turn_deg
-from weldcal.calibration.scanner_model import ScannerCorrection, correction_from_document
-from weldcal.calibration.sightings import see_flanges
-from weldcal.calibration.validation import position_errors, tilt_errors
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.report.plots_verify import verify_report

@@ -16,8 +16,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.eye_on_base.scanner_model import correction_from_document
 from weldcal.calibration.geometry.rigid import rotation_vector
-from weldcal.calibration.scanner_model import correction_from_document
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

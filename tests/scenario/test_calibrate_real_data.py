@@ -14,10 +14,10 @@ import pytest
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.calibrate import CalibrationReport, calibrate_dataset

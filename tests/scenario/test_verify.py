@@ -16,11 +16,11 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result, save_result
+from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
+from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.self_calibration import apply_self_calibration
-from weldcal.calibration.sightings import see_flanges
-from weldcal.calibration.solve import estimate_eye_on_base
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.calibrate import calibrate_dataset

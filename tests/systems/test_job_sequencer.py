@@ -12,7 +12,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
-from weldcal.calibration.solve import CalibrationEstimate, HeldOut
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
 from weldcal.systems.calibration_pose_planner import NextPose
 from weldcal.systems.job_sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult

@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.few_poses import axis_turn, estimate_from_whole_poses
+from weldcal.calibration.eye_on_base.few_poses import axis_turn, estimate_from_whole_poses
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit

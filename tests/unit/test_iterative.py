@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import convergence, k_fold, position_errors, run_algorithm1
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import (
     POOL_SIZE,
@@ -20,8 +22,6 @@ from weldcal.calibration.published.algorithm1 import (
     work_radius_cost,
 )
 from weldcal.calibration.published.icp import FAILED, CentreVerification, VerificationError
-from weldcal.calibration.solve import estimate_eye_on_base
-from weldcal.calibration.validation import convergence, k_fold, position_errors, run_algorithm1
 from weldcal.models.errors import InputError
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection, correction_from_document
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.scanner_model import ScannerCorrection, correction_from_document
 from weldcal.models.errors import InputError
 
 CORRECTION = ScannerCorrection(1.002, (0.015, -0.02))

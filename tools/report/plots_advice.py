@@ -7,8 +7,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from weldcal.calibration.advice import sigma_at, weakest_place
-from weldcal.calibration.estimate import CalibrationEstimate
+from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.tools.report.pictures import svg
 
 Array = NDArray[np.float64]

@@ -11,14 +11,14 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.stats import binom, chi2
 
 from weldcal.calibration.errors import CoplanarPoses
-from weldcal.calibration.estimate import with_scanner
+from weldcal.calibration.eye_on_base.estimate import with_scanner
+from weldcal.calibration.eye_on_base.scanner_fit import from_motion
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
 from weldcal.calibration.observability import check_diversity
-from weldcal.calibration.scanner_fit import from_motion
-from weldcal.calibration.scanner_model import ScannerCorrection
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.simulation import Progress, no_progress
 from weldcal.tools.studies.flange_frames import facing

@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.eye_on_base.observations import Sightings, see_flanges
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Algorithm1State, algorithm1_start, algorithm1_step
@@ -24,11 +29,6 @@ from weldcal.calibration.published.pipeline import (
     published_model,
     published_pairs,
 )
-from weldcal.calibration.scanner_model import ScannerCorrection
-from weldcal.calibration.self_calibration import apply_self_calibration
-from weldcal.calibration.sightings import Sightings, see_flanges
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress

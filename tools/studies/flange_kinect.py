@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from weldcal.calibration.eye_on_base.validation import k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.pipeline import all_pairs
-from weldcal.calibration.validation import k_fold, position_errors
 
 Array = NDArray[np.float64]
 

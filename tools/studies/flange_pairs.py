@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid_sets
 from weldcal.calibration.published.pipeline import all_pairs
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import k_fold, position_errors
 
 Array = NDArray[np.float64]
 

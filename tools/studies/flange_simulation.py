@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_all_rigid_sets
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.tools.console import Progress
 
 Array = NDArray[np.float64]

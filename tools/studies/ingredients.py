@@ -12,14 +12,14 @@ from scipy.stats import chi
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.self_calibration import held_out_errors
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.scanner_fit import from_holes, from_motion
-from weldcal.calibration.scanner_model import ScannerCorrection
-from weldcal.calibration.self_calibration import held_out_errors
-from weldcal.calibration.sightings import see_flanges
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import position_errors, tilt_errors
 from weldcal.models.flanges import get_flange
 from weldcal.tools.simulation import Progress, no_progress
 

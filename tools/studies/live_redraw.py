@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, skew
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.tools.outcome import calibration_error

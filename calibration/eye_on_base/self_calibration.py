@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
-from weldcal.calibration.estimate import CalibrationEstimate, HeldOut, with_scanner
-from weldcal.calibration.flange.holes import HolePattern
-from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.scanner_fit import (
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
+from weldcal.calibration.eye_on_base.scanner_fit import (
     CIRCLE_OWN,
     CorrectionEstimate,
     from_holes,
     from_motion,
 )
-from weldcal.calibration.scanner_model import ScannerCorrection
-from weldcal.calibration.validation import position_errors, tilt_errors
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

@@ -11,11 +11,11 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.eye_on_base.scanner_model import TERMS, ScannerCorrection
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, skew
-from weldcal.calibration.scanner_model import TERMS, ScannerCorrection
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 
 Array = NDArray[np.float64]
 

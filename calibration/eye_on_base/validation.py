@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Cost, algorithm1_start, algorithm1_step, translation_cost
 from weldcal.calibration.published.icp import VerificationError, Verifier
-from weldcal.calibration.scanner_model import ScannerCorrection
-from weldcal.calibration.solve import SolveConfig, estimate_eye_on_base
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.estimate import CalibrationEstimate, HeldOut
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut
+from weldcal.calibration.eye_on_base.solve import USUAL_SPREAD_M, USUAL_TILT_RAD, SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.observability import unobservable_sentences
-from weldcal.calibration.solve import USUAL_SPREAD_M, USUAL_TILT_RAD, SolveConfig, estimate_eye_on_base
-from weldcal.calibration.validation import position_errors, tilt_errors
 
 Array = NDArray[np.float64]
 

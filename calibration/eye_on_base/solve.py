@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from weldcal.calibration.errors import InconsistentPoses
-from weldcal.calibration.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
 from weldcal.calibration.observability import check_diversity, unobservable_sentences

@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.scanner_model import ScannerCorrection
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
