@@ -17,11 +17,11 @@ from weldcal.calibration.flange.base_circle import fit_base_circle
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
-from weldcal.calibration.handeye.scaled import inverse_information
+from weldcal.calibration.hand_eye.linearisation import inverse_information
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.hand_eye.stated_noise import information_of, with_stated_noise
 from weldcal.calibration.mounting_poses import MountingPose, information, prior, work_point
 from weldcal.calibration.mounting_scene import FLANGE, MountingScene
-from weldcal.calibration.stated_noise import information_of, with_stated_noise
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.flange_estimator import LIVE_FIT

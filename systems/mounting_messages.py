@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.hand_eye import HandEyeResult
-from weldcal.calibration.handeye.mountings import Sighting
+from weldcal.calibration.hand_eye.mountings import Sighting
+from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.calibration.mounting_poses import MountingPose
 from weldcal.systems.messages import Message
 

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.handeye.corners import CornerRefinement, poses_from_corners, refine_with_corners
-from weldcal.calibration.handeye.determinacy import check_poses
-from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
-from weldcal.calibration.handeye.files import PosePairs, read_pairs
-from weldcal.calibration.handeye.joints import refine_joints
-from weldcal.calibration.handeye.mistakes import likely_mistake, scale_warning
-from weldcal.calibration.handeye.mountings import Mounting, get_mounting
-from weldcal.calibration.handeye.next_pose import NextPose, next_pose
-from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
-from weldcal.calibration.handeye.problem import Problem, full_problem
-from weldcal.calibration.handeye.view import View, view_of
+from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_corners, refine_with_corners
+from weldcal.calibration.hand_eye.determinacy import check_poses
+from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
+from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.joints import refine_joints
+from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
+from weldcal.calibration.hand_eye.next_pose import NextPose, next_pose
+from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
+from weldcal.calibration.hand_eye.problem import Problem, full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
+from weldcal.calibration.hand_eye.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner

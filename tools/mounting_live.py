@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_dump_typed
 from pydrake.geometry import Meshcat, MeshcatParams
 
-from weldcal.calibration.hand_eye import HandEyeResult, pose_difference
-from weldcal.calibration.handeye.exports import Provenance, export_hand_eye
-from weldcal.calibration.handeye.mountings import Mounting
+from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
+from weldcal.calibration.hand_eye.mountings import Mounting
+from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
 from weldcal.calibration.mounting_poses import work_point
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice

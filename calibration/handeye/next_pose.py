@@ -11,11 +11,11 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation
-from weldcal.calibration.hand_eye import HandEyeResult, as_transform
-from weldcal.calibration.handeye.mountings import Mounting
-from weldcal.calibration.handeye.problem import Problem, State, linearise
-from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
-from weldcal.calibration.handeye.view import View, view_of
+from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
+from weldcal.calibration.hand_eye.mountings import Mounting
+from weldcal.calibration.hand_eye.problem import Problem, State, linearise
+from weldcal.calibration.hand_eye.solve import HandEyeResult, as_transform
+from weldcal.calibration.hand_eye.view import View, view_of
 from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import known_arms, load_arm

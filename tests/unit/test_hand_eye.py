@@ -17,7 +17,8 @@ from weldcal.calibration.errors import (
     UndeterminedPoses,
 )
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, log_rotation, pose
-from weldcal.calibration.hand_eye import (
+from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise
+from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     HandEyeResult,
     pose_difference,
@@ -26,7 +27,6 @@ from weldcal.calibration.hand_eye import (
     solve_axb_ycz,
     solve_problem,
 )
-from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
 from weldcal.models.errors import InputError, WeldcalError
 
 from .hand_eye_poses import Array, co_manipulation, eye_in_hand, random_poses

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from weldcal.calibration.handeye.files import read_pairs
-from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out
+from weldcal.calibration.hand_eye.files import read_pairs
+from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.models.errors import InputError
 from weldcal.tools.benchmarks.hand_eye import HandEyeBenchmark, run_hand_eye_benchmark, write_table
 

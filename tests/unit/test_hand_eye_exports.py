@@ -16,7 +16,7 @@ from pydrake.multibody.parsing import LoadModelDirectivesFromString, Parser, Pro
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.handeye.files import read_pairs
+from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.tools.hand_eye import HandEyeReport, run_hand_eye
 
 from .hand_eye_poses import co_manipulation, eye_in_hand

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import inverse
-from weldcal.calibration.handeye.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.models.errors import InputError
 from weldcal.tools.hand_eye import run_hand_eye
 

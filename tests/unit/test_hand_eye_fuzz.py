@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye import HandEyeConfig, solve_problem
-from weldcal.calibration.handeye.files import PosePairs
-from weldcal.calibration.handeye.mistakes import likely_mistake, scale_warning
-from weldcal.calibration.handeye.problem import full_problem
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
 from weldcal.tools.benchmarks.hand_eye_fuzz import MISTAKES, fuzz, judge, random_world
 
 from .hand_eye_poses import Array, eye_in_hand, random_poses

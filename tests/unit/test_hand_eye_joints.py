@@ -10,10 +10,10 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import inverse, pose
-from weldcal.calibration.hand_eye import HandEyeResult, solve_problem
-from weldcal.calibration.handeye.files import PosePairs
-from weldcal.calibration.handeye.joints import JointRefinement, flange_poses, refine_joints
-from weldcal.calibration.handeye.problem import full_problem
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.joints import JointRefinement, flange_poses, refine_joints
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeResult, solve_problem
 from weldcal.models.arms.chain import Chain, chain_forward, load_chain
 from weldcal.models.errors import InputError
 

@@ -7,11 +7,11 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
-from weldcal.calibration.hand_eye import HandEyeConfig, as_transform, solve_problem
-from weldcal.calibration.handeye.mountings import MOUNTINGS, Sighting, calibrate_mounting, get_mounting
-from weldcal.calibration.handeye.next_pose import next_pose
-from weldcal.calibration.handeye.problem import full_problem
-from weldcal.calibration.handeye.view import view_of
+from weldcal.calibration.hand_eye.mountings import MOUNTINGS, Sighting, calibrate_mounting, get_mounting
+from weldcal.calibration.hand_eye.next_pose import next_pose
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform, solve_problem
+from weldcal.calibration.hand_eye.view import view_of
 from weldcal.models.arms.chain import chain_forward, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner

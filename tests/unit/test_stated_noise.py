@@ -7,11 +7,11 @@ import pytest
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, as_transform, solve_problem
-from weldcal.calibration.handeye.choose import CANDIDATES
-from weldcal.calibration.handeye.mountings import Sighting, get_mounting, problem_of
-from weldcal.calibration.handeye.problem import Problem, State
-from weldcal.calibration.stated_noise import with_stated_noise
+from weldcal.calibration.hand_eye.choice import CANDIDATES
+from weldcal.calibration.hand_eye.mountings import Sighting, get_mounting, problem_of
+from weldcal.calibration.hand_eye.problem import Problem, State
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, as_transform, solve_problem
+from weldcal.calibration.hand_eye.stated_noise import with_stated_noise
 from weldcal.models.errors import InputError
 
 from .hand_eye_poses import random_poses

@@ -14,18 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import write_atomically
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye import (
+from weldcal.calibration.hand_eye.corners import refine_with_corners
+from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
+from weldcal.calibration.hand_eye.mountings import MOUNTINGS
+from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out, opencv_solve
+from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise
+from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     as_transform,
     pose_difference,
     solve_axb_ycz,
     solve_problem,
 )
-from weldcal.calibration.handeye.corners import refine_with_corners
-from weldcal.calibration.handeye.mountings import MOUNTINGS
-from weldcal.calibration.handeye.opencv_methods import METHODS, opencv_held_out, opencv_solve
-from weldcal.calibration.handeye.problem import Problem, full_problem, linearise
-from weldcal.calibration.handeye.scaled import Loss, Noise, Scaled
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.benchmarks.hand_eye_fuzz import fuzz
 from weldcal.tools.simulation import Progress, no_progress
@@ -288,7 +288,7 @@ def run_hand_eye_benchmark(
 ) -> HandEyeBenchmark:
     """All of it; ``data``: folder of sets (pairs.npz each), None to leave them out; ``quick``: few trials and
     no OpenCV on the sets, for a test. Raises InputError, before any work, where the folder holds no set."""
-    from weldcal.calibration.handeye.files import read_pairs
+    from weldcal.calibration.hand_eye.files import read_pairs
 
     report = HandEyeBenchmark()
     sets = sorted(data.glob("*/pairs.npz")) if data is not None else []

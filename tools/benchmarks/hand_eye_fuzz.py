@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose, random_rotations
-from weldcal.calibration.hand_eye import HandEyeConfig, as_transform
-from weldcal.calibration.handeye.files import PosePairs
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.hand_eye import solve_pairs
 from weldcal.tools.simulation import Progress, no_progress

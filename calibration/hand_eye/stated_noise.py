@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.hand_eye import HandEyeResult
-from weldcal.calibration.handeye.determinacy import determinacy, with_open_directions
-from weldcal.calibration.handeye.problem import NAMES, Problem, State, linearise
-from weldcal.calibration.handeye.scaled import inverse_information
+from weldcal.calibration.hand_eye.determinacy import determinacy, with_open_directions
+from weldcal.calibration.hand_eye.linearisation import inverse_information
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, linearise
+from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

@@ -12,15 +12,15 @@ from scipy.stats import f as fisher
 
 from weldcal.calibration.errors import UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.handeye.choose import CANDIDATES, Candidate, solve
-from weldcal.calibration.handeye.determinacy import (
+from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate, solve
+from weldcal.calibration.hand_eye.determinacy import (
     Diversity,
     check_poses,
     determinacy,
     with_open_directions,
     without_drift,
 )
-from weldcal.calibration.handeye.problem import NAMES, Problem, State, residuals
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, residuals
 from weldcal.models.errors import InputError, WeldcalError
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
 from weldcal.calibration.geometry.se3 import log_rotation, nearest_rotation
-from weldcal.calibration.handeye.problem import NAMES, Problem, State
-from weldcal.calibration.handeye.scaled import RANK
+from weldcal.calibration.hand_eye.linearisation import RANK
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State
 
 Array = NDArray[np.float64]
 

@@ -11,14 +11,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
-from weldcal.calibration.handeye.choose import CANDIDATES, most_promising
-from weldcal.calibration.handeye.determinacy import diversity
-from weldcal.calibration.handeye.files import PosePairs
-from weldcal.calibration.handeye.fit import descend
-from weldcal.calibration.handeye.problem import Problem, full_problem, linearise, residuals
-from weldcal.calibration.handeye.scaled import inverse_information
-from weldcal.calibration.handeye.starts import grid, kronecker, with_positions
+from weldcal.calibration.hand_eye.choice import CANDIDATES, most_promising
+from weldcal.calibration.hand_eye.determinacy import diversity
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.fit import descend
+from weldcal.calibration.hand_eye.linearisation import inverse_information
+from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.hand_eye.starts import grid, kronecker, with_positions
 from weldcal.models.errors import WeldcalError
 
 Array = NDArray[np.float64]

@@ -13,10 +13,10 @@ from scipy.stats import chi2
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import difference, pose
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
-from weldcal.calibration.handeye.choose import CANDIDATES
-from weldcal.calibration.handeye.files import PosePairs
-from weldcal.calibration.handeye.problem import NAMES, full_problem
+from weldcal.calibration.hand_eye.choice import CANDIDATES
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.problem import NAMES, full_problem
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.models.errors import WeldcalError
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.hand_eye import HandEyeConfig, HandEyeResult, solve_problem
-from weldcal.calibration.handeye.problem import Problem, State
+from weldcal.calibration.hand_eye.problem import Problem, State
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

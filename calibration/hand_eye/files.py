@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
-from weldcal.calibration.hand_eye import as_poses
-from weldcal.calibration.handeye.mountings import chain, get_mounting
+from weldcal.calibration.hand_eye.mountings import chain, get_mounting
+from weldcal.calibration.hand_eye.solve import as_poses
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, log_rotation, mean_pose, pose
-from weldcal.calibration.hand_eye import (
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.linearisation import TINY, inverse_information
+from weldcal.calibration.hand_eye.mountings import chain as mounted
+from weldcal.calibration.hand_eye.mountings import get_mounting
+from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, full_problem, linearise, residuals
+from weldcal.calibration.hand_eye.solve import (
     HandEyeConfig,
     HandEyeHeldOut,
     HandEyeResult,
@@ -18,11 +23,6 @@ from weldcal.calibration.hand_eye import (
     solve_ax_yb,
     solve_problem,
 )
-from weldcal.calibration.handeye.files import PosePairs
-from weldcal.calibration.handeye.mountings import chain as mounted
-from weldcal.calibration.handeye.mountings import get_mounting
-from weldcal.calibration.handeye.problem import NAMES, Problem, State, full_problem, linearise, residuals
-from weldcal.calibration.handeye.scaled import TINY, inverse_information
 from weldcal.models.arms.chain import Chain
 from weldcal.models.errors import InputError, WeldcalError
 

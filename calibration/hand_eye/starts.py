@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import inverse, log_rotation, nearest_rotation, pose
-from weldcal.calibration.handeye.problem import Problem, State
+from weldcal.calibration.hand_eye.problem import Problem, State
 
 Array = NDArray[np.float64]
 Rotations = tuple[Array, Array, Array]

@@ -18,8 +18,8 @@ from weldcal.calibration.data.results import (
     software_version,
     write_atomically,
 )
-from weldcal.calibration.hand_eye import HandEyeResult
-from weldcal.calibration.handeye.mountings import Mounting, Unknown
+from weldcal.calibration.hand_eye.mountings import Mounting, Unknown
+from weldcal.calibration.hand_eye.solve import HandEyeResult
 
 RESULT_FILE = "hand_eye.yaml"
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.handeye.problem import Linearised, Problem, gram
+from weldcal.calibration.hand_eye.problem import Linearised, Problem, gram
 
 Array = NDArray[np.float64]
 

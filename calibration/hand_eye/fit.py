@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.handeye.problem import Linearised, Problem, State, gram, linearise, residuals
-from weldcal.calibration.handeye.scaled import TINY, Loss, Noise, Scaled, pull
+from weldcal.calibration.hand_eye.linearisation import TINY, Loss, Noise, Scaled, pull
+from weldcal.calibration.hand_eye.problem import Linearised, Problem, State, gram, linearise, residuals
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -11,10 +11,10 @@ from scipy.stats import t as student
 
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.geometry.se3 import exp_rotation, mean_of
-from weldcal.calibration.handeye.fit import Fit, descend, fit, noise_of
-from weldcal.calibration.handeye.problem import Problem, State, residuals
-from weldcal.calibration.handeye.scaled import Loss
-from weldcal.calibration.handeye.starts import closed_forms, grid
+from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
+from weldcal.calibration.hand_eye.linearisation import Loss
+from weldcal.calibration.hand_eye.problem import Problem, State, residuals
+from weldcal.calibration.hand_eye.starts import closed_forms, grid
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, nearest_rotation, pose
-from weldcal.calibration.hand_eye import HandEyeHeldOut, fold_labels
-from weldcal.calibration.handeye.problem import Problem, residuals
+from weldcal.calibration.hand_eye.problem import Problem, residuals
+from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, fold_labels
 
 Array = NDArray[np.float64]
 
