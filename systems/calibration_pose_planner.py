@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State
 
-from weldcal.calibration.pose_planning import PlannedPose
+from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.systems.messages import CalibrationStatus, Message
 
 

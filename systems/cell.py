@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Diagram, DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, LogVectorOutput, VectorLogSink
 
-from weldcal.calibration.pose_planning import PlannedPose, PlannerConfig, plan_calibration_poses
+from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.clearance import Body, arm_bodies, path_clearance
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.pose_planning import PlannedPose
+from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
 from weldcal.models.errors import InputError
 from weldcal.systems.job_sequencer import stands_at
 from weldcal.systems.scenario import Scenario

@@ -20,8 +20,8 @@ from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.hand_eye.stated_noise import information_of, with_stated_noise
-from weldcal.calibration.mounting_poses import MountingPose, information, prior, work_point
-from weldcal.calibration.mounting_scene import FLANGE, MountingScene
+from weldcal.calibration.planning.mounting_poses import MountingPose, information, prior, work_point
+from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.flange_estimator import LIVE_FIT

@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from weldcal.calibration.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
-from weldcal.calibration.mounting_scene import FLANGE, MountingScene
+from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
+from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
 from weldcal.models.base_circles import base_circle
 from weldcal.models.errors import InputError

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.hand_eye.mountings import Sighting
 from weldcal.calibration.hand_eye.solve import HandEyeResult
-from weldcal.calibration.mounting_poses import MountingPose
+from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.systems.messages import Message
 
 Array = NDArray[np.float64]

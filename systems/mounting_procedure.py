@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.calibration.mounting_poses import MountingPose
+from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.mounting_messages import MountingState, MountingStatus
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.pose_planning import PlannedPose, PlannerConfig, predicted_sigma
+from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, predicted_sigma
 from weldcal.systems.messages import CalibrationStatus, Message
 
 

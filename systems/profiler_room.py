@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import Field
 from weldcal.models.arms.inverse import nearest_solution

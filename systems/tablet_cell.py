@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from weldcal.calibration.clearance import Body, arm_bodies
+from weldcal.calibration.planning.clearance import Body, arm_bodies
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule

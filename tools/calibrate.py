@@ -42,7 +42,7 @@ from weldcal.calibration.eye_on_base.validation import (
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.observability import turn_deg
+from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.algorithm1_beside import Algorithm1Outcome, compare_algorithm1, summary_of

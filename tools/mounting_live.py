@@ -19,7 +19,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
-from weldcal.calibration.mounting_poses import work_point
+from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.mounting_calibrator import solve_mounting

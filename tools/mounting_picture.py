@@ -19,7 +19,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
-from weldcal.calibration.mounting_scene import BASE, FLANGE
+from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
 from weldcal.systems.mounting_cell import MountingRun
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection, cor
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.observability import turn_deg
+from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.report.plots_verify import verify_report

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.observability import turn_deg
+from weldcal.calibration.planning.observability import turn_deg
 
 Array = NDArray[np.float64]
 

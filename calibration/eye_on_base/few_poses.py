@@ -16,7 +16,7 @@ from weldcal.calibration.eye_on_base.validation import position_errors, tilt_err
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.observability import unobservable_sentences
+from weldcal.calibration.planning.observability import unobservable_sentences
 
 Array = NDArray[np.float64]
 

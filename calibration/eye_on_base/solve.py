@@ -16,7 +16,7 @@ from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
-from weldcal.calibration.observability import check_diversity, unobservable_sentences
+from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 
 __all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from tests.conftest import FinishedRun, run_weldcal
-from weldcal.calibration.clearance import arm_bodies, path_clearance
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.pose_planning import PlannedPose
+from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.cell import job_plan, make_cell

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
 from weldcal.calibration.flange.fit import FlangeFit
-from weldcal.calibration.pose_planning import PlannedPose
+from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.flanges import get_flange

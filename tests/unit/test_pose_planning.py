@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.clearance import arm_bodies, lowest_point, occludes
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.pose_planning import (
+from weldcal.calibration.planning.calibration_poses import (
     PlannedPose,
     PlannerConfig,
     next_best_pose,
     plan_calibration_poses,
     predicted_sigma,
 )
+from weldcal.calibration.planning.clearance import arm_bodies, lowest_point, occludes
 from weldcal.models.arms.kinematics import forward_kinematics, link_frames, load_arm
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner

@@ -18,7 +18,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
-from weldcal.calibration.observability import check_diversity
+from weldcal.calibration.planning.observability import check_diversity
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.simulation import Progress, no_progress
 from weldcal.tools.studies.flange_frames import facing

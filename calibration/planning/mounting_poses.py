@@ -15,7 +15,7 @@ from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.problem import linearise
-from weldcal.calibration.mounting_scene import FLANGE, Bodies, MountingScene
+from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import jacobian, sigma_min
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule

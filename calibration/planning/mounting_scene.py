@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.spatial.distance import cdist
 
-from weldcal.calibration.clearance import Body, arm_bodies, lowest_point, occludes
 from weldcal.calibration.geometry.se3 import IDENTITY
 from weldcal.calibration.hand_eye.mountings import Mounting, Sighting, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
+from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.scanners import ScannerPreset
 
