@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.profiler.arc import find_arc
-from weldcal.calibration.profiler.edge_features import extract_edge
-from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
-from weldcal.calibration.profiler.edge_model import EdgeState, measurement_covariance, predicted, whitened
+from weldcal.calibration.profiler.edge.features import extract_edge
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
 from weldcal.calibration.profiler.errors import FeatureNotFound
-from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, sphere_joint
-from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.arc import find_arc
+from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, sphere_joint
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
 from weldcal.systems.messages import Message

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.interpolate import CubicSpline
 
-from weldcal.calibration.profiler.edge_model import EdgeState
+from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import (
     plan_edge_poses,
@@ -18,7 +18,7 @@ from weldcal.calibration.profiler.plan import (
     sample_edge_poses,
     sample_sphere_poses,
 )
-from weldcal.calibration.profiler.sphere_model import SphereSigmas
+from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.messages import Message

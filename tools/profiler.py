@@ -12,14 +12,13 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.results import matrix4
-from weldcal.calibration.profiler.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.edge_features import Kind, extract_edge
-from weldcal.calibration.profiler.edge_joint import EdgeEstimate
-from weldcal.calibration.profiler.edge_linear import edge_linear
-from weldcal.calibration.profiler.edge_model import EdgeState
+from weldcal.calibration.profiler.edge.features import Kind, extract_edge
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate
+from weldcal.calibration.profiler.edge.linear import edge_linear
+from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.errors import ArcNotFound, FeatureNotFound
-from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, rotation_groups
 from weldcal.calibration.profiler.plan import (
     Field,
@@ -30,15 +29,16 @@ from weldcal.calibration.profiler.plan import (
 )
 from weldcal.calibration.profiler.record import ProfilerRecord, load_record, save_record
 from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
-from weldcal.calibration.profiler.sphere_joint import Model, SphereEstimate, choose_model, sphere_joint
-from weldcal.calibration.profiler.sphere_linear import (
+from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
+from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, choose_model, sphere_joint
+from weldcal.calibration.profiler.sphere.linear import (
     compensate,
     fit_touch_sphere,
     sphere_center,
     sphere_linear,
     wrong_sides,
 )
-from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.profiler_files import ProfilerFile

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
 from weldcal.calibration.profiler.errors import InconsistentData
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError, WeldcalError

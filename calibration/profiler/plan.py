@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_model import EdgeState, measurement_covariance, predicted, whitened
+from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew
-from weldcal.calibration.profiler.sphere_model import SphereSigmas
+from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
 
 FLOOR = 1e-6  # of the largest information: what nothing was learnt of counts as known to 1/1000 of that only

@@ -15,8 +15,8 @@ from weldcal.calibration.data.results import matrix4, software_version, write_at
 from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, SAG_JOINTS, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
-from weldcal.calibration.profiler.sphere_joint import SphereEstimate
-from weldcal.calibration.profiler.sphere_model import corrected
+from weldcal.calibration.profiler.sphere.joint import SphereEstimate
+from weldcal.calibration.profiler.sphere.model import corrected
 from weldcal.models.errors import InputError
 
 RECORD_FILE = "profiler.yaml"

@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_features import extract_edge
-from weldcal.calibration.profiler.edge_model import EdgeState, predicted
+from weldcal.calibration.profiler.edge.features import extract_edge
+from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from weldcal.calibration.profiler.edge_model import EdgeState, predicted
+from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import sample_edge_poses
 from weldcal.calibration.profiler.record import load_record

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_features import extract_edge
-from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_crb, edge_joint
-from weldcal.calibration.profiler.edge_linear import edge_linear
-from weldcal.calibration.profiler.edge_model import EdgeState, predicted
+from weldcal.calibration.profiler.edge.features import extract_edge
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
+from weldcal.calibration.profiler.edge.linear import edge_linear
+from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.errors import (
     DegenerateMotion,
     FeatureNotFound,

@@ -10,11 +10,11 @@ import pytest
 
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.errors import FeatureNotFound
-from weldcal.calibration.profiler.frustum import fit_frustum, without_spikes
-from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.sphere_joint import SphereEstimate, sphere_joint
-from weldcal.calibration.profiler.sphere_model import SphereData
+from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
+from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/profiler"

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_joint import edge_crb
-from weldcal.calibration.profiler.edge_model import EdgeState
+from weldcal.calibration.profiler.edge.joint import edge_crb
+from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import (
     Field,

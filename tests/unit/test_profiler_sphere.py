@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.arc import find_arc, fit_circle
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import (
     ArcNotFound,
@@ -20,8 +19,9 @@ from weldcal.calibration.profiler.errors import (
     TooFewTranslations,
 )
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.sphere_joint import SphereEstimate, choose_model, leave_one_out_m, sphere_joint
-from weldcal.calibration.profiler.sphere_linear import (
+from weldcal.calibration.profiler.sphere.arc import find_arc, fit_circle
+from weldcal.calibration.profiler.sphere.joint import SphereEstimate, choose_model, leave_one_out_m, sphere_joint
+from weldcal.calibration.profiler.sphere.linear import (
     SphereLinear,
     compensate,
     fit_touch_sphere,
@@ -29,7 +29,7 @@ from weldcal.calibration.profiler.sphere_linear import (
     sphere_linear,
     wrong_sides,
 )
-from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.profiler_worlds import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
 

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
-from weldcal.calibration.profiler.frustum import fit_frustum
+from weldcal.calibration.profiler.features.frustum import fit_frustum
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
-from weldcal.calibration.profiler.sphere_joint import SphereEstimate, sphere_joint
-from weldcal.calibration.profiler.sphere_model import SphereSigmas
+from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
+from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.tools.studies.profiler_sphere import MM, WorldData, cloud_of
 
 # of the fixed files' worlds: what each error's sigma really is

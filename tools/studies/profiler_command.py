@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.profiler.edge_joint import edge_joint
+from weldcal.calibration.profiler.edge.joint import edge_joint
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_joint import edge_crb, edge_joint
-from weldcal.calibration.profiler.edge_linear import edge_linear
+from weldcal.calibration.profiler.edge.joint import edge_crb, edge_joint
+from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.tools.studies.profiler_sets import TRANSLATIONS, EdgeTrial
 

@@ -11,15 +11,15 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.arc import find_arc
-from weldcal.calibration.profiler.edge_features import extract_edge
-from weldcal.calibration.profiler.edge_joint import EdgeEstimate, edge_joint
-from weldcal.calibration.profiler.edge_linear import edge_linear
-from weldcal.calibration.profiler.edge_model import EdgeState, predicted
-from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.edge.features import extract_edge
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_joint
+from weldcal.calibration.profiler.edge.linear import edge_linear
+from weldcal.calibration.profiler.edge.model import EdgeState, predicted
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.calibration.profiler.sphere_joint import leave_one_out_m
-from weldcal.calibration.profiler.sphere_model import SphereData
+from weldcal.calibration.profiler.sphere.arc import find_arc
+from weldcal.calibration.profiler.sphere.joint import leave_one_out_m
+from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.studies.profiler_sets import MM, NOISE, EdgeTrial, fixed_edge_trials
 from weldcal.tools.studies.profiler_sphere import METHODS, WorldResult, fixed_worlds

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_joint import edge_crb, edge_joint
-from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.edge.joint import edge_crb, edge_joint
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic

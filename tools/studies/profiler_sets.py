@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge_model import EdgeState, predicted
+from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.profiler.arc import fit_circle
 from weldcal.calibration.profiler.arm_errors import DhArm
-from weldcal.calibration.profiler.frustum import Frustum, fit_frustum, without_spikes
-from weldcal.calibration.profiler.groove import groove_features
+from weldcal.calibration.profiler.features.frustum import Frustum, fit_frustum, without_spikes
+from weldcal.calibration.profiler.features.groove import groove_features
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.record import ProfilerRecord
-from weldcal.calibration.profiler.sphere_joint import sphere_joint
-from weldcal.calibration.profiler.sphere_linear import compensate, fit_touch_sphere, sphere_center, sphere_linear
-from weldcal.calibration.profiler.sphere_model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.arc import fit_circle
+from weldcal.calibration.profiler.sphere.joint import sphere_joint
+from weldcal.calibration.profiler.sphere.linear import compensate, fit_touch_sphere, sphere_center, sphere_linear
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.profiler_pieces import GrooveScan, scan_boss, scan_groove
 from weldcal.tools.studies.profiler_worlds import SphereTests, SphereTrial, SphereWorld, sphere_trial

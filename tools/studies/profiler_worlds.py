@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.profiler.arm_errors import OFFSET_JOINTS, DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.calibration.profiler.sphere_model import SphereData
+from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.arms.kinematics import load_arm
 
 RADIUS_M = 0.020

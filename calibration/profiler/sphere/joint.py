@@ -17,8 +17,8 @@ from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction
-from weldcal.calibration.profiler.sphere_model import Layout, Problem, SphereData, SphereSigmas, corrected
-from weldcal.calibration.profiler.sphere_start import sphere_starts
+from weldcal.calibration.profiler.sphere.model import Layout, Problem, SphereData, SphereSigmas, corrected
+from weldcal.calibration.profiler.sphere.start import sphere_starts
 from weldcal.models.errors import InputError
 
 Model = Literal["rigid", "affine", "affine+joints"]

@@ -10,7 +10,7 @@ import itertools
 
 import numpy as np
 
-from weldcal.calibration.profiler.edge_model import EdgeState
+from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew, turned
 
 ITERATIONS = 60

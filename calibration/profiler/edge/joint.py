@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from weldcal.calibration.profiler.edge_model import (
+from weldcal.calibration.profiler.edge.model import (
     EdgeState,
     left_covariance,
     left_information,
@@ -20,7 +20,7 @@ from weldcal.calibration.profiler.edge_model import (
     predicted,
     whitened,
 )
-from weldcal.calibration.profiler.edge_start import edge_starts
+from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewTranslations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, checked_points
 from weldcal.calibration.profiler.result import ProfilerEstimate, worst_direction

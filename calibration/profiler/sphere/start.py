@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from weldcal.calibration.profiler.edge_start import cube_rotations
+from weldcal.calibration.profiler.edge.start import cube_rotations
 from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew, turned
 
 POINTS = 7  # of each profile

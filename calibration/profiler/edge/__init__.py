@@ -1,0 +1,1 @@
+"""A laser profiler calibrated by a straight edge."""

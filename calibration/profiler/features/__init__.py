@@ -1,0 +1,1 @@
+"""Features that a calibrated profiler measures: V-grooves and frustums."""

@@ -1,0 +1,1 @@
+"""A laser profiler calibrated by a sphere, with touches where there are any."""
