@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.tablet.chain import HTM_NAMES
 from weldcal.calibration.tablet.detection import Look
-from weldcal.calibration.tablet.doubts import wrist_doubts
-from weldcal.calibration.tablet.files import file_hash, load_visit
-from weldcal.calibration.tablet.planar_files import hand_step_m, load_planar
-from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.planar.files import hand_step_m, load_planar
+from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.published.chain import HTM_NAMES
+from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES, Sign
 from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.two_stage import AFFINE_NAMES, Sign
-from weldcal.calibration.tablet.wrist import WristFit, fit_wrist
+from weldcal.calibration.tablet.wrist.diagnostics import wrist_doubts
+from weldcal.calibration.tablet.wrist.files import file_hash, load_visit
+from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.tablet_planar import NAMES, best_model, fit_visit

@@ -15,7 +15,7 @@ from pydrake.math import RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
-from weldcal.calibration.tablet.wrist import WristFit, seen_point
+from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.scenario import Scenario, check_scenario
 from weldcal.systems.tablet_cell import TabletCell, TabletVisit, make_tablet_cell

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.linear import LINEAR_NAMES, LinearFit, fit_linear
-from weldcal.calibration.tablet.planar import PLANAR_NAMES, PlanarConfig, PlanarFit, fit_planar
-from weldcal.calibration.tablet.planar_files import PlanarVisit
+from weldcal.calibration.tablet.planar.files import PlanarVisit
+from weldcal.calibration.tablet.planar.fit import PLANAR_NAMES, PlanarConfig, PlanarFit, fit_planar
+from weldcal.calibration.tablet.planar.linear import LINEAR_NAMES, LinearFit, fit_linear
+from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
-from weldcal.calibration.tablet.two_stage import Sign
 from weldcal.models.errors import InputError, WeldcalError
 
 Array = NDArray[np.float64]

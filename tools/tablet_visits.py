@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import software_version
-from weldcal.calibration.tablet.files import file_hash
-from weldcal.calibration.tablet.planar_files import PlanarFile
-from weldcal.calibration.tablet.two_stage import Sign
+from weldcal.calibration.tablet.planar.files import PlanarFile
+from weldcal.calibration.tablet.published.two_stage import Sign
+from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.tablet_planar import NAMES, VisitFits, best_model, fit_visit

@@ -17,12 +17,12 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from tests.unit.tablet_image import grid, picture, project
-from weldcal.calibration.tablet.doubts import wrist_doubts
 from weldcal.calibration.tablet.errors import TabletDataError
-from weldcal.calibration.tablet.files import WristVisit, load_visit
-from weldcal.calibration.tablet.planar_files import load_planar
+from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
-from weldcal.calibration.tablet.wrist import fit_wrist
+from weldcal.calibration.tablet.wrist.diagnostics import wrist_doubts
+from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
+from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.cli_tablet import tablet
 from weldcal.tools.studies.tablet_paper import published_touches

@@ -11,12 +11,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from weldcal.calibration.tablet.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
 from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
-from weldcal.calibration.tablet.evolution import evolve
-from weldcal.calibration.tablet.published import hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.published.calibration import hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
+from weldcal.calibration.tablet.published.evolution import evolve
+from weldcal.calibration.tablet.published.two_stage import (
+    AFFINE_NONE,
+    Sign,
+    fitness,
+    stage1_residuals,
+    stage2_residuals,
+)
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.two_stage import AFFINE_NONE, Sign, fitness, stage1_residuals, stage2_residuals
 from weldcal.tools.studies.cli_reproduce import reproduce
 from weldcal.tools.studies.tablet_paper import STAGE_1, STAGE_2, published_touches
 from weldcal.tools.studies.tablet_study import compare_signs, dh_by_eq_20

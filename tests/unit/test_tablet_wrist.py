@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.geometry.rigid import rotation_vector
 from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
-from weldcal.calibration.tablet.wrist import WristTouches, fit_wrist, seen_point
+from weldcal.calibration.tablet.wrist.fit import WristTouches, fit_wrist, seen_point
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
 P_FP = np.array([-0.002, -0.021, 0.163])

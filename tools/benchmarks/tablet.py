@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from weldcal.calibration.tablet.linear import fit_linear, solve_closed_form, touched_rays
-from weldcal.calibration.tablet.planar import PlanarConfig, fit_planar
-from weldcal.calibration.tablet.published import tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar
+from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
+from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.tablet_paper import published_touches

@@ -7,9 +7,9 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from weldcal.calibration.tablet.linear import LinearFit, fit_linear
-from weldcal.calibration.tablet.published import StageResult
-from weldcal.calibration.tablet.two_stage import Fitness
+from weldcal.calibration.tablet.planar.linear import LinearFit, fit_linear
+from weldcal.calibration.tablet.published.calibration import StageResult
+from weldcal.calibration.tablet.published.two_stage import Fitness
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.tablet_paper import STAGE_1, STAGE_2, TABLE_NUMBER, TOUCHING_MM, published_touches

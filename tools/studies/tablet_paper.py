@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.chain import DH_NAMES, HTM_NAMES, Model
+from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, Model
+from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.two_stage import AFFINE_NAMES
 
 Array = NDArray[np.float64]
 

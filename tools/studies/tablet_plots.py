@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.tablet.planar import fit_plane_motion, hand_over
+from weldcal.calibration.tablet.planar.fit import fit_plane_motion, hand_over
+from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.two_stage import Sign
 from weldcal.tools.report.plots_weld import OURS, THEIRS, TRUTH, svg
 from weldcal.tools.studies.tablet_study import HeldOutRow, ModelRow
 

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.chain import Model, place_landmarks
-from weldcal.calibration.tablet.evolution import PUBLISHED_GENERATIONS, PUBLISHED_POPULATION, evolve
-from weldcal.calibration.tablet.linear import fit_linear
-from weldcal.calibration.tablet.planar import PlanarConfig, fit_planar, fit_plane_motion, hand_over
-from weldcal.calibration.tablet.published import StageResult, hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over
+from weldcal.calibration.tablet.planar.linear import fit_linear
+from weldcal.calibration.tablet.published.calibration import StageResult, hand_to_touch, tablet_stage1, tablet_stage2
+from weldcal.calibration.tablet.published.chain import Model, place_landmarks
+from weldcal.calibration.tablet.published.evolution import PUBLISHED_GENERATIONS, PUBLISHED_POPULATION, evolve
+from weldcal.calibration.tablet.published.two_stage import Fitness, Sign, fitness, stage1_residuals
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.two_stage import Fitness, Sign, fitness, stage1_residuals
 from weldcal.tools.studies.tablet_paper import STAGE_1
 from weldcal.tools.studies.tablet_world import TabletTrial, simulate_trial
 

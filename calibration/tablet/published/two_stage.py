@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.chain import Landmarks, Model, place_landmarks
+from weldcal.calibration.tablet.published.chain import Landmarks, Model, place_landmarks
 from weldcal.calibration.tablet.touches import TabletTouches
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import TooFewLandmarks
+from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, check_touches, same_landmark
-from weldcal.calibration.tablet.two_stage import Sign
 
 Array = NDArray[np.float64]
 

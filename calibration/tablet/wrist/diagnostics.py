@@ -10,7 +10,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS
-from weldcal.calibration.tablet.wrist import WristFit, WristTouches
+from weldcal.calibration.tablet.wrist.fit import WristFit, WristTouches
 
 Array = NDArray[np.float64]
 

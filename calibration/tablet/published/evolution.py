@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, differential_evolution
 
-from weldcal.calibration.tablet.distances import DistanceMinimum, Residuals
+from weldcal.calibration.tablet.published.distances import DistanceMinimum, Residuals
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.tablet.chain import Model, place_landmarks, search_range
-from weldcal.calibration.tablet.distances import DistanceMinimum, Residuals, minimise_distances
-from weldcal.calibration.tablet.touches import TabletTouches, check_touches
-from weldcal.calibration.tablet.two_stage import (
+from weldcal.calibration.tablet.published.chain import Model, place_landmarks, search_range
+from weldcal.calibration.tablet.published.distances import DistanceMinimum, Residuals, minimise_distances
+from weldcal.calibration.tablet.published.two_stage import (
     AFFINE_NONE,
     AFFINE_RANGE,
     CENTRE,
@@ -22,6 +21,7 @@ from weldcal.calibration.tablet.two_stage import (
     stage1_residuals,
     stage2_residuals,
 )
+from weldcal.calibration.tablet.touches import TabletTouches, check_touches
 
 Array = NDArray[np.float64]
 Minimiser = Callable[[Residuals, Array], DistanceMinimum]

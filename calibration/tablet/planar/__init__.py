@@ -1,0 +1,1 @@
+"""Tablet calibration from touches that move in the tablet's plane."""

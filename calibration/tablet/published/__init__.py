@@ -1,0 +1,1 @@
+"""The tablet paper's two-stage calibration by name."""

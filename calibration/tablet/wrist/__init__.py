@@ -1,0 +1,1 @@
+"""Tablet calibration from full robot poses of the wrist."""
