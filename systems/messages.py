@@ -14,7 +14,7 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Algorithm1State
 from weldcal.calibration.published.icp import Verification
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 
 class Message:

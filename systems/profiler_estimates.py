@@ -21,7 +21,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
 from weldcal.systems.messages import Message
 from weldcal.systems.profiler_scenario import ProfilerJob
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
 SMOOTHING_M = 0.004  # waves of a seam shorter than about six times this are taken for noise

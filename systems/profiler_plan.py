@@ -24,7 +24,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.messages import Message
 from weldcal.systems.profiler_room import Room
 from weldcal.systems.profiler_scenario import edge_as_thought
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
 CANDIDATES = 160

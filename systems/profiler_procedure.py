@@ -29,7 +29,7 @@ from weldcal.systems.profiler_estimates import (
 )
 from weldcal.systems.profiler_plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
 from weldcal.systems.profiler_room import Room
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
 DWELL_S = 0.1  # at rest before a profile is taken

@@ -17,9 +17,9 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.feasibility import check_feasible
 from weldcal.welding.planning import PlanningMethod, RootPlan, plan_root
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.servo_state import ServoConfig
 from weldcal.welding.touch import touch_start_pose
 

@@ -13,7 +13,7 @@ from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.systems.profiler_cell import ProfilerCell, ProfilerRun
 from weldcal.systems.profiler_estimates import pose_sigmas
 from weldcal.welding.process import path_error
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
 JOINT_3_SIGMA = float(chi2.ppf(chi2.cdf(9.0, 1), 6))  # 20.06

@@ -9,9 +9,9 @@ import numpy as np
 
 from weldcal.welding.contact import contact_lost
 from weldcal.welding.evolve import changed
-from weldcal.welding.plan_fit import add_point
-from weldcal.welding.refinement import PendingPoint, RefinedSeam
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.plan_fit import add_point
+from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 from weldcal.welding.servo_state import ServoConfig, ServoSample, WeldingState
 from weldcal.welding.vectors import Array, clip, dot
 

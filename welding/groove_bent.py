@@ -13,7 +13,7 @@ from weldcal.welding.groove_measure import measure_groove
 from weldcal.welding.groove_seam import GrooveConfig, GrooveSeam
 from weldcal.welding.groove_search import find_grooves
 from weldcal.welding.planes import Floats, thinned
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger one sags by 11 mm or less, and its walls lean by less than 9 deg
 MARGIN_M = 0.020

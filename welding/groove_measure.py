@@ -25,7 +25,7 @@ from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam
 from weldcal.welding.groove_search import CoarseGroove
 from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
 from weldcal.welding.planes import Floats, into, point_pitch, thinned
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 MOST_POINTS = 400_000  # about one groove
 THINNED = 0.9  # a smaller pitch than that of the cloud it was found in is that of a cloud which was thinned for it

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.errors import WeldcalError
 from weldcal.welding.groove_search import SearchConfig
 from weldcal.welding.planes import Floats
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 
 class GrooveNotFound(WeldcalError):

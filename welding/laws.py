@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform
 
 from weldcal.welding.chord import UnknownLaw
 from weldcal.welding.guard import seam_conditioning
-from weldcal.welding.refinement import RefinedSeam
-from weldcal.welding.seam import SeamFrame
+from weldcal.welding.seam.curve import SeamFrame
+from weldcal.welding.seam.refinement import RefinedSeam
 from weldcal.welding.servo_state import ServoConfig, WeldingState
 from weldcal.welding.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.track import Motion, TorchTarget, guarded_motion

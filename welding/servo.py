@@ -18,12 +18,12 @@ from weldcal.welding.contact import (
     with_progress,
 )
 from weldcal.welding.evolve import changed
-from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.laws import get_law, motion_law
-from weldcal.welding.plan_fit import PlanFit
-from weldcal.welding.refinement import drop_pending
-from weldcal.welding.seam import SeamCurve, SeamError, SeamFrame
+from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
+from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
+from weldcal.welding.seam.plan_fit import PlanFit
+from weldcal.welding.seam.refinement import drop_pending
 from weldcal.welding.servo_state import Diagnostics, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.touch import touch_step
 from weldcal.welding.track import TorchTarget, torch_target

@@ -11,9 +11,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
-from weldcal.welding.feasibility import SeamWindows
-from weldcal.welding.plan_fit import PlanFit, PlanFitConfig
-from weldcal.welding.refinement import PendingPoint, RefinedSeam, RefinementConfig
+from weldcal.welding.seam.feasibility import SeamWindows
+from weldcal.welding.seam.plan_fit import PlanFit, PlanFitConfig
+from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam, RefinementConfig
 from weldcal.welding.vectors import Array
 from weldcal.welding.weave import WeaveConfig
 

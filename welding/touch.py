@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.welding.contact import freshness
 from weldcal.welding.evolve import changed
-from weldcal.welding.seam import SeamCurve, SeamFrame
+from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.servo_state import GainFit, ServoConfig, ServoSample, WeldingState
 from weldcal.welding.vectors import clip, dot, pose, unit
 

@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform
 
 from weldcal.welding.guard import SeamConditioning, seam_conditioning
 from weldcal.welding.lsq import box_least_squares
-from weldcal.welding.refinement import LocalFit, RefinedSeam, local_fit
-from weldcal.welding.seam import SeamCurve, SeamFrame
+from weldcal.welding.seam.curve import SeamCurve, SeamFrame
+from weldcal.welding.seam.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.servo_state import ServoConfig, WeldingState
 from weldcal.welding.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit

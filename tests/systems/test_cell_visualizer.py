@@ -25,7 +25,7 @@ from weldcal.systems.phase_labels import TEXT, label_image
 from weldcal.systems.scenario import VisualizationConfig
 from weldcal.systems.weld_gauge import gauge_picture
 from weldcal.systems.welding_velocity_servo import ServoReport
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo_state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
 
 from .cells import TOOL, scenario

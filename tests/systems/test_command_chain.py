@@ -19,7 +19,7 @@ from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.welding.guard import SlewLimits
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo_state import DeflectionSample, ServoConfig
 from weldcal.welding.touch import touch_start_pose
 

@@ -18,7 +18,7 @@ from weldcal.systems.job_sequencer import PHASES, JobPlan, JobSequencer, JobStat
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
 from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.tools.simulation import SHARES
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 
 from .cells import Q_HOME
 

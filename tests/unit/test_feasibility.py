@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from weldcal.tools.studies.seams import arcs, s_curve
-from weldcal.welding.chord_map import chord_map
-from weldcal.welding.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.process import ProcessLogError, path_error, speed_statistics, torch_events
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.chord_map import chord_map
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 
 from .weld_kinematics import l_curve, straight
 

@@ -12,9 +12,9 @@ from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import StudyRun, simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
 from weldcal.welding.feel_start import feel_start_step, with_touch_place
-from weldcal.welding.plan_fit import PlanFit
 from weldcal.welding.process import path_error
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.servo_state import (
     Measurement,
     Phase,

@@ -13,7 +13,7 @@ from weldcal.tools.studies.weld_rows import Case
 from weldcal.tools.studies.weld_study import study_config
 from weldcal.welding.chord import UnknownLaw
 from weldcal.welding.laws import LAWS, get_law, literal_tangent
-from weldcal.welding.refinement import RefinedSeam
+from weldcal.welding.seam.refinement import RefinedSeam
 from weldcal.welding.vectors import Array
 
 STRAIGHT = arcs((0.10, 0.0), spacing=2e-3)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.welding.plan_fit import PlanFit, PlanFitConfig, add_point
-from weldcal.welding.refinement import RefinedSeam, RefinementConfig, drop_pending, local_fit, refine, tip_point
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.plan_fit import PlanFit, PlanFitConfig, add_point
+from weldcal.welding.seam.refinement import RefinedSeam, RefinementConfig, drop_pending, local_fit, refine, tip_point
 
 CONFIG = RefinementConfig()
 X_AXIS = np.array([1.0, 0.0, 0.0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.welding.seam import NonFiniteSeamPoints, RepeatedSeamPoints, SeamCurve, SeamError, TooFewSeamPoints
+from weldcal.welding.seam.curve import NonFiniteSeamPoints, RepeatedSeamPoints, SeamCurve, SeamError, TooFewSeamPoints
 
 R = 0.060
 

@@ -16,7 +16,7 @@ from weldcal.tools.studies.groove import DROP_M as DROP
 from weldcal.tools.studies.groove import SEAT_M as SEAT
 from weldcal.tools.studies.seams import s_curve
 from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo import welding_step
 from weldcal.welding.servo_state import (
     DeflectionSample,

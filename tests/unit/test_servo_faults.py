@@ -15,7 +15,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
-from weldcal.welding.seam import SeamCurve, SeamError
+from weldcal.welding.seam.curve import SeamCurve, SeamError
 from weldcal.welding.servo import welding_step
 from weldcal.welding.servo_state import DeflectionSample, Phase, ServoConfig, ServoSample, TouchConfig, WeldingState
 from weldcal.welding.touch import touch_start_pose

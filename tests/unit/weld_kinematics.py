@@ -10,7 +10,7 @@ import numpy as np
 from weldcal.tools.studies.budgets import NOMINAL, Budget
 from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs, corner
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo_state import Phase, ServoConfig, WeldingCommand, WeldingState
 from weldcal.welding.vectors import Array
 

@@ -9,7 +9,7 @@ from weldcal.systems.messages import CalibrationStatus
 from weldcal.tools.outcome import WeldOutcome
 from weldcal.tools.report.plots_weld import OURS, ROBOT, THEIRS, TRUTH, Array, WeldTrace, plain, svg
 from weldcal.welding.process import path_error, speed_along, torch_angles
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo_state import Phase, ServoConfig
 
 

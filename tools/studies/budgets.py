@@ -10,7 +10,7 @@ from pydrake.math import RotationMatrix
 from scipy.ndimage import gaussian_filter1d
 
 from weldcal.tools.studies.seams import TrueSeam
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.vectors import Array
 
 

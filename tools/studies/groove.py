@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.vectors import Array, dot
 
 RADIUS_M = 2.5e-3

@@ -12,7 +12,7 @@ from weldcal.tools.studies.budgets import Budget, planned_seam, roughness
 from weldcal.tools.studies.groove import DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.seams import TrueSeam
 from weldcal.welding.feel_start import with_touch_place
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo import welding_step
 from weldcal.welding.servo_state import DeflectionSample, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.touch import touch_start_pose

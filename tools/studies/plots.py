@@ -8,8 +8,8 @@ import numpy as np
 
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.studies.plant import PHASES, StudyRun
-from weldcal.welding.chord_map import chord_map
 from weldcal.welding.process import path_error, speed_along
+from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo_state import Phase, ServoConfig
 
 _EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s

@@ -12,8 +12,8 @@ from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, get_seam
 from weldcal.tools.studies.weld_rows import Case
 from weldcal.tools.studies.weld_study import study_config
-from weldcal.welding.feasibility import assess_seam, split_seam
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.feasibility import assess_seam, split_seam
 
 TURNS = ("turn_120_r20", "turn_120_r5", "turn_150_r10", "u_r20", "u_r30", "u_r100", "cusp_r20")
 CHORDS = (0.040, 0.060, 0.080)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.vectors import Array, dot, norm
 
 

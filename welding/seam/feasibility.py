@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.welding.chord_map import ChordMap, chord_map
-from weldcal.welding.seam import SeamCurve
+from weldcal.welding.seam.chord_map import ChordMap, chord_map
+from weldcal.welding.seam.curve import SeamCurve
 
 _SPACING_M = 1.0e-3
 

@@ -1,0 +1,1 @@
+"""The planned seam: its curve, its feasibility and its refinement by touch."""
