@@ -17,7 +17,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.servo_state import ServoConfig

@@ -13,7 +13,7 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.cell import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.systems.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
-from weldcal.welding.planning import PlanningMethod
+from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo_state import ServoConfig
 from weldcal.welding.touch import touch_start_pose

@@ -13,11 +13,11 @@ from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece
 from weldcal.tools.benchmarks.plan_scenes import Scene, scan_part
 from weldcal.tools.benchmarks.plan_trials import sideways
-from weldcal.welding.bent_face import BentFace, find_bent_faces
-from weldcal.welding.find_workpiece import find_workpiece
-from weldcal.welding.groove_cloud import extract_groove
-from weldcal.welding.planning import PlanningMethod, plan_root
-from weldcal.welding.registration import WorkpieceNotFound, register_workpiece
+from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
+from weldcal.welding.locate.find_workpiece import find_workpiece
+from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.planning import PlanningMethod, plan_root
+from weldcal.welding.locate.registration import WorkpieceNotFound, register_workpiece
 
 RADIUS_M = 0.200
 SCANNER = get_scanner("phoxi_m", 618, 462)  # pixels of 1.3 mm at this distance

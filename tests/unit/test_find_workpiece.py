@@ -12,8 +12,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
 from weldcal.tools.benchmarks.plan_scenes import Scene, box, cast, looking_at, scan_part, table
-from weldcal.welding.find_workpiece import AmbiguousWorkpiece, FoundWorkpiece, find_workpiece
-from weldcal.welding.registration import WorkpieceNotFound
+from weldcal.welding.locate.find_workpiece import AmbiguousWorkpiece, FoundWorkpiece, find_workpiece
+from weldcal.welding.locate.registration import WorkpieceNotFound
 
 SCANNER = get_scanner("phoxi_m", 515, 385)
 CAD = {shape: make_workpiece(shape) for shape in ("straight", "s", "l")}

@@ -22,8 +22,8 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.tools.benchmarks import seam_planning
 from weldcal.tools.benchmarks.plan_scenes import Scene, box, cast, looking_at, scan_part, table
 from weldcal.tools.benchmarks.plan_trials import sideways
-from weldcal.welding.groove_cloud import extract_groove
-from weldcal.welding.groove_seam import (
+from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.groove_seam import (
     GrooveNotFound,
     GrooveSeam,
     GrooveTooNarrow,

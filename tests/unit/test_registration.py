@@ -14,7 +14,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
-from weldcal.welding.registration import RegistrationConfig, WorkpieceNotFound, register_workpiece
+from weldcal.welding.locate.registration import RegistrationConfig, WorkpieceNotFound, register_workpiece
 
 # 826 pixels over 590 mm at 650 mm: a pitch of 1.0 mm on a plate 0.91 m away; the noise there is 0.2 mm.
 SCANNER = get_scanner("phoxi_m", 826)

@@ -19,9 +19,9 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece
 from weldcal.tools.benchmarks.plan_scenes import Scene, scan_part
-from weldcal.welding.find_workpiece import find_workpiece
-from weldcal.welding.groove_cloud import extract_groove
-from weldcal.welding.planes import Floats, into
+from weldcal.welding.locate.find_workpiece import find_workpiece
+from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.planes import Floats, into
 
 WIDEST_PX = 824
 SHAPES = (

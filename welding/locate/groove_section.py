@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.planes import Floats
+from weldcal.welding.locate.planes import Floats
 
 ITERATIONS = 12
 ENOUGH = 3  # points on a wall to be a wall

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from weldcal.welding.planes import Floats, into
+from weldcal.welding.locate.planes import Floats, into
 
 LEAST_RADIUS_M, MOST_RADIUS_M = 0.100, 2.0
 SEEDS, NEIGHBOURS, PAIRS = 2500, 40, 300

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 from scipy.optimize import least_squares
 
-from weldcal.welding.planes import PLANE_BAND_M, Floats, Raster, point_pitch, rasterise, turned
-from weldcal.welding.pose_covariance import outline_covariance
+from weldcal.welding.locate.planes import PLANE_BAND_M, Floats, Raster, point_pitch, rasterise, turned
+from weldcal.welding.locate.pose_covariance import outline_covariance
 
 
 def inward_normals(outline: Floats) -> Floats:

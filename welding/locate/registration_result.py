@@ -10,9 +10,9 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
 from weldcal.models.workpieces import Workpiece
-from weldcal.welding.outline_fit import check, displaced, outermost
-from weldcal.welding.planes import Floats, rasterise, turned
-from weldcal.welding.pose_covariance import moved_covariance, seam_sigma
+from weldcal.welding.locate.outline_fit import check, displaced, outermost
+from weldcal.welding.locate.planes import Floats, rasterise, turned
+from weldcal.welding.locate.pose_covariance import moved_covariance, seam_sigma
 
 
 class WorkpieceNotFound(WeldcalError):

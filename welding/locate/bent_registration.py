@@ -17,10 +17,10 @@ from scipy.optimize import least_squares
 
 from weldcal.models.mesh import inside_loops
 from weldcal.models.workpieces import Workpiece
-from weldcal.welding.bent_face import BentFace, find_bent_faces, rolled, unrolled
-from weldcal.welding.outline_fit import by_the_edge, inward_normals, outermost, slide
-from weldcal.welding.planes import Floats, into, point_pitch, thinned
-from weldcal.welding.pose_covariance import (
+from weldcal.welding.locate.bent_face import BentFace, find_bent_faces, rolled, unrolled
+from weldcal.welding.locate.outline_fit import by_the_edge, inward_normals, outermost, slide
+from weldcal.welding.locate.planes import Floats, into, point_pitch, thinned
+from weldcal.welding.locate.pose_covariance import (
     EDGE_NOISES,
     EDGE_PITCHES,
     HEIGHT_FLOOR_M,
@@ -30,7 +30,7 @@ from weldcal.welding.pose_covariance import (
     USUAL_SLANT_RAD,
     points_per_independent,
 )
-from weldcal.welding.registration_result import (
+from weldcal.welding.locate.registration_result import (
     RegistrationConfig,
     WorkpieceNotFound,
     WorkpieceRegistration,

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from weldcal.welding.groove_follow import Slices
-from weldcal.welding.groove_line import Line
-from weldcal.welding.groove_seam import GrooveNotFound
-from weldcal.welding.groove_search import CoarseGroove
-from weldcal.welding.groove_section import BAND_M, Profile
-from weldcal.welding.planes import Floats
+from weldcal.welding.locate.groove_follow import Slices
+from weldcal.welding.locate.groove_line import Line
+from weldcal.welding.locate.groove_seam import GrooveNotFound
+from weldcal.welding.locate.groove_search import CoarseGroove
+from weldcal.welding.locate.groove_section import BAND_M, Profile
+from weldcal.welding.locate.planes import Floats
 
 
 def seen_extent(

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.groove_corner import Corner
-from weldcal.welding.groove_line import Line, smoothing_weights
-from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveTooNarrow
-from weldcal.welding.groove_search import CoarseGroove
-from weldcal.welding.groove_section import BAND_M, Profile, Section, fit_section
-from weldcal.welding.planes import Floats
+from weldcal.welding.locate.groove_corner import Corner
+from weldcal.welding.locate.groove_line import Line, smoothing_weights
+from weldcal.welding.locate.groove_seam import GrooveConfig, GrooveNotFound, GrooveTooNarrow
+from weldcal.welding.locate.groove_search import CoarseGroove
+from weldcal.welding.locate.groove_section import BAND_M, Profile, Section, fit_section
+from weldcal.welding.locate.planes import Floats
 
 STATION_M = 0.001
 FOLLOW = 3.0  # times wider than the last smoothing: a line moved again and again keeps ever more of the noise

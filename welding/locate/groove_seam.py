@@ -9,8 +9,8 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
-from weldcal.welding.groove_search import SearchConfig
-from weldcal.welding.planes import Floats
+from weldcal.welding.locate.groove_search import SearchConfig
+from weldcal.welding.locate.planes import Floats
 from weldcal.welding.seam.curve import SeamCurve
 
 

@@ -19,10 +19,19 @@ from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
-from weldcal.welding.bent_face import BentFace, find_bent_faces
-from weldcal.welding.bent_registration import RADIUS_SHARE, flattened, into_plate
-from weldcal.welding.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, turned, upward_planes
-from weldcal.welding.registration import (
+from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
+from weldcal.welding.locate.bent_registration import RADIUS_SHARE, flattened, into_plate
+from weldcal.welding.locate.planes import (
+    PLANE_BAND_M,
+    Floats,
+    into,
+    point_pitch,
+    robust_plane,
+    thinned,
+    turned,
+    upward_planes,
+)
+from weldcal.welding.locate.registration import (
     RegistrationConfig,
     WorkpieceNotFound,
     WorkpieceRegistration,

@@ -12,11 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.welding.groove_bent import bent_seams
-from weldcal.welding.groove_measure import measure_groove
-from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, SeveralGrooves
-from weldcal.welding.groove_search import find_grooves
-from weldcal.welding.planes import Floats, thinned
+from weldcal.welding.locate.groove_bent import bent_seams
+from weldcal.welding.locate.groove_measure import measure_groove
+from weldcal.welding.locate.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, SeveralGrooves
+from weldcal.welding.locate.groove_search import find_grooves
+from weldcal.welding.locate.planes import Floats, thinned
 
 COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # to find openings in: a groove 2 mm wide is still three cells wide
 

@@ -8,11 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from weldcal.models.errors import WeldcalError
-from weldcal.welding.bent_face import LEAST_RADIUS_M, BentFace, find_bent_faces
-from weldcal.welding.groove_measure import measure_groove
-from weldcal.welding.groove_seam import GrooveConfig, GrooveSeam
-from weldcal.welding.groove_search import find_grooves
-from weldcal.welding.planes import Floats, thinned
+from weldcal.welding.locate.bent_face import LEAST_RADIUS_M, BentFace, find_bent_faces
+from weldcal.welding.locate.groove_measure import measure_groove
+from weldcal.welding.locate.groove_seam import GrooveConfig, GrooveSeam
+from weldcal.welding.locate.groove_search import find_grooves
+from weldcal.welding.locate.planes import Floats, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_RADIUS_M = 1.0  # over 0.3 m a larger one sags by 11 mm or less, and its walls lean by less than 9 deg

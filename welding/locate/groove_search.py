@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from weldcal.welding.planes import Floats, Mask, into, point_pitch, robust_plane, upward_planes
+from weldcal.welding.locate.planes import Floats, Mask, into, point_pitch, robust_plane, upward_planes
 
 
 @dataclass(frozen=True)

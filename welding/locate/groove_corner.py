@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from weldcal.welding.groove_line import Line, filleted, meeting_point, tight_turns
-from weldcal.welding.groove_section import Profile
-from weldcal.welding.planes import Floats
+from weldcal.welding.locate.groove_line import Line, filleted, meeting_point, tight_turns
+from weldcal.welding.locate.groove_section import Profile
+from weldcal.welding.locate.planes import Floats
 
 SIDE_M = 0.015  # length of a side that is prolonged
 LEAST_RADIUS_M = 0.0005  # a seam curve cannot turn on the spot: its apex is then 0.2 mm off at a right angle

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from weldcal.welding.groove_corner import Corner, round_corners, split_legs
-from weldcal.welding.groove_extent import ends_at_edges, refuse_gap, seen_extent
-from weldcal.welding.groove_follow import (
+from weldcal.welding.locate.groove_corner import Corner, round_corners, split_legs
+from weldcal.welding.locate.groove_extent import ends_at_edges, refuse_gap, seen_extent
+from weldcal.welding.locate.groove_follow import (
     STATION_M,
     Slices,
     agreed,
@@ -20,11 +20,11 @@ from weldcal.welding.groove_follow import (
     followed,
     measured_profile,
 )
-from weldcal.welding.groove_line import Line, smoothing_weights
-from weldcal.welding.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain
-from weldcal.welding.groove_search import CoarseGroove
-from weldcal.welding.groove_section import BAND_M, ENOUGH, Profile
-from weldcal.welding.planes import Floats, into, point_pitch, thinned
+from weldcal.welding.locate.groove_line import Line, smoothing_weights
+from weldcal.welding.locate.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain
+from weldcal.welding.locate.groove_search import CoarseGroove
+from weldcal.welding.locate.groove_section import BAND_M, ENOUGH, Profile
+from weldcal.welding.locate.planes import Floats, into, point_pitch, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_POINTS = 400_000  # about one groove

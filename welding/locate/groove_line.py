@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from weldcal.welding.planes import Floats, Mask
+from weldcal.welding.locate.planes import Floats, Mask
 
 STEP_M = 0.0005
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 
 from weldcal.models.workpieces import Workpiece
-from weldcal.welding.planes import Floats
+from weldcal.welding.locate.planes import Floats
 
 EDGE_PITCHES = 0.03  # error common to the points of an edge, in point distances
 SCATTER_PITCHES = 0.20  # what the outermost points of an edge scatter where their pixels' phases are mixed

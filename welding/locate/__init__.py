@@ -1,0 +1,1 @@
+"""Where the part and its groove lie in a scan."""
