@@ -14,8 +14,8 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import FingerCamera, WeldingTool
 from weldcal.systems.messages import Image, Message
 from weldcal.systems.pose_recorder import PoseHistory
-from weldcal.welding.deformation import TagModel, deflection_from_tag, detect_tag
-from weldcal.welding.servo_state import DeflectionSample
+from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag
+from weldcal.welding.servo.state import DeflectionSample
 
 IMAGES_KEPT = 10  # a third of a second of them: later than that the servo has stopped
 

@@ -36,8 +36,8 @@ from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.welding_velocity_servo import ServoReport, WeldingVelocityServo
-from weldcal.welding.guard import SlewLimits
-from weldcal.welding.servo_state import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.guards import SlewLimits
+from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
 
 AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 LOG_PERIOD_S = 0.008  # a row per servo tick

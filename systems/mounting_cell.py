@@ -28,7 +28,7 @@ from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.scenario import Scenario
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
-from weldcal.welding.guard import SlewLimits
+from weldcal.welding.servo.guards import SlewLimits
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from weldcal.systems.profiler_room import Room
 from weldcal.systems.scenario import Scenario
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
-from weldcal.welding.guard import SlewLimits
+from weldcal.welding.servo.guards import SlewLimits
 
 Array = NDArray[np.float64]
 CONTROL_PERIOD_S = 0.004

@@ -22,9 +22,9 @@ from weldcal.systems.mounting_scenario import MountingJob, check_mounting
 from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job
 from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
-from weldcal.welding.laws import get_law
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.process import WeldProcess
+from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
 DRAWN_ARMS = ("ur10e",)
@@ -128,7 +128,7 @@ class WeldingConfig:
     clearance_mm: float = 25.0  # height above the seam where the approach ends
     seam_length_mm: float | None = None  # weld only this much of the seam
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
-    law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/laws.py)
+    law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 
 
 @dc.dataclass

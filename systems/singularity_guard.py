@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
-from weldcal.welding.guard import ArmGuardConfig, guarded_joint_velocity
+from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
 
 
 class SingularityGuard(LeafSystem):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from weldcal.welding.guard import SlewLimits, slew_limit
+from weldcal.welding.servo.guards import SlewLimits, slew_limit
 
 
 class SlewLimiter(LeafSystem):

@@ -29,8 +29,8 @@ from weldcal.systems.station import Station, make_station
 from weldcal.systems.tablet_messages import TabletTruth, WristPicture
 from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.tablet_scenario import TabletConfig
-from weldcal.welding.guard import SlewLimits
-from weldcal.welding.servo_state import ServoConfig
+from weldcal.welding.servo.guards import SlewLimits
+from weldcal.welding.servo.state import ServoConfig
 
 Array = NDArray[np.float64]
 PEN_BODY_M = 0.006  # radius of the pen where moves are to keep clear of the table

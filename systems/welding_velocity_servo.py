@@ -14,8 +14,8 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import JobCommand, Message, PlannedSeam
-from weldcal.welding.servo import welding_step
-from weldcal.welding.servo_state import Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.state import Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.step import welding_step
 
 TELEMETRY = (
     "phase", "torch_on", "s_tip", "s_torch", "e_t", "e_height", "n_d_dot_n_t", "conditioning", "omega",

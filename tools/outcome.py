@@ -15,7 +15,7 @@ from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
 from weldcal.welding.process import PathError, SpeedStatistics, WeldProcess, path_error, speed_along, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo_state import Phase
+from weldcal.welding.servo.state import Phase
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from weldcal.tools.outcome import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.simulation import Run
 from weldcal.welding.process import speed_along, torch_angles
-from weldcal.welding.servo_state import Phase
+from weldcal.welding.servo.state import Phase
 from weldcal.welding.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 
 PHASE_NAMES = [str(phase) for phase in Phase]

@@ -54,7 +54,7 @@ from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair, a
 from weldcal.systems.drivers.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
-from weldcal.welding.deformation import TagModel, tag_cells
+from weldcal.welding.servo.deformation import TagModel, tag_cells
 
 SCANNER_RENDERER = "scanner"
 FINGER_RENDERER = "finger"

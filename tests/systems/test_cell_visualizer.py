@@ -26,7 +26,7 @@ from weldcal.systems.scenario import VisualizationConfig
 from weldcal.systems.weld_gauge import gauge_picture
 from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo_state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
+from weldcal.welding.servo.state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
 
 from .cells import TOOL, scenario
 

@@ -18,10 +18,10 @@ from weldcal.systems.messages import JobCommand, PlannedSeam, UrStatus
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
-from weldcal.welding.guard import SlewLimits
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo_state import DeflectionSample, ServoConfig
-from weldcal.welding.touch import touch_start_pose
+from weldcal.welding.servo.guards import SlewLimits
+from weldcal.welding.servo.state import DeflectionSample, ServoConfig
+from weldcal.welding.servo.touch import touch_start_pose
 
 from .cells import Q_HOME, TOOL, the_arm
 

@@ -20,7 +20,7 @@ from weldcal.systems.drivers.picture_worker import Finish, Pixels
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.messages import Image
 from weldcal.systems.pose_recorder import PoseHistory
-from weldcal.welding.deformation import TagModel, tag_cells
+from weldcal.welding.servo.deformation import TagModel, tag_cells
 
 from .cells import Q_HOME, TOOL, Drive, plain_station, scenario, the_arm
 

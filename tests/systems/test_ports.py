@@ -78,8 +78,8 @@ from weldcal.systems.tablet_cell import plan_tablet
 from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 from weldcal.systems.tablet_procedure import TabletProcedure, TabletState
 from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
-from weldcal.welding.guard import SlewLimits
-from weldcal.welding.servo_state import ServoConfig
+from weldcal.welding.servo.guards import SlewLimits
+from weldcal.welding.servo.state import ServoConfig
 
 from .cells import Q_HOME, TOOL, plain_station, the_arm
 

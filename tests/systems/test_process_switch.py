@@ -17,7 +17,7 @@ from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.process_switch import ProcessSwitch
 from weldcal.systems.welding_velocity_servo import ServoReport
-from weldcal.welding.servo_state import Diagnostics, Phase, WeldingCommand
+from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
 from .cells import Q_HOME, weld_only_cell
 

@@ -15,8 +15,8 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.systems.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo_state import ServoConfig
-from weldcal.welding.touch import touch_start_pose
+from weldcal.welding.servo.state import ServoConfig
+from weldcal.welding.servo.touch import touch_start_pose
 
 from .cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 

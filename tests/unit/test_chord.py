@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from weldcal.welding.chord import (
+from weldcal.welding.servo.chord import (
     ChordMotion,
     UnknownLaw,
     chord_axes,

@@ -11,11 +11,11 @@ from pydrake.math import RigidTransform
 from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import StudyRun, simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
-from weldcal.welding.feel_start import feel_start_step, with_touch_place
 from weldcal.welding.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
-from weldcal.welding.servo_state import (
+from weldcal.welding.servo.feel_start import feel_start_step, with_touch_place
+from weldcal.welding.servo.state import (
     Measurement,
     Phase,
     ServoConfig,

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from weldcal.welding.guard import (
+from weldcal.welding.servo.guards import (
     ArmGuardConfig,
     GuardError,
     SlewLimits,
@@ -16,7 +16,7 @@ from weldcal.welding.guard import (
     seam_conditioning,
     slew_limit,
 )
-from weldcal.welding.lsq import box_least_squares
+from weldcal.welding.servo.lsq import box_least_squares
 
 DT = 0.002
 LIMITS = SlewLimits(speed=1.0, acceleration=4.0, jerk=80.0)

@@ -11,9 +11,9 @@ from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs, corner
 from weldcal.tools.studies.weld_rows import Case
 from weldcal.tools.studies.weld_study import study_config
-from weldcal.welding.chord import UnknownLaw
-from weldcal.welding.laws import LAWS, get_law, literal_tangent
 from weldcal.welding.seam.refinement import RefinedSeam
+from weldcal.welding.servo.chord import UnknownLaw
+from weldcal.welding.servo.laws import LAWS, get_law, literal_tangent
 from weldcal.welding.vectors import Array
 
 STRAIGHT = arcs((0.10, 0.0), spacing=2e-3)

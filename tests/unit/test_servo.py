@@ -17,8 +17,7 @@ from weldcal.tools.studies.groove import SEAT_M as SEAT
 from weldcal.tools.studies.seams import s_curve
 from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo import welding_step
-from weldcal.welding.servo_state import (
+from weldcal.welding.servo.state import (
     DeflectionSample,
     Phase,
     ServoConfig,
@@ -28,7 +27,8 @@ from weldcal.welding.servo_state import (
     TouchConfig,
     WeldingState,
 )
-from weldcal.welding.touch import touch_start_pose
+from weldcal.welding.servo.step import welding_step
+from weldcal.welding.servo.touch import touch_start_pose
 
 from .weld_kinematics import Run, l_curve, straight, weld
 

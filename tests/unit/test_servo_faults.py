@@ -16,9 +16,9 @@ from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError
-from weldcal.welding.servo import welding_step
-from weldcal.welding.servo_state import DeflectionSample, Phase, ServoConfig, ServoSample, TouchConfig, WeldingState
-from weldcal.welding.touch import touch_start_pose
+from weldcal.welding.servo.state import DeflectionSample, Phase, ServoConfig, ServoSample, TouchConfig, WeldingState
+from weldcal.welding.servo.step import welding_step
+from weldcal.welding.servo.touch import touch_start_pose
 
 CONFIG = ServoConfig()
 UP = np.array([0.0, 0.0, 1.0])

@@ -12,8 +12,8 @@ from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
 from weldcal.welding.process import path_error
-from weldcal.welding.servo_state import Phase, ServoConfig, ServoConfigError, ToolGeometry
-from weldcal.welding.weave import WeaveConfig, WeaveError, weave_at
+from weldcal.welding.servo.state import Phase, ServoConfig, ServoConfigError, ToolGeometry
+from weldcal.welding.servo.weave import WeaveConfig, WeaveError, weave_at
 
 MM = 1e-3
 

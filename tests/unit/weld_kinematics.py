@@ -11,7 +11,7 @@ from weldcal.tools.studies.budgets import NOMINAL, Budget
 from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs, corner
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo_state import Phase, ServoConfig, WeldingCommand, WeldingState
+from weldcal.welding.servo.state import Phase, ServoConfig, WeldingCommand, WeldingState
 from weldcal.welding.vectors import Array
 
 

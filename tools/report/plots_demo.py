@@ -10,7 +10,7 @@ from weldcal.tools.outcome import WeldOutcome
 from weldcal.tools.report.plots_weld import OURS, ROBOT, THEIRS, TRUTH, Array, WeldTrace, plain, svg
 from weldcal.welding.process import path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo_state import Phase, ServoConfig
+from weldcal.welding.servo.state import Phase, ServoConfig
 
 
 def convergence(status: CalibrationStatus, required_m: float) -> bytes:

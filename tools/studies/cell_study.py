@@ -20,7 +20,7 @@ from weldcal.tools.demo import DemoOptions, DemoResult, known_camera, measure
 from weldcal.tools.outcome import FeltSeam, felt_seam
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.simulation import Progress, no_progress, run_cell
-from weldcal.welding.laws import get_law
+from weldcal.welding.servo.laws import get_law
 
 Array = NDArray[np.float64]
 # (figure, worst or mean over the runs, limit, unit); a real-time factor is a lower bound

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from weldcal.tools.studies.plant import PHASES, StudyRun
 from weldcal.welding.process import ProcessLogError, path_error, speed_statistics
 from weldcal.welding.seam.chord_map import chord_map
-from weldcal.welding.servo_state import Phase
+from weldcal.welding.servo.state import Phase
 from weldcal.welding.vectors import Array
 
 _WELDING = [PHASES.index(p) for p in (Phase.TRACK, Phase.COAST, Phase.FINISH)]

@@ -10,7 +10,7 @@ from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.studies.plant import PHASES, StudyRun
 from weldcal.welding.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map
-from weldcal.welding.servo_state import Phase, ServoConfig
+from weldcal.welding.servo.state import Phase, ServoConfig
 
 _EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s
 _BENT_RAD = math.radians(1.0)  # a surface whose normal turns by less is flat

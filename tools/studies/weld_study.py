@@ -13,7 +13,7 @@ from weldcal.tools.studies.plant import StudyRun, simulate
 from weldcal.tools.studies.seams import get_seam
 from weldcal.tools.studies.weld_rows import Case, Row, Target
 from weldcal.welding.seam.feasibility import SeamWindows
-from weldcal.welding.servo_state import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
 
 Progress = Callable[[str, float], None]
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from pydrake.math import RigidTransform
 
-from weldcal.welding.servo_state import ServoConfig
+from weldcal.welding.servo.state import ServoConfig
 from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 

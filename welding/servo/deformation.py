@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import InputError
-from weldcal.welding.tag_edges import corners_from_sides
+from weldcal.welding.servo.tag_edges import corners_from_sides
 from weldcal.welding.vectors import Array, pose
 
 _DICTIONARIES = {

@@ -14,8 +14,8 @@ from weldcal.models.errors import InputError
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.seam.plan_fit import PlanFit, PlanFitConfig
 from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam, RefinementConfig
+from weldcal.welding.servo.weave import WeaveConfig
 from weldcal.welding.vectors import Array
-from weldcal.welding.weave import WeaveConfig
 
 
 class ServoConfigError(InputError):

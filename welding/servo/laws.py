@@ -10,13 +10,13 @@ from typing import Literal
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.welding.chord import UnknownLaw
-from weldcal.welding.guard import seam_conditioning
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.refinement import RefinedSeam
-from weldcal.welding.servo_state import ServoConfig, WeldingState
-from weldcal.welding.tool_axes import height_share, roll_rate, tool_axes
-from weldcal.welding.track import Motion, TorchTarget, guarded_motion
+from weldcal.welding.servo.chord import UnknownLaw
+from weldcal.welding.servo.guards import seam_conditioning
+from weldcal.welding.servo.state import ServoConfig, WeldingState
+from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
+from weldcal.welding.servo.track import Motion, TorchTarget, guarded_motion
 from weldcal.welding.vectors import Array, clip, cross, dot, unit
 
 _OMEGA_CEILING = 100.0  # rad/s; an unguarded law asks for thousands, no robot turns by more than this in a tick
