@@ -23,7 +23,7 @@ from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job
 from weldcal.systems.scenario_numbers import check_numbers
 from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
 from weldcal.welding.locate.planning import PlanningMethod
-from weldcal.welding.process import WeldProcess
+from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05

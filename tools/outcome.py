@@ -13,7 +13,14 @@ from pydrake.systems.framework import Context
 from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
-from weldcal.welding.process import PathError, SpeedStatistics, WeldProcess, path_error, speed_along, speed_statistics
+from weldcal.welding.record.process import (
+    PathError,
+    SpeedStatistics,
+    WeldProcess,
+    path_error,
+    speed_along,
+    speed_statistics,
+)
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Phase
 

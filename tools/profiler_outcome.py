@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.systems.profiler_cell import ProfilerCell, ProfilerRun
 from weldcal.systems.profiler_estimates import pose_sigmas
-from weldcal.welding.process import path_error
+from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]

@@ -17,9 +17,9 @@ from weldcal.systems.welding_velocity_servo import PHASE_CODES
 from weldcal.tools.outcome import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.simulation import Run
-from weldcal.welding.process import speed_along, torch_angles
+from weldcal.welding.record.process import speed_along, torch_angles
+from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.servo.state import Phase
-from weldcal.welding.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 
 PHASE_NAMES = [str(phase) for phase in Phase]
 

@@ -25,7 +25,7 @@ from weldcal.tools.demo import DemoOptions, DemoResult, measure, run_scenario, r
 from weldcal.tools.outcome import calibration_error
 from weldcal.tools.simulation import run_cell
 from weldcal.tools.studies.cell_study import figures
-from weldcal.welding.weld_log import load_weld_log
+from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.
 TOLD = """

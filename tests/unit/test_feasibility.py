@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from weldcal.tools.studies.seams import arcs, s_curve
-from weldcal.welding.process import ProcessLogError, path_error, speed_statistics, torch_events
+from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics, torch_events
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible

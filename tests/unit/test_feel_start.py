@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import StudyRun, simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
-from weldcal.welding.process import path_error
+from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.servo.feel_start import feel_start_step, with_touch_place

@@ -15,7 +15,7 @@ from weldcal.tools.studies.budgets import HARD, NOMINAL, PERFECT
 from weldcal.tools.studies.groove import DROP_M as DROP
 from weldcal.tools.studies.groove import SEAT_M as SEAT
 from weldcal.tools.studies.seams import s_curve
-from weldcal.welding.process import PathError, SpeedStatistics, path_error, speed_statistics
+from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import (
     DeflectionSample,

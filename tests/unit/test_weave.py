@@ -11,7 +11,7 @@ import pytest
 from weldcal.tools.studies.budgets import NOMINAL
 from weldcal.tools.studies.plant import simulate
 from weldcal.tools.studies.seams import TrueSeam, arcs
-from weldcal.welding.process import path_error
+from weldcal.welding.record.process import path_error
 from weldcal.welding.servo.state import Phase, ServoConfig, ServoConfigError, ToolGeometry
 from weldcal.welding.servo.weave import WeaveConfig, WeaveError, weave_at
 

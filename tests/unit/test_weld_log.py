@@ -12,8 +12,8 @@ import pytest
 
 from weldcal.models.errors import InputError
 from weldcal.tools.outcome import new_ticks
-from weldcal.welding.process import WeldProcess
-from weldcal.welding.weld_log import (
+from weldcal.welding.record.process import WeldProcess
+from weldcal.welding.record.weld_log import (
     COLUMNS,
     NAMES,
     WeldLogError,

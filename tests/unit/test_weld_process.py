@@ -10,7 +10,7 @@ from pydrake.math import RollPitchYaw
 
 from weldcal.models.errors import InputError
 from weldcal.systems.scenario import load_scenario
-from weldcal.welding.process import EFFICIENCY, ProcessLogError, WeldProcess, speed_along, torch_angles
+from weldcal.welding.record.process import EFFICIENCY, ProcessLogError, WeldProcess, speed_along, torch_angles
 
 
 @pytest.mark.parametrize(("name", "k"), [("MAG", 0.8), ("TIG", 0.6), ("SAW", 1.0)])

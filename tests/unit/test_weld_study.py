@@ -19,7 +19,7 @@ from weldcal.tools.studies.seams import NAMES, UnknownSeam, get_seam
 from weldcal.tools.studies.turns import run_turn
 from weldcal.tools.studies.weld_rows import ROWS, Case, Target, UnknownRow, get_rows
 from weldcal.tools.studies.weld_study import CaseResult, hold_against, run_case
-from weldcal.welding.process import path_error
+from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 
 MM = 1e-3

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.tools.outcome import WeldOutcome
 from weldcal.tools.report.plots_weld import OURS, ROBOT, THEIRS, TRUTH, Array, WeldTrace, plain, svg
-from weldcal.welding.process import path_error, speed_along, torch_angles
+from weldcal.welding.record.process import path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Phase, ServoConfig
 

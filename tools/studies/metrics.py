@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.tools.studies.plant import PHASES, StudyRun
-from weldcal.welding.process import ProcessLogError, path_error, speed_statistics
+from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo.state import Phase
 from weldcal.welding.vectors import Array

@@ -8,7 +8,7 @@ import numpy as np
 
 from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.studies.plant import PHASES, StudyRun
-from weldcal.welding.process import path_error, speed_along
+from weldcal.welding.record.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo.state import Phase, ServoConfig
 

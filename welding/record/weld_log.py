@@ -18,7 +18,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import InputError
-from weldcal.welding.process import WeldProcess
+from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.vectors import Array
 
 SCHEMA, VERSION = "weldcal weld log", 1

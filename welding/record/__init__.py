@@ -1,0 +1,1 @@
+"""What a weld was: process, heat input and the weld log."""
