@@ -30,7 +30,7 @@ from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.operator_panel import OperatorPanel
 from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.process_switch import ProcessSwitch
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter

@@ -17,7 +17,7 @@ from weldcal.models.tool import WeldingTool
 from weldcal.systems.job_sequencer import PHASES, JobState
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, PlannedSeam, Scan
 from weldcal.systems.phase_labels import add_phase_label
-from weldcal.systems.scenario import VisualizationConfig
+from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import Station
 from weldcal.systems.weld_view import WeldView
 from weldcal.systems.welding_velocity_servo import ServoReport

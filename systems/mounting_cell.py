@@ -25,7 +25,7 @@ from weldcal.systems.mounting_calibrator import MountingCalibrator, MountingFitC
 from weldcal.systems.mounting_messages import MountingState, MountingStatus
 from weldcal.systems.mounting_procedure import MountingProcedure
 from weldcal.systems.pose_recorder import PoseRecorder
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.welding.servo.guards import SlewLimits

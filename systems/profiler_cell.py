@@ -21,7 +21,7 @@ from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_room import Room
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.welding.servo.guards import SlewLimits

@@ -29,7 +29,7 @@ from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.tablet_world import tablet_fittings
 from weldcal.systems.messages import Message
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.tablet_messages import TabletTruth
 
 

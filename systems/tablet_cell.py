@@ -23,7 +23,7 @@ from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.pose_recorder import PoseRecorder
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.tablet_messages import TabletTruth, WristPicture

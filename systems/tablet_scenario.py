@@ -11,7 +11,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 
 if TYPE_CHECKING:
-    from weldcal.systems.scenario import Scenario
+    from weldcal.systems.scenario.schema import Scenario
 
 MOST_LANDMARKS = 100
 STEEPEST_DEG = 45.0  # of a pen that still touches with its tip and not with its side

@@ -35,7 +35,7 @@ def live(
     folder = out or fresh_folder("hand-eye", Path(scenario).stem, seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("hand-eye live") as progress:
         from weldcal.models.errors import InputError
-        from weldcal.systems.scenario import load_scenario
+        from weldcal.systems.scenario.schema import load_scenario
         from weldcal.tools.demo import DemoOptions
         from weldcal.tools.mounting_live import run_mounting_live
 

@@ -34,7 +34,7 @@ def live(
     scenario = name or scenario
     folder = out or fresh_folder("profiler-live", scenario, seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("profiler live") as progress:
-        from weldcal.systems.scenario import load_scenario
+        from weldcal.systems.scenario.schema import load_scenario
         from weldcal.tools.demo import DemoOptions
         from weldcal.tools.profiler_live import run_profiler_live, run_profiler_seeds
 

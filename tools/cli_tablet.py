@@ -145,7 +145,7 @@ def demo(
     from weldcal.tools.cli_options import finish, fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
-        from weldcal.systems.scenario import load_scenario
+        from weldcal.systems.scenario.schema import load_scenario
         from weldcal.tools.demo import DemoOptions
         from weldcal.tools.tablet_demo import run_tablet_demo
 

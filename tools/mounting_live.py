@@ -24,7 +24,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.mounting_calibrator import solve_mounting
 from weldcal.systems.mounting_cell import FOOT, MountingRun, make_mounting_cell, run_mounting_cell
-from weldcal.systems.scenario import Scenario, check_scenario
+from weldcal.systems.scenario.schema import Scenario, check_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.hand_eye import HandEyeReport

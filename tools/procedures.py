@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from weldcal.systems.scenario import Scenario, load_scenario
+from weldcal.systems.scenario.schema import Scenario, load_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions, run_calibration_live, run_scenario
 from weldcal.tools.mounting_live import run_mounting_live

@@ -21,7 +21,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.profiler_cell import ProfilerCell, ProfilerRun, make_profiler_cell, run_profiler_cell
 from weldcal.systems.profiler_estimates import Taken
-from weldcal.systems.scenario import Scenario, check_scenario
+from weldcal.systems.scenario.schema import Scenario, check_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.profiler_outcome import LiveOutcome, PathOutcome, PoseOutcome, live_outcome

@@ -15,7 +15,7 @@ from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur_rtde import UrRtde
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.pacing import draw_in_this_thread
 from weldcal.tools.ur_emulator.process import HOST as EMULATOR_HOST
 from weldcal.tools.ur_emulator.process import emulator_process

@@ -17,7 +17,7 @@ from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
 from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.scenario import Scenario, check_scenario
+from weldcal.systems.scenario.schema import Scenario, check_scenario
 from weldcal.systems.tablet_cell import TabletCell, TabletVisit, make_tablet_cell
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions

@@ -42,7 +42,7 @@ from weldcal.systems.tablet_scenario import TabletConfig
 from weldcal.systems.textured_board import textured_board
 
 if TYPE_CHECKING:
-    from weldcal.systems.scenario import Scenario
+    from weldcal.systems.scenario.schema import Scenario
 
 _TEXELS_PER_MM = 8
 _PEN_MASS_KG = 0.02

@@ -10,7 +10,7 @@ import pytest
 
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
-from weldcal.systems.scenario import Scenario, load_scenario
+from weldcal.systems.scenario.schema import Scenario, load_scenario
 from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario
 from weldcal.tools.robots import chosen_robot
 from weldcal.tools.ur_emulator.process import Emulator, emulator_process

@@ -19,7 +19,7 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.cell import job_plan, make_cell
 from weldcal.systems.clear_moves import clear_poses
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.scenario import SCENARIO_FOLDER, Scenario, load_scenario
+from weldcal.systems.scenario.schema import SCENARIO_FOLDER, Scenario, load_scenario
 from weldcal.tools.calibrate import calibrate_dataset
 from weldcal.tools.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.outcome import calibration_error

@@ -19,7 +19,7 @@ from weldcal.systems.mounting_calibrator import solve_mounting
 from weldcal.systems.mounting_cell import MountingRun, make_mounting_cell, mounting_scene, run_mounting_cell
 from weldcal.systems.mounting_messages import MountingState, MountingStatus
 from weldcal.systems.mounting_procedure import MountingProcedure
-from weldcal.systems.scenario import Scenario, load_scenario
+from weldcal.systems.scenario.schema import Scenario, load_scenario
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.mounting_live import MountingReport, run_mounting_live
 from weldcal.tools.procedures import kind_of

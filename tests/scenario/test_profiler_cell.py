@@ -21,7 +21,7 @@ from weldcal.systems.pose_recorder import PoseHistory
 from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.profiler_room import Room
 from weldcal.systems.profiler_scenario import ProfilerJob
-from weldcal.systems.scenario import load_scenario
+from weldcal.systems.scenario.schema import load_scenario
 from weldcal.tools.cli import app
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.procedures import runner_of

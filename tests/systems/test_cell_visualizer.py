@@ -22,7 +22,7 @@ from weldcal.systems.cell_visualizer import ALL_PHASES, ROOT, CellVisualizer
 from weldcal.systems.job_sequencer import PHASES, JobState
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
 from weldcal.systems.phase_labels import TEXT, label_image
-from weldcal.systems.scenario import VisualizationConfig
+from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.weld_gauge import gauge_picture
 from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.welding.seam.curve import SeamCurve

@@ -12,7 +12,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 
 from .cells import Q_HOME, Drive, the_arm

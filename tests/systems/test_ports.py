@@ -69,7 +69,7 @@ from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_room import Room
 from weldcal.systems.profiler_scenario import ProfilerJob
-from weldcal.systems.scenario import VisualizationConfig, load_scenario
+from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
 from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.singularity_guard import SingularityGuard
 from weldcal.systems.slew_limiter import SlewLimiter

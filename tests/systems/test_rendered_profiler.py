@@ -23,7 +23,7 @@ from weldcal.systems.drivers.rendered_profiler import RayFan, RenderedProfiler, 
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_scenario import ProfilerJob
-from weldcal.systems.scenario import load_scenario
+from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import make_station
 
 from .cells import Q_HOME, the_arm

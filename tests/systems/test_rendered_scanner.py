@@ -36,7 +36,7 @@ from weldcal.systems.drivers.rendered_scanner import (
 from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
-from weldcal.systems.scenario import load_scenario
+from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import make_station
 
 from .cells import Q_HOME, the_arm

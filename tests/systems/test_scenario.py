@@ -15,8 +15,8 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
-from weldcal.systems.scenario import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
-from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.systems.scenario.numbers import check_numbers
+from weldcal.systems.scenario.schema import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.

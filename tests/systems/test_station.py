@@ -19,7 +19,7 @@ from weldcal.systems.drivers.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Image, JobCommand, Scan
-from weldcal.systems.scenario import Scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, apply_driver_config, make_station
 
 from .cells import EXACT_PLATE, Q_HOME, TOOL, Drive, plain_station, scenario, the_arm, weld_only_cell

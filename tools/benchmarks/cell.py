@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
-from weldcal.systems.scenario import load_scenario
+from weldcal.systems.scenario.schema import load_scenario
 from weldcal.tools.demo import DemoOptions, run_scenario
 from weldcal.tools.simulation import Progress, no_progress
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.scenario import load_scenario, scenario_names
+from weldcal.systems.scenario.schema import load_scenario, scenario_names
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.mounting_live import MountingReport, run_mounting_live

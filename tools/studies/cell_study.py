@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import make_cell
-from weldcal.systems.scenario import Scenario, scenario_names
+from weldcal.systems.scenario.schema import Scenario, scenario_names
 from weldcal.tools.console import plain
 from weldcal.tools.demo import DemoOptions, DemoResult, known_camera, measure
 from weldcal.tools.outcome import FeltSeam, felt_seam

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.simulated_ur import SimulatedUr
-from weldcal.systems.scenario import Scenario, check_scenario, load_scenario
+from weldcal.systems.scenario.schema import Scenario, check_scenario, load_scenario
 from weldcal.tools.outcome import calibration_error, calibration_status
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.simulation import Progress, no_progress, run_cell

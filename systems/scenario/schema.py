@@ -20,7 +20,7 @@ from weldcal.systems.drivers.simulated_ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.mounting_scenario import MountingJob, check_mounting
 from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job
-from weldcal.systems.scenario_numbers import check_numbers
+from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
