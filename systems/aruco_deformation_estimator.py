@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import FingerCamera, WeldingTool
 from weldcal.systems.messages import Image, Message
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag
 from weldcal.welding.servo.state import DeflectionSample
 

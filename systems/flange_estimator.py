@@ -16,7 +16,7 @@ from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 
 # The poses are planned so that the whole feature is in sight; where it is not, something stands in between and the rim ends wrongly.
 LIVE_FIT = FlangeFitConfig(min_coverage=0.85)

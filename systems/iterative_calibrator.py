@@ -25,7 +25,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 
 
 @dc.dataclass(frozen=True)

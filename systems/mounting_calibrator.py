@@ -26,8 +26,8 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.mounting_messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
-from weldcal.systems.pose_recorder import PoseHistory
 
 Array = NDArray[np.float64]
 

@@ -20,13 +20,13 @@ from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.second_arm import SECOND
-from weldcal.systems.flange_mover import FlangeMover
+from weldcal.systems.motion.flange_mover import FlangeMover
+from weldcal.systems.motion.pose_recorder import PoseRecorder
+from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.mounting_calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.mounting_messages import MountingState, MountingStatus
 from weldcal.systems.mounting_procedure import MountingProcedure
-from weldcal.systems.pose_recorder import PoseRecorder
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.welding.servo.guards import SlewLimits
 

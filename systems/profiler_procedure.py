@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
 from weldcal.systems.messages import JobCommand, Message, UrStatus
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.profiler_estimates import (
     EdgeFound,
     SeamFound,

@@ -16,15 +16,15 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED, MOVE_TIMEOUT_S, Wiring, panel
-from weldcal.systems.clear_moves import check_way_home, clear_move
-from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.flange_mover import FlangeMover
-from weldcal.systems.pose_recorder import PoseRecorder
+from weldcal.systems.motion.clear_moves import check_way_home, clear_move
+from weldcal.systems.motion.command_arbiter import CommandArbiter
+from weldcal.systems.motion.flange_mover import FlangeMover
+from weldcal.systems.motion.pose_recorder import PoseRecorder
+from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.tablet_messages import TabletTruth, WristPicture
 from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState

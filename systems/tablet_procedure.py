@@ -12,7 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
 from weldcal.systems.messages import JobCommand, Message, UrStatus
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from weldcal.systems.cell import Cell, job_plan
 from weldcal.systems.drivers.rendered_finger_camera import StreamingColourCamera
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import Scan
-from weldcal.systems.operator_panel import PACE_SLIDER
+from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
 
 Progress = Callable[[str, float], None]

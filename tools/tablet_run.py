@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
-from weldcal.systems.operator_panel import PACE_SLIDER
+from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.systems.tablet_cell import TabletCell, TabletVisit
 from weldcal.systems.tablet_procedure import TabletState
 from weldcal.tools.console import Progress

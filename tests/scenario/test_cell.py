@@ -17,8 +17,8 @@ from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.cell import job_plan, make_cell
-from weldcal.systems.clear_moves import clear_poses
 from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.motion.clear_moves import clear_poses
 from weldcal.systems.scenario.schema import SCENARIO_FOLDER, Scenario, load_scenario
 from weldcal.tools.calibrate import calibrate_dataset
 from weldcal.tools.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result

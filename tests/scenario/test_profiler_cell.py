@@ -17,7 +17,7 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch, drawn_pose
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.profiler_room import Room
 from weldcal.systems.profiler_scenario import ProfilerJob

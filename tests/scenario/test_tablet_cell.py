@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import make_cell
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import Station
 from weldcal.systems.tablet_cell import make_tablet_cell, plan_tablet

@@ -25,7 +25,7 @@ from weldcal.systems.iterative_calibrator import (
     verify_at,
 )
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 
 from .cells import Q_HOME, TOOL, Drive, plain_station, the_arm
 

@@ -13,10 +13,10 @@ from pydrake.systems.framework import LeafSystem
 
 from weldcal.models.arms.kinematics import forward_kinematics, kinematics_and_jacobian
 from weldcal.systems.aruco_deformation_estimator import Deformation
-from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.messages import JobCommand, PlannedSeam, UrStatus
-from weldcal.systems.singularity_guard import SingularityGuard
-from weldcal.systems.slew_limiter import SlewLimiter
+from weldcal.systems.motion.command_arbiter import CommandArbiter
+from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.guards import SlewLimits

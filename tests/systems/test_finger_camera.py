@@ -19,7 +19,7 @@ from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimato
 from weldcal.systems.drivers.picture_worker import Finish, Pixels
 from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
 from weldcal.systems.messages import Image
-from weldcal.systems.pose_recorder import PoseHistory
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, tag_cells
 
 from .cells import Q_HOME, TOOL, Drive, plain_station, scenario, the_arm

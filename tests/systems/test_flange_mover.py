@@ -11,8 +11,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Integrator, VectorLogSink
 
-from weldcal.systems.flange_mover import FlangeMover, move_duration, quintic
 from weldcal.systems.messages import JobCommand
+from weldcal.systems.motion.flange_mover import FlangeMover, move_duration, quintic
 
 from .cells import Q_HOME
 

@@ -27,7 +27,6 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.cell_visualizer import CellVisualizer
-from weldcal.systems.command_arbiter import CommandArbiter
 from weldcal.systems.drivers.picture_scene import PicturePoses
 from weldcal.systems.drivers.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair
@@ -46,7 +45,6 @@ from weldcal.systems.drivers.simulated_tablet import SimulatedTablet, TabletDigi
 from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur_rtde import UrRtdeArm
 from weldcal.systems.flange_estimator import FlangeEstimator
-from weldcal.systems.flange_mover import FlangeMover
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
 from weldcal.systems.job_sequencer import JobPlan, JobSequencer, JobState
 from weldcal.systems.messages import (
@@ -58,21 +56,23 @@ from weldcal.systems.messages import (
     Scan,
     UrStatus,
 )
+from weldcal.systems.motion.command_arbiter import CommandArbiter
+from weldcal.systems.motion.flange_mover import FlangeMover
+from weldcal.systems.motion.operator_panel import OperatorPanel
+from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
+from weldcal.systems.motion.process_switch import ProcessSwitch
+from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.mounting_calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.mounting_cell import mounting_scene
 from weldcal.systems.mounting_messages import MountingState, MountingStatus
 from weldcal.systems.mounting_procedure import MountingProcedure
-from weldcal.systems.operator_panel import OperatorPanel
-from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
-from weldcal.systems.process_switch import ProcessSwitch
 from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_room import Room
 from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
 from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
-from weldcal.systems.singularity_guard import SingularityGuard
-from weldcal.systems.slew_limiter import SlewLimiter
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.tablet_cell import plan_tablet
 from weldcal.systems.tablet_messages import TabletTouch, WristPicture

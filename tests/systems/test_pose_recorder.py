@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import SymbolicVectorSystem
 
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.pose_recorder import PoseHistory, PoseRecorder
+from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 
 from .cells import Q_HOME, the_arm
 

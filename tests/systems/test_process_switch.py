@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 from weldcal.systems.cell import Cell
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import JobCommand, UrStatus
-from weldcal.systems.process_switch import ProcessSwitch
+from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
