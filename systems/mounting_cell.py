@@ -19,7 +19,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED
 from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.second_arm import SECOND
+from weldcal.systems.drivers.simulated.second_arm import SECOND
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.motion.slew_limiter import SlewLimiter

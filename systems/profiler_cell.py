@@ -13,7 +13,7 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import JERK_LIMIT
-from weldcal.systems.drivers.rendered_profiler import RenderedProfiler, drawn_pose
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.flange_mover import FlangeMover

@@ -18,7 +18,7 @@ from weldcal.calibration.profiler.sphere.arc import find_arc
 from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
-from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.messages import Message
 from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.welding.seam.curve import SeamCurve

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.drivers.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
+from weldcal.systems.drivers.simulated.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.profiler_estimates import (

@@ -16,7 +16,7 @@ from weldcal.models.arms.kinematics import LINKS, ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
-from weldcal.systems.drivers.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
+from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
 from weldcal.systems.profiler_scenario import ProfilerJob, pose_of
 
 Array = NDArray[np.float64]

@@ -20,14 +20,14 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.profiler_fixture import draw_fixture
-from weldcal.systems.drivers.profiler_world import ProfilerFixture, ProfilerTruth
-from weldcal.systems.drivers.rendered_profiler import RenderedProfiler, drawn_pose
-from weldcal.systems.drivers.rendered_scanner import random_pose_error
-from weldcal.systems.drivers.second_arm import PlacedArm, apply_second_robot, place_second_arm
-from weldcal.systems.drivers.simulated_world import SimulatedWorld, build_world
+from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, ProfilerTruth
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
+from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated.second_arm import PlacedArm, apply_second_robot, place_second_arm
+from weldcal.systems.drivers.simulated.tablet_world import tablet_fittings
+from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
-from weldcal.systems.drivers.tablet_world import tablet_fittings
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.tablet_messages import TabletTruth

@@ -17,7 +17,7 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED, MOVE_TIMEOUT_S, Wiring, panel
 from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
+from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.motion.clear_moves import check_way_home, clear_move
 from weldcal.systems.motion.command_arbiter import CommandArbiter

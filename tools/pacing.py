@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from weldcal.systems.drivers.picture_worker import PICTURE_THREAD
+from weldcal.systems.drivers.simulated.picture_worker import PICTURE_THREAD
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY
 
 LATE_S = 0.020  # of the Diagram's time

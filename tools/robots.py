@@ -11,7 +11,7 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur_rtde import UrRtde

@@ -11,7 +11,7 @@ from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.systems.cell import Cell, feature_standard
-from weldcal.systems.drivers.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.welding_velocity_servo import PHASE_CODES
 from weldcal.tools.outcome import WeldOutcome, columns

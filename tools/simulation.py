@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, job_plan
-from weldcal.systems.drivers.rendered_finger_camera import StreamingColourCamera
+from weldcal.systems.drivers.simulated.rendered_finger_camera import StreamingColourCamera
 from weldcal.systems.job_sequencer import JobState
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER

@@ -12,9 +12,9 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 
 if TYPE_CHECKING:
-    from weldcal.systems.drivers.profiler_world import ProfilerFixture
-    from weldcal.systems.drivers.simulated_world import SimulatedWorld
-    from weldcal.systems.drivers.tablet_world import TabletFittings
+    from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
+    from weldcal.systems.drivers.simulated.tablet_world import TabletFittings
+    from weldcal.systems.drivers.simulated.world import SimulatedWorld
 
 
 class Closable(Protocol):

@@ -11,12 +11,12 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.calibration.published.algorithm1 import COST_AXES, named_cost
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
-from weldcal.systems.drivers.rendered_profiler import RenderedProfiler
-from weldcal.systems.drivers.rendered_scanner import RenderedScanner
-from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
-from weldcal.systems.drivers.simulated_tablet import SimulatedTablet
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
+from weldcal.systems.drivers.simulated.tablet import SimulatedTablet
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.mounting_scenario import MountingJob, check_mounting
 from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job

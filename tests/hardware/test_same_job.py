@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.scenario.schema import Scenario, load_scenario
 from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario
 from weldcal.tools.robots import chosen_robot

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, Diagram, EventStatus, InputPort, 
 
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenario
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY, LOOP_PRIORITY
 from weldcal.systems.drivers.ur_rtde import UrRtde
 from weldcal.systems.messages import UrStatus

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch, drawn_pose
+from weldcal.systems.drivers.simulated.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch, drawn_pose
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState

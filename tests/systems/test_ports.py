@@ -27,11 +27,11 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.cell_visualizer import CellVisualizer
-from weldcal.systems.drivers.picture_scene import PicturePoses
-from weldcal.systems.drivers.profiler_fixture import draw_fixture
-from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair
-from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
-from weldcal.systems.drivers.rendered_profiler import (
+from weldcal.systems.drivers.simulated.picture_scene import PicturePoses
+from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
+from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
+from weldcal.systems.drivers.simulated.rendered_profiler import (
     CheatTorch,
     ProfilerSensor,
     ProfileScan,
@@ -39,10 +39,10 @@ from weldcal.systems.drivers.rendered_profiler import (
     TorchTouch,
     TouchSensor,
 )
-from weldcal.systems.drivers.rendered_scanner import DepthSensor
-from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera, WristCamera
-from weldcal.systems.drivers.simulated_tablet import SimulatedTablet, TabletDigitizer
-from weldcal.systems.drivers.simulated_ur import SimulatedUr, SpeedJointServo
+from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
+from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
+from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
+from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur_rtde import UrRtdeArm
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator

@@ -17,9 +17,9 @@ from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.workpieces import make_workpiece
-from weldcal.systems.drivers.profiler_fixture import draw_fixture
-from weldcal.systems.drivers.profiler_world import ProfilerFixture
-from weldcal.systems.drivers.rendered_profiler import RayFan, RenderedProfiler, drawn_pose, measured_profile
+from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
+from weldcal.systems.drivers.simulated.rendered_profiler import RayFan, RenderedProfiler, drawn_pose, measured_profile
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_scenario import ProfilerJob

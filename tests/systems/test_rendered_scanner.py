@@ -25,15 +25,15 @@ from pydrake.systems.sensors import ImageDepth32F
 
 from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.drivers.picture_scene import PictureScene
-from weldcal.systems.drivers.rendered_scanner import (
+from weldcal.systems.drivers.simulated.picture_scene import PictureScene
+from weldcal.systems.drivers.simulated.rendered_scanner import (
     ApplyDriverConfig,
     DepthSensor,
     RenderedScanner,
     darkness,
     random_pose_error,
 )
-from weldcal.systems.drivers.simulated_world import SCANNER_RENDERER
+from weldcal.systems.drivers.simulated.world import SCANNER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 from weldcal.systems.scenario.schema import load_scenario

@@ -12,11 +12,12 @@ from pydrake.systems.primitives import VectorLogSink
 
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers import rendered_finger_camera, rendered_scanner, simulated_ur
 from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.rendered_finger_camera import RenderedFingerCamera
-from weldcal.systems.drivers.rendered_scanner import RenderedScanner
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.simulated import rendered_finger_camera, rendered_scanner
+from weldcal.systems.drivers.simulated import ur as simulated_ur
+from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Image, JobCommand, Scan
 from weldcal.systems.scenario.schema import Scenario

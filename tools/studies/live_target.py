@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from weldcal.systems.cell import make_cell, work_point
-from weldcal.systems.drivers.simulated_ur import SimulatedUr
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.scenario.schema import Scenario, check_scenario, load_scenario
 from weldcal.tools.outcome import calibration_error, calibration_status
 from weldcal.tools.report.pictures import svg

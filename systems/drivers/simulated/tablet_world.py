@@ -33,10 +33,10 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
-from weldcal.systems.drivers.rendered_scanner import random_pose_error
-from weldcal.systems.drivers.rendered_wrist_camera import RenderedWristCamera
-from weldcal.systems.drivers.simulated_tablet import GLASS, NIB, SimulatedTablet
-from weldcal.systems.drivers.simulated_world import DARK, STEEL
+from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
+from weldcal.systems.drivers.simulated.tablet import GLASS, NIB, SimulatedTablet
+from weldcal.systems.drivers.simulated.world import DARK, STEEL
 from weldcal.systems.tablet_messages import TabletTruth
 from weldcal.systems.tablet_scenario import TabletConfig
 from weldcal.systems.textured_board import textured_board

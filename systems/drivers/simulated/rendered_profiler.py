@@ -14,7 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
-from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Message
 from weldcal.systems.profiler_scenario import pose_of

@@ -25,7 +25,7 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
-from weldcal.systems.drivers.simulated_world import SimulatedWorld
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 

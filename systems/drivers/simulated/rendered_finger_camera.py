@@ -22,7 +22,7 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
-from weldcal.systems.drivers.picture_worker import Draw, PictureWorker, Pixels
+from weldcal.systems.drivers.simulated.picture_worker import Draw, PictureWorker, Pixels
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Image, Message
 

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.workpieces import Workpiece
-from weldcal.systems.drivers.profiler_world import (
+from weldcal.systems.drivers.simulated.profiler_world import (
     ProfilerFixture,
     ProfilerTruth,
     box_mesh,
@@ -14,7 +14,7 @@ from weldcal.systems.drivers.profiler_world import (
     straightedge_mesh,
     under_straightedge,
 )
-from weldcal.systems.drivers.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.profiler_scenario import ProfilerJob, pose_of
 
 

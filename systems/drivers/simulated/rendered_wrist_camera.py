@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
-from weldcal.systems.drivers.picture_scene import add_picture_scene
+from weldcal.systems.drivers.simulated.picture_scene import add_picture_scene
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.tablet_messages import WristPicture
 

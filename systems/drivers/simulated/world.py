@@ -49,9 +49,9 @@ from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
-from weldcal.systems.drivers.picture_scene import PictureScene, add_picture_scene
-from weldcal.systems.drivers.profiler_world import ProfilerFixture, TouchPair, add_fixture
-from weldcal.systems.drivers.second_arm import PlacedArm, add_second_arm
+from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
+from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 from weldcal.systems.textured_board import textured_board
 from weldcal.welding.servo.deformation import TagModel, tag_cells

@@ -1,0 +1,1 @@
+"""Simulated devices and the world they act in."""
