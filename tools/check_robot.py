@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import typer
 
-from weldcal.systems.drivers.ur.preflight import Check, Preflight
+from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight
 
 WIDEST = 100
 MARKS = {"ok": typer.colors.GREEN, "to change": typer.colors.RED, "not checked": typer.colors.YELLOW}

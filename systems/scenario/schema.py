@@ -17,7 +17,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
-from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.mounting_scenario import MountingJob, check_mounting
 from weldcal.systems.profiler_scenario import ProfilerJob, check_profiler_job
 from weldcal.systems.scenario.numbers import check_numbers

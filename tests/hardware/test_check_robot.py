@@ -20,12 +20,12 @@ import pytest
 from tests.hardware.emulator_process import Emulator, emulator_process
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur import preflight as module
 from weldcal.systems.drivers.ur.dashboard import ask, stop_program
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import SENTENCES
-from weldcal.systems.drivers.ur.kinematics_info import KinematicsInfo, read_kinematics
-from weldcal.systems.drivers.ur.preflight import CHECKS, Preflight, preflight, require_ready
+from weldcal.systems.drivers.ur.readiness import preflight as module
+from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo, read_kinematics
+from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
 from weldcal.tools.check_robot import emit_table
 from weldcal.tools.ur_emulator.main import HOME

@@ -17,8 +17,8 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.off_switch import MASK, VALUE
 from weldcal.systems.drivers.ur.robot import guard_script
+from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
-from weldcal.systems.drivers.ur_rtde import PrepareRobot, UrRtde
 from weldcal.systems.station import make_station
 from weldcal.tools.benchmarks.fault_bench import Bench
 from weldcal.tools.benchmarks.robot_faults import recover

@@ -17,7 +17,7 @@ from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenari
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY, LOOP_PRIORITY
-from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.station import make_station
 from weldcal.tools.pacing import WallClock

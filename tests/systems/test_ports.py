@@ -43,7 +43,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
-from weldcal.systems.drivers.ur_rtde import UrRtdeArm
+from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.flange_estimator import FlangeEstimator
 from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
 from weldcal.systems.job_sequencer import JobPlan, JobSequencer, JobState

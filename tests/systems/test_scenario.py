@@ -14,7 +14,7 @@ from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
-from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
 

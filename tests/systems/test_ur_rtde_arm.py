@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 from tests.systems.still_link import StillLink
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur_rtde import UrRtdeArm
+from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 
 Q = np.array([0.0, -1.4, 1.9, -2.1, -1.6, 0.0])
 

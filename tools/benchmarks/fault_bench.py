@@ -18,8 +18,8 @@ from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
-from weldcal.systems.drivers.ur.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur_rtde import UrRtde
+from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.tools.ur_emulator.main import HOME
 from weldcal.tools.ur_emulator.process import Emulator
 

@@ -21,7 +21,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
-from weldcal.systems.drivers.ur_rtde import PrepareRobot, UrRtde, UrRtdeArm
+from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
 from weldcal.tools.benchmarks.robot_faults import LOADED
 from weldcal.tools.console import plain
 from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority

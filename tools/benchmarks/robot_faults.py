@@ -17,7 +17,7 @@ import numpy as np
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur_rtde import PrepareRobot, UrRtde
+from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.tools.benchmarks.fault_bench import SPEED_M_S, Bench, StoppedUnasked
 from weldcal.tools.benchmarks.fault_cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
 from weldcal.tools.benchmarks.fault_sequences import Sequence, run_sequence

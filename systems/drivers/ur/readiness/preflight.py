@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur import remedies
 from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.kinematics_info import (
+from weldcal.systems.drivers.ur.readiness import operator_actions as remedies
+from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KINEMATICS_TOLERANCE_M,
     KINEMATICS_TOLERANCE_RAD,
     KinematicsInfo,
@@ -26,7 +26,7 @@ from weldcal.systems.drivers.ur.kinematics_info import (
     cross_check,
     read_kinematics,
 )
-from weldcal.systems.drivers.ur.releases import POLYSCOPE_X, is_supported, upper_range_works
+from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported, upper_range_works
 from weldcal.systems.drivers.ur.rtde_wire import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
-from weldcal.systems.drivers.ur.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.messages import UrStatus
 
