@@ -15,14 +15,16 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator
-from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner
 from weldcal.systems.cell_visualizer import add_visualizer
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.station_build import PreparedRobot
-from weldcal.systems.flange_estimator import FlangeEstimator
-from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
-from weldcal.systems.job_sequencer import JobPlan, JobSequencer
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
+from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner
+from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
+from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig, IterativeCalibrator
+from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
+from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.motion.clear_moves import check_way_home, clear_poses, station_bodies
 from weldcal.systems.motion.command_arbiter import CommandArbiter
@@ -33,9 +35,7 @@ from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.station import Station, make_station
-from weldcal.systems.welding_velocity_servo import ServoReport, WeldingVelocityServo
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
 

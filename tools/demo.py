@@ -13,8 +13,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 
 from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.systems.next_scan import next_scan
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, check_scenario, load_scenario
 from weldcal.tools.outcome import (
     CalibrationError,

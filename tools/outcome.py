@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
-from weldcal.systems.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
 from weldcal.welding.record.process import (
     PathError,
     SpeedStatistics,

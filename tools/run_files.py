@@ -12,8 +12,8 @@ from weldcal.calibration.data.results import CalibrationResult, PoseRecord, expo
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.systems.cell import Cell, feature_standard
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.systems.welding_velocity_servo import PHASE_CODES
 from weldcal.tools.outcome import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.simulation import Run

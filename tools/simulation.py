@@ -16,7 +16,7 @@ from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, job_plan
 from weldcal.systems.drivers.simulated.rendered_finger_camera import StreamingColourCamera
-from weldcal.systems.job_sequencer import JobState
+from weldcal.systems.jobs.weld.sequencer import JobState
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority

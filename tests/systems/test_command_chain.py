@@ -12,12 +12,12 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
 from weldcal.models.arms.kinematics import forward_kinematics, kinematics_and_jacobian
-from weldcal.systems.aruco_deformation_estimator import Deformation
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
+from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import JobCommand, PlannedSeam, UrStatus
 from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
-from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import DeflectionSample, ServoConfig

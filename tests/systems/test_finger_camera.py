@@ -15,9 +15,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import CameraInfo
 
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation, measure_deformation
 from weldcal.systems.drivers.simulated.picture_worker import Finish, Pixels
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import (
+    ArucoDeformationEstimator,
+    Deformation,
+    measure_deformation,
+)
 from weldcal.systems.messages import Image
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, tag_cells

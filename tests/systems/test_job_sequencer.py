@@ -13,10 +13,10 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
-from weldcal.systems.calibration_pose_planner import NextPose
-from weldcal.systems.job_sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
+from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
-from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.tools.simulation import SHARES
 from weldcal.welding.seam.curve import SeamCurve
 

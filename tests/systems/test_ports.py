@@ -24,8 +24,6 @@ from tests.systems.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
-from weldcal.systems.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
-from weldcal.systems.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.cell_visualizer import CellVisualizer
 from weldcal.systems.drivers.simulated.picture_scene import PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
@@ -44,9 +42,13 @@ from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWris
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
-from weldcal.systems.flange_estimator import FlangeEstimator
-from weldcal.systems.iterative_calibrator import CalibratorConfig, IterativeCalibrator
-from weldcal.systems.job_sequencer import JobPlan, JobSequencer, JobState
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
+from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
+from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
+from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig, IterativeCalibrator
+from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
+from weldcal.systems.jobs.weld.sequencer import JobPlan, JobSequencer, JobState
+from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import (
     CalibrationStatus,
     FlangeEstimate,
@@ -72,12 +74,10 @@ from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_room import Room
 from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
-from weldcal.systems.seam_planner import DrawnSeamPlanner, SeamPlanner
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.tablet_cell import plan_tablet
 from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 from weldcal.systems.tablet_procedure import TabletProcedure, TabletState
-from weldcal.systems.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig
 

@@ -13,10 +13,10 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from weldcal.systems.cell import Cell
-from weldcal.systems.job_sequencer import JobState
+from weldcal.systems.jobs.weld.sequencer import JobState
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.motion.process_switch import ProcessSwitch
-from weldcal.systems.welding_velocity_servo import ServoReport
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
 from .cells import Q_HOME, weld_only_cell

@@ -11,8 +11,8 @@ from pydrake.systems.analysis import Simulator
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.cell import servo_config
+from weldcal.systems.jobs.weld.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.systems.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import ServoConfig

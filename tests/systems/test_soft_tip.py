@@ -12,8 +12,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import kinematics_and_jacobian
 from weldcal.models.errors import InputError
-from weldcal.systems.aruco_deformation_estimator import measure_deformation
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import measure_deformation
 from weldcal.welding.servo.deformation import TagModel
 
 from .cells import Q_HOME, TOOL, Drive, plain_station

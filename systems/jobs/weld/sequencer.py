@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.systems.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus
-from weldcal.systems.welding_velocity_servo import ServoReport
 
 AT_HOME_RAD = 0.01  # an arm that stands this near to home begins the job from where it is
 

@@ -1,0 +1,1 @@
+"""The main job: calibrate, verify, scan the workpiece, plan the seam, weld."""
