@@ -22,8 +22,8 @@ from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
 from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.mounting_calibrator import solve_mounting
-from weldcal.systems.mounting_cell import FOOT, MountingRun, make_mounting_cell, run_mounting_cell
+from weldcal.systems.jobs.mounting.calibrator import solve_mounting
+from weldcal.systems.jobs.mounting.cell import FOOT, MountingRun, make_mounting_cell, run_mounting_cell
 from weldcal.systems.scenario.schema import Scenario, check_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions

@@ -20,7 +20,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
-from weldcal.systems.mounting_cell import MountingRun
+from weldcal.systems.jobs.mounting.cell import MountingRun
 
 Array = NDArray[np.float64]
 

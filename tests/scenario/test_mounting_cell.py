@@ -14,11 +14,11 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from weldcal.models.errors import InputError
+from weldcal.systems.jobs.mounting.calibrator import solve_mounting
+from weldcal.systems.jobs.mounting.cell import MountingRun, make_mounting_cell, mounting_scene, run_mounting_cell
+from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.mounting_calibrator import solve_mounting
-from weldcal.systems.mounting_cell import MountingRun, make_mounting_cell, mounting_scene, run_mounting_cell
-from weldcal.systems.mounting_messages import MountingState, MountingStatus
-from weldcal.systems.mounting_procedure import MountingProcedure
 from weldcal.systems.scenario.schema import Scenario, load_scenario
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.mounting_live import MountingReport, run_mounting_live

@@ -42,6 +42,10 @@ from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWris
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
+from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
+from weldcal.systems.jobs.mounting.cell import mounting_scene
+from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
@@ -65,10 +69,6 @@ from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
-from weldcal.systems.mounting_calibrator import MountingCalibrator, MountingFitConfig
-from weldcal.systems.mounting_cell import mounting_scene
-from weldcal.systems.mounting_messages import MountingState, MountingStatus
-from weldcal.systems.mounting_procedure import MountingProcedure
 from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.profiler_robot_error import RobotError
 from weldcal.systems.profiler_room import Room

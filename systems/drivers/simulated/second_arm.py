@@ -16,7 +16,7 @@ from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.mounting_scenario import SecondArm
+from weldcal.systems.jobs.mounting.config import SecondArm
 
 SECOND = "ur10e_2"
 """Prefix of its ports, as `ur10e` is the first one's."""

@@ -20,12 +20,12 @@ from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.simulated.second_arm import SECOND
+from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
+from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.motion.slew_limiter import SlewLimiter
-from weldcal.systems.mounting_calibrator import MountingCalibrator, MountingFitConfig
-from weldcal.systems.mounting_messages import MountingState, MountingStatus
-from weldcal.systems.mounting_procedure import MountingProcedure
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.welding.servo.guards import SlewLimits

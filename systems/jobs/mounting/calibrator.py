@@ -24,10 +24,10 @@ from weldcal.calibration.planning.mounting_poses import MountingPose, informatio
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.jobs.mounting.messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.systems.mounting_messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
 
 Array = NDArray[np.float64]
 

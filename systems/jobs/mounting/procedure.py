@@ -12,8 +12,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.calibration.planning.mounting_poses import MountingPose
+from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.messages import JobCommand, UrStatus
-from weldcal.systems.mounting_messages import MountingState, MountingStatus
 
 Array = NDArray[np.float64]
 

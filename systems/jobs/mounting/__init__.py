@@ -1,0 +1,1 @@
+"""Calibration of a scanner in any mounting, live."""
