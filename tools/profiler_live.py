@@ -19,8 +19,8 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import InputError
-from weldcal.systems.profiler_cell import ProfilerCell, ProfilerRun, make_profiler_cell, run_profiler_cell
-from weldcal.systems.profiler_estimates import Taken
+from weldcal.systems.jobs.profiler.cell import ProfilerCell, ProfilerRun, make_profiler_cell, run_profiler_cell
+from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.scenario.schema import Scenario, check_scenario
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions

@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
 from weldcal.calibration.profiler.result import ProfilerEstimate
-from weldcal.systems.profiler_cell import ProfilerCell, ProfilerRun
-from weldcal.systems.profiler_estimates import pose_sigmas
+from weldcal.systems.jobs.profiler.cell import ProfilerCell, ProfilerRun
+from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 

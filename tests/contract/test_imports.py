@@ -22,7 +22,13 @@ FILES = {
 }
 
 # Where the simulation's truth may be spoken of: where it is made, and where it is handed on to reports.
-TRUTH_IS_KNOWN = ("systems/drivers/", "systems/station.py", "systems/cell.py", "systems/profiler_cell.py", "tools/")
+TRUTH_IS_KNOWN = (
+    "systems/drivers/",
+    "systems/station.py",
+    "systems/cell.py",
+    "systems/jobs/profiler/cell.py",
+    "tools/",
+)
 
 LONGEST_FILE = 500
 

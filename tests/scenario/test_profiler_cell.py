@@ -16,11 +16,11 @@ from weldcal.calibration.profiler.record import load_record
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch, drawn_pose
+from weldcal.systems.jobs.profiler.config import ProfilerJob
+from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
-from weldcal.systems.profiler_room import Room
-from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.tools.cli import app
 from weldcal.tools.demo import DemoOptions

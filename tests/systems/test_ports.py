@@ -46,6 +46,10 @@ from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, Mountin
 from weldcal.systems.jobs.mounting.cell import mounting_scene
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.jobs.profiler.config import ProfilerJob
+from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
+from weldcal.systems.jobs.profiler.robot_error import RobotError
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
@@ -69,10 +73,6 @@ from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
-from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
-from weldcal.systems.profiler_robot_error import RobotError
-from weldcal.systems.profiler_room import Room
-from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.tablet_cell import plan_tablet

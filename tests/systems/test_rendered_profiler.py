@@ -20,9 +20,9 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.rendered_profiler import RayFan, RenderedProfiler, drawn_pose, measured_profile
+from weldcal.systems.jobs.profiler.config import ProfilerJob
+from weldcal.systems.jobs.profiler.robot_error import RobotError
 from weldcal.systems.messages import JobCommand
-from weldcal.systems.profiler_robot_error import RobotError
-from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import make_station
 

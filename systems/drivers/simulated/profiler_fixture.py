@@ -15,7 +15,7 @@ from weldcal.systems.drivers.simulated.profiler_world import (
     under_straightedge,
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
-from weldcal.systems.profiler_scenario import ProfilerJob, pose_of
+from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 
 
 def draw_fixture(

@@ -12,8 +12,8 @@ from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia, UnitInertia
 
 from weldcal.models.mesh import TriMesh, revolve
+from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
-from weldcal.systems.profiler_scenario import ProfilerJob
 
 Array = NDArray[np.float64]
 TIP_RADIUS_M = 2e-5  # of the point that touches: a hundredth of a millimetre is below what any figure shows

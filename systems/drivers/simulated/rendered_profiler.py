@@ -16,8 +16,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.jobs.profiler.config import pose_of
 from weldcal.systems.messages import Message
-from weldcal.systems.profiler_scenario import pose_of
 
 Array = NDArray[np.float64]
 FORCE_N = 0.02  # from here on a touch is felt

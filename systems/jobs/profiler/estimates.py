@@ -19,8 +19,8 @@ from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, sph
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
+from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
-from weldcal.systems.profiler_scenario import ProfilerJob
 from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]

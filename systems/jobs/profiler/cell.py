@@ -15,13 +15,13 @@ from weldcal.models.errors import InputError
 from weldcal.systems.cell import JERK_LIMIT
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
+from weldcal.systems.jobs.profiler.robot_error import RobotError
 from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.motion.slew_limiter import SlewLimiter
-from weldcal.systems.profiler_procedure import ProfilerProcedure, ProfilerState
-from weldcal.systems.profiler_robot_error import RobotError
-from weldcal.systems.profiler_room import Room
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.welding.servo.guards import SlewLimits

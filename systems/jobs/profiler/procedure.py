@@ -14,9 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.simulated.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
-from weldcal.systems.messages import JobCommand, Message, UrStatus
-from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.systems.profiler_estimates import (
+from weldcal.systems.jobs.profiler.estimates import (
     EdgeFound,
     SeamFound,
     SphereFound,
@@ -27,8 +25,10 @@ from weldcal.systems.profiler_estimates import (
     find_sphere,
     sphere_sigmas,
 )
-from weldcal.systems.profiler_plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
-from weldcal.systems.profiler_room import Room
+from weldcal.systems.jobs.profiler.plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
+from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.messages import JobCommand, Message, UrStatus
+from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]

@@ -17,7 +17,7 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
-from weldcal.systems.profiler_scenario import ProfilerJob, pose_of
+from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 
 Array = NDArray[np.float64]
 STEP_RAD = 0.1  # along a move, between places that are looked at

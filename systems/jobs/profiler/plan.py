@@ -21,9 +21,9 @@ from weldcal.calibration.profiler.plan import (
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
+from weldcal.systems.jobs.profiler.config import edge_as_thought
+from weldcal.systems.jobs.profiler.planning_context import Room
 from weldcal.systems.messages import Message
-from weldcal.systems.profiler_room import Room
-from weldcal.systems.profiler_scenario import edge_as_thought
 from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]

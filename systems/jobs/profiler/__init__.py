@@ -1,0 +1,1 @@
+"""Calibration of a laser profiler by an edge or a sphere, live, and a seam measured with it."""
