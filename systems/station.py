@@ -28,9 +28,9 @@ from weldcal.systems.drivers.simulated.second_arm import PlacedArm, apply_second
 from weldcal.systems.drivers.simulated.tablet_world import tablet_fittings
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
+from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.tablet_messages import TabletTruth
 
 
 @dc.dataclass(frozen=True, eq=False)

@@ -17,8 +17,8 @@ from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
 from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit, make_tablet_cell
 from weldcal.systems.scenario.schema import Scenario, check_scenario
-from weldcal.systems.tablet_cell import TabletCell, TabletVisit, make_tablet_cell
 from weldcal.tools.console import Progress
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.report.render import write_atomic

@@ -12,7 +12,7 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.tablet_cell import TabletCell, TabletVisit
+from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit
 from weldcal.tools.report.render import write_atomic
 
 

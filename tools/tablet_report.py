@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
 from weldcal.calibration.tablet.result import TabletResult
-from weldcal.systems.tablet_cell import TabletCell, TabletVisit
+from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, render
 

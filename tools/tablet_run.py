@@ -11,9 +11,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
+from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit
+from weldcal.systems.jobs.tablet.procedure import TabletState
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
-from weldcal.systems.tablet_cell import TabletCell, TabletVisit
-from weldcal.systems.tablet_procedure import TabletState
 from weldcal.tools.console import Progress
 from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
 

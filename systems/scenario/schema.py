@@ -20,8 +20,8 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
 from weldcal.systems.jobs.profiler.config import ProfilerJob, check_profiler_job
+from weldcal.systems.jobs.tablet.config import TabletConfig, check_tablet
 from weldcal.systems.scenario.numbers import check_numbers
-from weldcal.systems.tablet_scenario import TabletConfig, check_tablet
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.servo.laws import get_law

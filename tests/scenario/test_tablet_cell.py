@@ -14,13 +14,13 @@ from pydrake.systems.analysis import Simulator
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import make_cell
+from weldcal.systems.jobs.tablet.cell import make_tablet_cell, plan_tablet
+from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import Station
-from weldcal.systems.tablet_cell import make_tablet_cell, plan_tablet
-from weldcal.systems.tablet_messages import TabletTouch, WristPicture
-from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.tools.demo import DemoOptions, known_camera
 from weldcal.tools.procedures import kind_of, run_procedure
 

@@ -50,6 +50,9 @@ from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.jobs.profiler.planning_context import Room
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.jobs.profiler.robot_error import RobotError
+from weldcal.systems.jobs.tablet.cell import plan_tablet
+from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
@@ -75,9 +78,6 @@ from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
 from weldcal.systems.station import CheatPoses
-from weldcal.systems.tablet_cell import plan_tablet
-from weldcal.systems.tablet_messages import TabletTouch, WristPicture
-from weldcal.systems.tablet_procedure import TabletProcedure, TabletState
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig
 

@@ -13,7 +13,7 @@ from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, Rgbd
 
 from weldcal.systems.drivers.simulated.picture_scene import add_picture_scene
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.tablet_messages import WristPicture
+from weldcal.systems.jobs.tablet.messages import WristPicture
 
 RENDERER = "wrist"
 _NEAR_M, _FAR_M = 0.05, 2.0

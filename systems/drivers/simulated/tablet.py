@@ -11,7 +11,7 @@ from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.systems.framework import Context, LeafSystem, State
 
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.tablet_messages import TabletTouch
+from weldcal.systems.jobs.tablet.messages import TabletTouch
 
 GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two geometries that touch
 

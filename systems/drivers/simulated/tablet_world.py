@@ -37,8 +37,8 @@ from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet import GLASS, NIB, SimulatedTablet
 from weldcal.systems.drivers.simulated.world import DARK, STEEL
-from weldcal.systems.tablet_messages import TabletTruth
-from weldcal.systems.tablet_scenario import TabletConfig
+from weldcal.systems.jobs.tablet.config import TabletConfig
+from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.textured_board import textured_board
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.systems.tablet_messages import TabletTouch, WristPicture
 
 Array = NDArray[np.float64]
 

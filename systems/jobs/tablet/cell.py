@@ -19,6 +19,9 @@ from weldcal.systems.cell import JERK_LIMIT, MOVE_ACCELERATION, MOVE_SPEED, MOVE
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.jobs.tablet.config import TabletConfig
+from weldcal.systems.jobs.tablet.messages import TabletTruth, WristPicture
+from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.motion.clear_moves import check_way_home, clear_move
 from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.flange_mover import FlangeMover
@@ -26,9 +29,6 @@ from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
-from weldcal.systems.tablet_messages import TabletTruth, WristPicture
-from weldcal.systems.tablet_procedure import TabletPlan, TabletProcedure, TabletState
-from weldcal.systems.tablet_scenario import TabletConfig
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig
 

@@ -1,0 +1,1 @@
+"""A visit to a tablet: one look, then a touch of each landmark."""
