@@ -15,7 +15,6 @@ from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.systems.cell_visualizer import add_visualizer
 from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
@@ -36,6 +35,7 @@ from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
+from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
 

@@ -18,13 +18,13 @@ from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
 from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.cell import Cell, make_cell
-from weldcal.systems.cell_visualizer import ALL_PHASES, ROOT, CellVisualizer
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
-from weldcal.systems.phase_labels import TEXT, label_image
 from weldcal.systems.scenario.schema import VisualizationConfig
-from weldcal.systems.weld_gauge import gauge_picture
+from weldcal.systems.viewer.cell_visualizer import ALL_PHASES, ROOT, CellVisualizer
+from weldcal.systems.viewer.phase_labels import TEXT, label_image
+from weldcal.systems.viewer.weld_gauge import gauge_picture
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
 

@@ -24,7 +24,6 @@ from tests.systems.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
-from weldcal.systems.cell_visualizer import CellVisualizer
 from weldcal.systems.drivers.simulated.picture_scene import PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
@@ -78,6 +77,7 @@ from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
 from weldcal.systems.station import CheatPoses
+from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig
 

@@ -17,10 +17,10 @@ from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, PlannedSeam, Scan
-from weldcal.systems.phase_labels import add_phase_label
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import Station
-from weldcal.systems.weld_view import WeldView
+from weldcal.systems.viewer.phase_labels import add_phase_label
+from weldcal.systems.viewer.weld_view import WeldView
 
 ROOT = "/weldcal"
 CLOUD, CIRCLE, BELIEF = Rgba(0.95, 0.80, 0.25, 0.9), Rgba(0.90, 0.15, 0.35, 1.0), Rgba(0.10, 0.70, 0.55, 0.35)

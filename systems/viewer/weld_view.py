@@ -13,11 +13,11 @@ from weldcal.models.outline import outline
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
-from weldcal.systems.phase_labels import HEIGHT_M as SIGN_HEIGHT_M
-from weldcal.systems.phase_labels import WIDTH_M as SIGN_WIDTH_M
-from weldcal.systems.phase_labels import X_WS, label_image
 from weldcal.systems.textured_board import textured_board
-from weldcal.systems.weld_gauge import HEIGHT_PX, WIDTH_PX, gauge_picture
+from weldcal.systems.viewer.phase_labels import HEIGHT_M as SIGN_HEIGHT_M
+from weldcal.systems.viewer.phase_labels import WIDTH_M as SIGN_WIDTH_M
+from weldcal.systems.viewer.phase_labels import X_WS, label_image
+from weldcal.systems.viewer.weld_gauge import HEIGHT_PX, WIDTH_PX, gauge_picture
 
 Array = NDArray[np.float64]
 PLANNED, REFINED, TORCH = Rgba(0.55, 0.55, 0.60, 1.0), Rgba(0.15, 0.45, 0.90, 1.0), Rgba(0.95, 0.45, 0.10, 1.0)

@@ -1,0 +1,1 @@
+"""What the cell believes, drawn in Meshcat."""
