@@ -15,8 +15,8 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.pacing import draw_in_this_thread
 from weldcal.tools.ur_emulator.process import HOST as EMULATOR_HOST
 from weldcal.tools.ur_emulator.process import emulator_process
 

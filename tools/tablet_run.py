@@ -14,8 +14,8 @@ from pydrake.systems.sensors import RgbdSensor
 from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit
 from weldcal.systems.jobs.tablet.procedure import TabletState
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
+from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
 from weldcal.tools.console import Progress
-from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
 
 LOOK_PERIOD_S = 0.02  # between looks at the procedure
 PANEL_PERIOD_S = 0.1

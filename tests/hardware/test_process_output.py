@@ -19,10 +19,10 @@ from weldcal.systems.drivers.ur.off_switch import MASK, VALUE
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
+from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
 from weldcal.tools.benchmarks.fault_bench import Bench
 from weldcal.tools.benchmarks.robot_faults import recover
-from weldcal.tools.pacing import WallClock
 from weldcal.tools.ur_emulator.controller import Controller
 from weldcal.tools.ur_emulator.main import HOME
 from weldcal.tools.ur_emulator.modes import RuntimeState

@@ -17,7 +17,7 @@ from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
-from weldcal.tools.simulation import SHARES
+from weldcal.systems.runner import SHARES
 from weldcal.welding.seam.curve import SeamCurve
 
 from .cells import Q_HOME

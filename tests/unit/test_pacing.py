@@ -6,7 +6,7 @@ import gc
 
 import pytest
 
-from weldcal.tools.pacing import LATE_S, WallClock, no_long_garbage_collections
+from weldcal.systems.pacing import LATE_S, WallClock, no_long_garbage_collections
 
 
 class FakeTime:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import pairwise
 from pathlib import Path
 
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.tools.demo import DemoOptions, run_scenario
-from weldcal.tools.simulation import Progress, no_progress
 
 SEAM_MM = 100.0
 

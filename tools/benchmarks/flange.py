@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.simulation import Progress, no_progress
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange_frames import Frame, facing, flange_frame
 
 Array = NDArray[np.float64]

@@ -27,8 +27,8 @@ from weldcal.calibration.hand_eye.solve import (
     solve_problem,
 )
 from weldcal.models.errors import InputError, WeldcalError
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.benchmarks.hand_eye_fuzz import fuzz
-from weldcal.tools.simulation import Progress, no_progress
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose, random
 from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
 from weldcal.models.errors import WeldcalError
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.hand_eye import solve_pairs
-from weldcal.tools.simulation import Progress, no_progress
 
 Array = NDArray[np.float64]
 

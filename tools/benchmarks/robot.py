@@ -22,11 +22,11 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
+from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.benchmarks.robot_faults import LOADED
 from weldcal.tools.console import plain
-from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.simulation import Progress, no_progress
 from weldcal.tools.ur_emulator.process import HOST, emulator_process
 
 RATE_HZ = 125.0

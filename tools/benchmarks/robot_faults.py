@@ -18,13 +18,13 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
+from weldcal.systems.pacing import no_long_garbage_collections
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.benchmarks.fault_bench import SPEED_M_S, Bench, StoppedUnasked
 from weldcal.tools.benchmarks.fault_cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
 from weldcal.tools.benchmarks.fault_sequences import Sequence, run_sequence
 from weldcal.tools.console import plain
-from weldcal.tools.pacing import no_long_garbage_collections
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.simulation import Progress, no_progress
 from weldcal.tools.ur_emulator.process import HOST, emulator_process
 
 OUTCOME_COLUMNS = (

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 from weldcal.models.scanners import SCANNERS
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.benchmarks.plan_trials import (
     FIRST_HELD_OUT,
     METHODS,
@@ -19,7 +20,6 @@ from weldcal.tools.benchmarks.plan_trials import (
 )
 from weldcal.tools.benchmarks.plan_troubles import run_troubles, trouble_rows
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.simulation import Progress, no_progress
 
 
 def run_seam_planning_benchmark(

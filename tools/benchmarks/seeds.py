@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.demo import DemoOptions, run_demo
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.simulation import Progress, no_progress
 
 COLUMNS = (
     "seed", "state", "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "expected_error_mm",

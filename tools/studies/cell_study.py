@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import make_cell
+from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.schema import Scenario, scenario_names
 from weldcal.tools.console import plain
 from weldcal.tools.demo import DemoOptions, DemoResult, known_camera, measure
 from weldcal.tools.outcome import FeltSeam, felt_seam
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.simulation import Progress, no_progress, run_cell
 from weldcal.welding.servo.laws import get_law
 
 Array = NDArray[np.float64]

@@ -19,8 +19,8 @@ from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.pictures import svg
-from weldcal.tools.simulation import Progress, no_progress
 from weldcal.tools.studies.flange_frames import facing
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.simulation import Progress, no_progress
+from weldcal.systems.runner import Progress, no_progress
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
-from weldcal.tools.simulation import Progress, no_progress
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange_frames import empty_frame, flange_frame
 
 Array = NDArray[np.float64]

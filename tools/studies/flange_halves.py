@@ -14,7 +14,7 @@ from scipy.stats import norm
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFit, fit_flange
 from weldcal.models.flanges import FlangeStandard
-from weldcal.tools.simulation import Progress, no_progress
+from weldcal.systems.runner import Progress, no_progress
 
 Array = NDArray[np.float64]
 

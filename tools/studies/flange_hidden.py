@@ -12,7 +12,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
-from weldcal.tools.simulation import Progress, no_progress
+from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange_frames import Frame, box, flange_frame, random_place
 
 Array = NDArray[np.float64]

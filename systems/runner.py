@@ -19,7 +19,7 @@ from weldcal.systems.drivers.simulated.rendered_finger_camera import StreamingCo
 from weldcal.systems.jobs.weld.sequencer import JobState
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
-from weldcal.tools.pacing import WallClock, no_long_garbage_collections, real_time_priority
+from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
 
 Progress = Callable[[str, float], None]
 # How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
