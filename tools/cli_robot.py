@@ -84,7 +84,7 @@ def emulate_ur(
 ) -> None:
     """A UR controller on loopback that executes the URScript it is sent; runs until it is interrupted."""
     with console.boundary(json_wanted=False, debug=debug):
-        from weldcal.tools.ur_emulator.main import run_emulator
+        from weldcal.tools.emulators.ur.main import run_emulator
 
         run_emulator(
             host=host,

@@ -17,8 +17,8 @@ from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_re
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.ur_emulator.process import HOST as EMULATOR_HOST
-from weldcal.tools.ur_emulator.process import emulator_process
+from weldcal.tools.emulators.ur.process import HOST as EMULATOR_HOST
+from weldcal.tools.emulators.ur.process import emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this they do beside other work

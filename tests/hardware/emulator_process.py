@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from weldcal.tools.ur_emulator.process import CONTROL_PORT, HOST, Emulator, emulator_process
+from weldcal.tools.emulators.ur.process import CONTROL_PORT, HOST, Emulator, emulator_process
 
 __all__ = ["CONTROL_PORT", "HOST", "Emulator", "emulator", "emulator_process", "run_client", "start_client"]
 

@@ -19,8 +19,8 @@ from tests.hardware.emulator_process import HOST, Emulator, emulator, emulator_p
 from tests.hardware.test_emulator_wire import calibrated, chain, kinematics_of, packages
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian, load_arm
 from weldcal.models.errors import InputError
-from weldcal.tools.ur_emulator.main import HOME
-from weldcal.tools.ur_emulator.poses import rotation_matrix
+from weldcal.tools.emulators.ur.controller.poses import rotation_matrix
+from weldcal.tools.emulators.ur.main import HOME
 
 __all__ = ["emulator"]
 

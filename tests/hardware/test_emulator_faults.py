@@ -16,7 +16,7 @@ import pytest
 from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import HOST, Emulator, emulator_process
 from weldcal.models.errors import InputError
-from weldcal.tools.ur_emulator.main import HOME
+from weldcal.tools.emulators.ur.main import HOME
 
 PORTS = {"rtde": 30004, "script": 30003, "primary": 30001, "secondary": 30002, "dashboard": 29999}
 SPEED_RAD_S = 0.1

@@ -12,7 +12,7 @@ import time
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.ur_emulator.process import emulator_process, lock_path
+from weldcal.tools.emulators.ur.process import emulator_process, lock_path
 
 # not the address of the other tests: these want to find it free, and taken by themselves
 ALONE = "127.0.0.9"
@@ -46,7 +46,7 @@ def test_a_taken_port_and_wrong_arguments_are_one_sentence() -> None:
 def test_the_emulator_ends_with_a_parent_that_is_killed() -> None:
     script = (
         "import os, time\n"
-        "from weldcal.tools.ur_emulator.process import emulator_process\n"
+        "from weldcal.tools.emulators.ur.process import emulator_process\n"
         f"with emulator_process(host={ALONE!r}) as made:\n"
         "    print(made.process.pid, flush=True)\n"
         "    time.sleep(60)\n"

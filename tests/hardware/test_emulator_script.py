@@ -15,14 +15,14 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arms.urdf import arm_urdf
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.main import HOME
-from weldcal.tools.ur_emulator.modes import RuntimeState, SafetyMode
-from weldcal.tools.ur_emulator.program import Program
-from weldcal.tools.ur_emulator.script_dynamics import Dynamics, mass_matrix
-from weldcal.tools.ur_emulator.script_lexer import split_programs
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
-from weldcal.tools.ur_emulator.versions import parse_version
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.script.dynamics import Dynamics, mass_matrix
+from weldcal.tools.emulators.ur.script.lexer import split_programs
+from weldcal.tools.emulators.ur.script.program import Program
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
+from weldcal.tools.emulators.ur.versions import parse_version
 
 
 def said_by(body: str, frames: int = 50) -> list[Any]:

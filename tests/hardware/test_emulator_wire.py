@@ -15,8 +15,8 @@ from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import HOST, Emulator, emulator_process
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.tools.ur_emulator.dh import dh_parameters
-from weldcal.tools.ur_emulator.rtde_fields import inputs, outputs
+from weldcal.tools.emulators.ur.controller.dh import dh_parameters
+from weldcal.tools.emulators.ur.wire.rtde_fields import inputs, outputs
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from weldcal.tools.benchmarks.fault_bench import Bench
 from weldcal.tools.benchmarks.fault_cases import AT_START, GO, REFUSE, RUNNING, STOP, Case
 from weldcal.tools.benchmarks.fault_sequences import run_sequence
 from weldcal.tools.benchmarks.robot_faults import FaultReport, recover, run_case
-from weldcal.tools.ur_emulator.process import emulator_process
+from weldcal.tools.emulators.ur.process import emulator_process
 
 CASES = [case for case in RUNNING + AT_START if case.short]
 

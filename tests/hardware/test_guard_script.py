@@ -9,10 +9,10 @@ import pytest
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.robot import guard_script
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.main import HOME
-from weldcal.tools.ur_emulator.modes import RuntimeState, SafetyMode
-from weldcal.tools.ur_emulator.versions import parse_version
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.versions import parse_version
 
 OBEYING, STALE, SILENT, TOO_FAST, MIXED = 1, 2, 3, 4, 5
 SPEED_J, MOVE_J, MOVE_L, SPEED_STOP, PAYLOAD, TCP, TCP_BACK, STOP = 9, 1, 3, 15, 17, 29, 40, 255

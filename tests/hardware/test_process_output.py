@@ -23,11 +23,11 @@ from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
 from weldcal.tools.benchmarks.fault_bench import Bench
 from weldcal.tools.benchmarks.robot_faults import recover
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.main import HOME
-from weldcal.tools.ur_emulator.modes import RuntimeState
-from weldcal.tools.ur_emulator.process import emulator_process
-from weldcal.tools.ur_emulator.versions import parse_version
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RuntimeState
+from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.versions import parse_version
 
 OUTPUT = 3
 HOST = "127.0.0.47"  # an address of its own: this module waits for no other

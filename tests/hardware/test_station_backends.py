@@ -21,7 +21,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
-from weldcal.tools.ur_emulator.process import emulator_process
+from weldcal.tools.emulators.ur.process import emulator_process
 
 # An address of its own: this module waits for no other.
 HOST = "127.0.0.42"

@@ -20,8 +20,8 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.tools.ur_emulator.main import HOME
-from weldcal.tools.ur_emulator.process import Emulator
+from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.process import Emulator
 
 Array = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.benchmarks.robot_faults import LOADED
 from weldcal.tools.console import plain
+from weldcal.tools.emulators.ur.process import HOST, emulator_process
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.ur_emulator.process import HOST, emulator_process
 
 RATE_HZ = 125.0
 READ_S = 0.002

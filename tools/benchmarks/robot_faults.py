@@ -24,8 +24,8 @@ from weldcal.tools.benchmarks.fault_bench import SPEED_M_S, Bench, StoppedUnaske
 from weldcal.tools.benchmarks.fault_cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
 from weldcal.tools.benchmarks.fault_sequences import Sequence, run_sequence
 from weldcal.tools.console import plain
+from weldcal.tools.emulators.ur.process import HOST, emulator_process
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.ur_emulator.process import HOST, emulator_process
 
 OUTCOME_COLUMNS = (
     "name", "must", "did", "fault", "rest_after_ms", "travel_mm", "seen_after_ms", "sentence", "played", "problems", "retries",

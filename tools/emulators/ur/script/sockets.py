@@ -10,10 +10,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from weldcal.tools.ur_emulator.motions import STEP_S
-from weldcal.tools.ur_emulator.script_compiler import Slices
-from weldcal.tools.ur_emulator.script_dynamics import Dynamics
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.script.compiler import Slices
+from weldcal.tools.emulators.ur.script.dynamics import Dynamics
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 OPEN_LIMIT_S = 0.02
 NAME = "socket_0"

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from weldcal.models.arms.kinematics import link_frames
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.modes import RobotMode, RuntimeState, safety_status_bits
-from weldcal.tools.ur_emulator.registers import N_BITS, N_NUMBERS
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, safety_status_bits
+from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS
 
 # struct codes (big endian) by RTDE type
 CODES = {

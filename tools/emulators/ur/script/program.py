@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from weldcal.tools.ur_emulator.script_compiler import SOURCE_NAME, Halted, Hooks, Slices, compile_program
-from weldcal.tools.ur_emulator.script_parser import parse_program
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
+from weldcal.tools.emulators.ur.script.compiler import SOURCE_NAME, Halted, Hooks, Slices, compile_program
+from weldcal.tools.emulators.ur.script.parser import parse_program
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 # How often a loop may turn within one 2 ms slice without giving it up; the real limit is time, this one repeats.
 LOOP_LIMIT = 4000

@@ -16,17 +16,17 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.ur_emulator.checker import Checker
-from weldcal.tools.ur_emulator.control_channel import ControlServer, World
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.dashboard import DashboardServer
-from weldcal.tools.ur_emulator.external_control import ExternalControl
-from weldcal.tools.ur_emulator.motions import STEP_S
-from weldcal.tools.ur_emulator.net import Network
-from weldcal.tools.ur_emulator.process import CONTROL_PORT, READY
-from weldcal.tools.ur_emulator.rtde_server import RtdeServer
-from weldcal.tools.ur_emulator.script_ports import PrimaryServer, RealTimeServer
-from weldcal.tools.ur_emulator.versions import parse_version
+from weldcal.tools.emulators.ur.checker import Checker
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
+from weldcal.tools.emulators.ur.versions import parse_version
+from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, World
+from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
+from weldcal.tools.emulators.ur.wire.external_control import ExternalControl
+from weldcal.tools.emulators.ur.wire.net import Network
+from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
+from weldcal.tools.emulators.ur.wire.script_ports import PrimaryServer, RealTimeServer
 
 PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, DASHBOARD_PORT = 30001, 30002, 30003, 30004, 29999
 # the elbow up, the tool down, away from every singularity
@@ -180,8 +180,8 @@ def _alive(process: int) -> bool:
 
 
 def main() -> None:
-    """Entry point of `python -m weldcal.tools.ur_emulator`."""
-    parser = argparse.ArgumentParser(prog="python -m weldcal.tools.ur_emulator", description=__doc__)
+    """Entry point of `python -m weldcal.tools.emulators.ur`."""
+    parser = argparse.ArgumentParser(prog="python -m weldcal.tools.emulators.ur", description=__doc__)
     parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
     parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
     parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")

@@ -6,11 +6,11 @@ import struct
 from collections.abc import Callable
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.dh import dh_parameters
-from weldcal.tools.ur_emulator.modes import RobotMode, RuntimeState, SafetyMode
-from weldcal.tools.ur_emulator.net import Connection, Server
-from weldcal.tools.ur_emulator.script_lexer import split_programs
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.dh import dh_parameters
+from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.script.lexer import split_programs
+from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
 STATE_PERIOD_FRAMES = 50  # 10 Hz
 STATE, MESSAGE = 16, 20

@@ -125,7 +125,7 @@ def emulator_process(
     Raises:
         InputError: the lock or a port is taken, or an argument is not one.
     """
-    command = [sys.executable, "-m", "weldcal.tools.ur_emulator", "--parent", str(os.getpid()), "--host", host]
+    command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", host]
     command += ["--control-port", str(control_port), "--polyscope", polyscope, "--pace", str(pace), "--seed", str(seed)]
     if q is not None:
         command += ["--q", *(repr(float(angle)) for angle in q)]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
-from weldcal.tools.ur_emulator.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
-from weldcal.tools.ur_emulator.poses import inverse, matrix, pose_of
+from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
+from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 OPENING = frozenset({"def", "thread", "sec", "if", "while"})
 KEYWORDS = OPENING | {

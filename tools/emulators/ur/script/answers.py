@@ -11,15 +11,15 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.errors import InputError
-from weldcal.tools.ur_emulator.motions import STEP_S, newton
-from weldcal.tools.ur_emulator.poses import inverse, matrix, pose_of
-from weldcal.tools.ur_emulator.registers import N_BITS, N_NUMBERS, Watchdog, register_index
-from weldcal.tools.ur_emulator.script_compiler import Pose
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
+from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
+from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
+from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
+from weldcal.tools.emulators.ur.script.compiler import Pose
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 if TYPE_CHECKING:
-    from weldcal.tools.ur_emulator.controller import Controller
-    from weldcal.tools.ur_emulator.program import Program
+    from weldcal.tools.emulators.ur.controller.core import Controller
+    from weldcal.tools.emulators.ur.script.program import Program
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.tools.ur_emulator.motions import (
+from weldcal.tools.emulators.ur.controller.motions import (
     STEP_S,
     JointVelocity,
     Motion,
@@ -17,9 +17,9 @@ from weldcal.tools.ur_emulator.motions import (
     joint_path,
     tool_path,
 )
-from weldcal.tools.ur_emulator.script_answers import positive, six
-from weldcal.tools.ur_emulator.script_compiler import Pose, Slices
-from weldcal.tools.ur_emulator.script_sockets import Sockets
+from weldcal.tools.emulators.ur.script.answers import positive, six
+from weldcal.tools.emulators.ur.script.compiler import Pose, Slices
+from weldcal.tools.emulators.ur.script.sockets import Sockets
 
 
 class Motions(Sockets):

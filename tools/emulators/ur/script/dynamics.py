@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, link_frames
-from weldcal.tools.ur_emulator.motions import Array
-from weldcal.tools.ur_emulator.poses import matrix
-from weldcal.tools.ur_emulator.script_answers import Answers, six
+from weldcal.tools.emulators.ur.controller.motions import Array
+from weldcal.tools.emulators.ur.controller.poses import matrix
+from weldcal.tools.emulators.ur.script.answers import Answers, six
 
 STEP_RAD = 1e-6  # of the central differences
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
-from weldcal.tools.ur_emulator.poses import pose_error, rotation_matrix, rotation_vector
+from weldcal.tools.emulators.ur.controller.poses import pose_error, rotation_matrix, rotation_vector
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.motions import STEP_S
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
 
 RECORD_FRAMES = 300_000  # ten minutes
 REST_RAD_S = 1e-3

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from weldcal.models.errors import InputError
-from weldcal.tools.ur_emulator.checker import Checker
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.dashboard import IDLE_PROGRAM
-from weldcal.tools.ur_emulator.external_control import CLIENT_PORT, ExternalControl
-from weldcal.tools.ur_emulator.modes import RobotMode, SafetyMode
-from weldcal.tools.ur_emulator.motions import STEP_S
-from weldcal.tools.ur_emulator.net import Connection, Network, Server
-from weldcal.tools.ur_emulator.rtde_server import RtdeServer
+from weldcal.tools.emulators.ur.checker import Checker
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
+from weldcal.tools.emulators.ur.wire.external_control import CLIENT_PORT, ExternalControl
+from weldcal.tools.emulators.ur.wire.net import Connection, Network, Server
+from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 
 Request = Mapping[str, Any]
 

@@ -10,14 +10,14 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from weldcal.tools.ur_emulator.script_answers import Answers
-from weldcal.tools.ur_emulator.script_dynamics import Dynamics
-from weldcal.tools.ur_emulator.script_motions import Motions
-from weldcal.tools.ur_emulator.script_sockets import Sockets
+from weldcal.tools.emulators.ur.script.answers import Answers
+from weldcal.tools.emulators.ur.script.dynamics import Dynamics
+from weldcal.tools.emulators.ur.script.motions import Motions
+from weldcal.tools.emulators.ur.script.sockets import Sockets
 
 if TYPE_CHECKING:
-    from weldcal.tools.ur_emulator.controller import Controller
-    from weldcal.tools.ur_emulator.program import Program
+    from weldcal.tools.emulators.ur.controller.core import Controller
+    from weldcal.tools.emulators.ur.script.program import Program
 
 BLOCKING = frozenset(
     {

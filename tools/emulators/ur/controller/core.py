@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.tools.ur_emulator.arm import EmulatedArm
-from weldcal.tools.ur_emulator.builtins import script_functions
-from weldcal.tools.ur_emulator.modes import POWERLESS, RobotMode, RuntimeState, SafetyMode
-from weldcal.tools.ur_emulator.motions import STEP_S, MotionRefused
-from weldcal.tools.ur_emulator.program import Program
-from weldcal.tools.ur_emulator.registers import Payload, Registers, Terminals, Watchdog
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
-from weldcal.tools.ur_emulator.versions import Version
+from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
+from weldcal.tools.emulators.ur.controller.modes import POWERLESS, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.motions import STEP_S, MotionRefused
+from weldcal.tools.emulators.ur.controller.registers import Payload, Registers, Terminals, Watchdog
+from weldcal.tools.emulators.ur.script.builtins import script_functions
+from weldcal.tools.emulators.ur.script.program import Program
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
+from weldcal.tools.emulators.ur.versions import Version
 
 START_TIMESTAMP_S = 100.0  # a controller has been on for a while; some clients wait for more than 40 s
 UNLOCK_AFTER_S = 5.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from weldcal.tools.ur_emulator.script_syntax import ScriptError
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
 N_NUMBERS = 48
 N_BITS = 128

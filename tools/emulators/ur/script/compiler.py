@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from weldcal.tools.ur_emulator.script_syntax import (
+from weldcal.tools.emulators.ur.script.syntax import (
     Assign,
     Call,
     Command,

@@ -7,9 +7,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.net import Connection, Server
-from weldcal.tools.ur_emulator.rtde_fields import CODES, MASKED, Getter, Input, Output, apply_masked, inputs, outputs
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.wire.net import Connection, Server
+from weldcal.tools.emulators.ur.wire.rtde_fields import (
+    CODES,
+    MASKED,
+    Getter,
+    Input,
+    Output,
+    apply_masked,
+    inputs,
+    outputs,
+)
 
 PROTOCOL, VERSION, TEXT, DATA, SET_OUTPUTS, SET_INPUTS, START, PAUSE = (ord(letter) for letter in "VvMUOISP")
 FREQUENCY_HZ = 500.0

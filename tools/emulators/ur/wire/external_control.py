@@ -6,8 +6,8 @@ URCap does, it connects to the client's script sender, asks `request_program`, a
 
 from __future__ import annotations
 
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.net import Connection, Server
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
 CLIENT_PORT = 50002
 SILENCE_S = 0.1

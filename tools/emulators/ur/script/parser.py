@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from weldcal.tools.ur_emulator.script_lexer import Token, tokenize
-from weldcal.tools.ur_emulator.script_syntax import (
+from weldcal.tools.emulators.ur.script.lexer import Token, tokenize
+from weldcal.tools.emulators.ur.script.syntax import (
     Assign,
     Call,
     Command,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from weldcal.tools.ur_emulator.controller import Controller
-from weldcal.tools.ur_emulator.modes import RobotMode, RuntimeState, SafetyMode
-from weldcal.tools.ur_emulator.net import Connection, Server
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
 GREETING = "Connected: Universal Robots Dashboard Server"
 SERIAL = "20235500001"

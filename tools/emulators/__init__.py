@@ -1,0 +1,1 @@
+"""Emulated devices that run in processes of their own."""

@@ -1,0 +1,1 @@
+"""The emulated controller itself: power, safety, arm and registers."""

@@ -1,0 +1,1 @@
+"""URScript as the emulated controller runs it: parser, compiler and built-in functions."""
