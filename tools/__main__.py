@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from weldcal.tools.cli import main
+from weldcal.tools.cli.app import main
 
 main()

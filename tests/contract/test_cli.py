@@ -17,7 +17,8 @@ import typer.main
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
-from weldcal.tools import cli, console
+from weldcal.tools import console
+from weldcal.tools.cli.app import app as cli
 
 HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 

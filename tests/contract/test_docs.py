@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import typer.main
 
-from weldcal.tools.cli import app
+from weldcal.tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

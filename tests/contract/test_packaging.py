@@ -96,7 +96,7 @@ def test_the_wheel_has_its_command_and_its_licences(built: Built) -> None:
         commands = wheel.read("weldcal-0.1.0.dist-info/entry_points.txt").decode()
         metadata = wheel.read("weldcal-0.1.0.dist-info/METADATA").decode()
         licences = {name.rsplit("/", 1)[-1] for name in wheel.namelist() if "/licenses/" in name}
-    assert "weldcal = weldcal.tools.cli:main" in commands
+    assert "weldcal = weldcal.tools.cli.app:main" in commands
     assert "License-Expression: BSD-3-Clause" in metadata
     assert licences == {"LICENSE", "NOTICE"}
 
@@ -115,7 +115,7 @@ def test_an_installed_wheel_works_far_from_the_repository(built: Built, tmp_path
     # -S keeps this repository's editable install out of sight; the libraries are added by hand.
     libraries = [path for path in sys.path if path.endswith("site-packages")]
     script = (
-        "import sys; import weldcal.tools.cli as cli; from weldcal.tools.report.render import environment;"
+        "import sys; import weldcal.tools.cli.app as cli; from weldcal.tools.report.render import environment;"
         "from weldcal.systems.scenario.schema import SCENARIO_FOLDER;"
         f"assert cli.__file__.startswith({str(target)!r}), cli.__file__;"
         "assert environment().get_template('base.html.j2');"

@@ -22,7 +22,7 @@ from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerS
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.schema import load_scenario
-from weldcal.tools.cli import app
+from weldcal.tools.cli.app import app
 from weldcal.tools.demo import DemoOptions
 from weldcal.tools.procedures import runner_of
 from weldcal.tools.profiler_live import ProfilerLive, run_profiler_live

@@ -24,7 +24,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.calibrate import calibrate_dataset
-from weldcal.tools.cli import app
+from weldcal.tools.cli.app import app
 from weldcal.tools.verify import VerifyReport, verify_dataset
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"

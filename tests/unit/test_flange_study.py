@@ -19,7 +19,7 @@ from weldcal.calibration.published.algorithm1 import algorithm1_start, algorithm
 from weldcal.calibration.published.icp import VerificationError
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
-from weldcal.tools.cli import app
+from weldcal.tools.cli.app import app
 from weldcal.tools.studies.flange_clouds import METHODS, study_clouds
 from weldcal.tools.studies.flange_command import find_datasets, title
 from weldcal.tools.studies.flange_kinect import PAPER_E_XYZ_MM, paper_error, study_kinect

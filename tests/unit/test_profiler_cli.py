@@ -19,7 +19,7 @@ from weldcal.calibration.profiler.plan import sample_edge_poses
 from weldcal.calibration.profiler.record import load_record
 from weldcal.calibration.profiler.result import ProfilerEstimate, believed_covariance
 from weldcal.models.errors import InputError
-from weldcal.tools.cli import app
+from weldcal.tools.cli.app import app
 from weldcal.tools.studies.profiler_worlds import CLEAN, SphereWorld, sphere_trial
 
 STATE = EdgeState(

@@ -171,7 +171,7 @@ def test_the_scanners_of_the_recorded_data_are_presets() -> None:
 
 
 def test_the_command_lists_them() -> None:
-    from weldcal.tools.cli import app
+    from weldcal.tools.cli.app import app
 
     result = CliRunner().invoke(app, ["robots", "--json"])
     assert result.exit_code == 0
@@ -184,7 +184,7 @@ def test_the_command_lists_them() -> None:
 
 
 def test_what_could_not_be_looked_up_is_called_unconfirmed() -> None:
-    from weldcal.tools.cli import app
+    from weldcal.tools.cli.app import app
 
     shown = CliRunner().invoke(app, ["robots", "ur3e"])
     assert shown.exit_code == 0

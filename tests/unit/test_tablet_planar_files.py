@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.published.two_stage import Sign
-from weldcal.tools.cli_tablet import tablet
+from weldcal.tools.cli.tablet import tablet
 from weldcal.tools.studies.tablet_world import TabletTrial, simulate_trial
 from weldcal.tools.tablet_planar import VisitFits, best_model, fit_visit
 

@@ -23,7 +23,7 @@ from weldcal.calibration.tablet.published.two_stage import (
     stage2_residuals,
 )
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.tools.studies.cli_reproduce import reproduce
+from weldcal.tools.cli.reproduce.group import reproduce
 from weldcal.tools.studies.tablet_paper import STAGE_1, STAGE_2, published_touches
 from weldcal.tools.studies.tablet_study import compare_signs, dh_by_eq_20
 

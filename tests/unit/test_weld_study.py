@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from weldcal.tools.cli.reproduce.group import reproduce
 from weldcal.tools.studies.budgets import HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.studies.cli_reproduce import reproduce
 from weldcal.tools.studies.groove import DROP_M, SEAT_M, Groove, Tip, floor
 from weldcal.tools.studies.metrics import RunMetrics
 from weldcal.tools.studies.seams import NAMES, UnknownSeam, get_seam

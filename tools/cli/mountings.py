@@ -30,7 +30,7 @@ def live(
     debug: DebugOption = False,
 ) -> None:
     """Where is the scanner? Live, in any mounting: the robot looks at its own flange, foot, or a second arm's flange."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     folder = out or fresh_folder("hand-eye", Path(scenario).stem, seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("hand-eye live") as progress:
@@ -65,7 +65,7 @@ def benchmark_mountings(
     debug: DebugOption = False,
 ) -> None:
     """Every mounting live over several seeds: errors against the truth, at poses kept aside, and in units of the covariance."""
-    from weldcal.tools.cli_options import finish, fresh_folder
+    from weldcal.tools.cli.options import finish, fresh_folder
 
     folder = out or fresh_folder("benchmark", "mountings", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark mountings") as progress:

@@ -29,7 +29,7 @@ def cell(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """The weld in the whole cell, contact and rendered tag included: seam points, torch and real-time factor."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce cell") as progress:
         from weldcal.tools.studies.cell_study import CellStudyOptions, run_cell_study

@@ -25,7 +25,7 @@ def profiler(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """How fast an edge calibrates a profiler without a guess, beside the paper's method and a grid search."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark profiler") as progress:
         from weldcal.tools.benchmarks.profiler import lines, run_profiler_benchmark

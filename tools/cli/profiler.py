@@ -227,7 +227,7 @@ def _sphere(
 
 
 def _folder(out: Path | None, file: Path, seed: int) -> Path:
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     return out or fresh_folder("profiler", file.stem, seed)
 
@@ -244,7 +244,7 @@ def _pose_rows(X_FS: list[list[float]]) -> dict[str, str]:
 
 
 def _report(command: str, found: Mapping[str, object], folder: Path, json: bool) -> None:
-    from weldcal.tools.cli_options import finish
+    from weldcal.tools.cli.options import finish
 
     rows: dict[str, str] = {}
     X = found.get("X_FS")

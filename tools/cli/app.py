@@ -7,12 +7,13 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools import cli_hand_eye, console
-from weldcal.tools.benchmarks.cli_flange import mount as mount_flange
-from weldcal.tools.benchmarks.cli_profiler import profiler as benchmark_profiler
-from weldcal.tools.benchmarks.cli_seam_planning import seam_planning
-from weldcal.tools.cli_mounting import benchmark_mountings, live
-from weldcal.tools.cli_options import (
+from weldcal.tools import console
+from weldcal.tools.cli.app import hand_eye as cli_hand_eye
+from weldcal.tools.cli.benchmark.flange import mount as mount_flange
+from weldcal.tools.cli.benchmark.profiler import profiler as benchmark_profiler
+from weldcal.tools.cli.benchmark.seam_planning import seam_planning
+from weldcal.tools.cli.mountings import benchmark_mountings, live
+from weldcal.tools.cli.options import (
     BrowserOption,
     CorrectionOption,
     DebugOption,
@@ -28,14 +29,14 @@ from weldcal.tools.cli_options import (
     finish,
     fresh_folder,
 )
-from weldcal.tools.cli_profiler import profiler
-from weldcal.tools.cli_profiler_live import live as profiler_live
-from weldcal.tools.cli_robot import mount as mount_robot
-from weldcal.tools.cli_robots import robots
-from weldcal.tools.cli_tablet import tablet
-from weldcal.tools.studies.cli_cell import cell as reproduce_cell
-from weldcal.tools.studies.cli_reproduce import reproduce
-from weldcal.tools.studies.cli_tablet import benchmark_tablet
+from weldcal.tools.cli.profiler import profiler
+from weldcal.tools.cli.profiler_live import live as profiler_live
+from weldcal.tools.cli.reproduce.cell import cell as reproduce_cell
+from weldcal.tools.cli.reproduce.group import reproduce
+from weldcal.tools.cli.reproduce.tablet import benchmark_tablet
+from weldcal.tools.cli.robot import mount as mount_robot
+from weldcal.tools.cli.robots import robots
+from weldcal.tools.cli.tablet import tablet
 
 app = typer.Typer(
     name="weldcal",

@@ -32,7 +32,7 @@ def flange(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """Flange calibration as published: Table 1, Fig. 9, 10 and 11, the Kinect, and what Algorithm 1's cost does."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce flange") as progress:
         from weldcal.tools.studies.flange_command import StudyOptions, run_study

@@ -25,7 +25,7 @@ def profiler_seeds(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """How each target of 'reproduce profiler' spreads over seeds, beside the Cramer-Rao bound; twenty seconds a seed."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce profiler-seeds") as progress:
         from weldcal.tools.studies.profiler_seeds import run_profiler_seeds

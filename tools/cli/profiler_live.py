@@ -29,7 +29,7 @@ def live(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """A profiler on the simulated arm: calibrated live by an edge and a touched sphere, then a seam scanned and followed."""
-    from weldcal.tools.cli_options import finish, fresh_folder
+    from weldcal.tools.cli.options import finish, fresh_folder
 
     scenario = name or scenario
     folder = out or fresh_folder("profiler-live", scenario, seed)

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.studies.cli_flange import flange
-from weldcal.tools.studies.cli_profiler_seeds import profiler_seeds
-from weldcal.tools.studies.cli_tablet import reproduce_tablet
+from weldcal.tools.cli.reproduce.flange import flange
+from weldcal.tools.cli.reproduce.profiler_seeds import profiler_seeds
+from weldcal.tools.cli.reproduce.tablet import reproduce_tablet
 
 reproduce = typer.Typer(help="Figures against their targets.", no_args_is_help=True)
 reproduce.command("tablet")(reproduce_tablet)
@@ -46,7 +46,7 @@ def weld(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """The weld law in a small kinematic world: every target, the paper's law beside it, pictures, one report."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce weld") as progress:
         from weldcal.tools.studies.weld_command import StudyOptions, run_study
@@ -82,7 +82,7 @@ def profiler(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """A laser profiler on the flange: both papers' tables with ours beside them, pictures, one report."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce profiler") as progress:
         from weldcal.tools.studies.profiler_command import ProfilerStudyOptions, run_profiler_study

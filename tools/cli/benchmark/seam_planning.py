@@ -28,7 +28,7 @@ def seam_planning(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """How well a seam is planned from one scan, by drawing and from the cloud alone, for each scanner."""
-    from weldcal.tools.cli_options import finish, fresh_folder
+    from weldcal.tools.cli.options import finish, fresh_folder
 
     folder = out or fresh_folder("benchmark", "seam-planning", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark seam-planning") as progress:

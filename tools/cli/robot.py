@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.cli_options import (
+from weldcal.tools.cli.options import (
     AddressOption,
     DebugOption,
     JsonOption,

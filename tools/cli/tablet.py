@@ -83,7 +83,7 @@ def calibrate(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """Where do camera and pen sit on the wrist? From one look at the tablet and a touch of each landmark."""
-    from weldcal.tools.cli_options import finish, fresh_folder
+    from weldcal.tools.cli.options import finish, fresh_folder
 
     folder = out or fresh_folder("tablet", file.stem, seed)
     with console.boundary(json_wanted=json, debug=debug):
@@ -142,7 +142,7 @@ def demo(
     debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
 ) -> None:
     """The whole procedure in the station: a look, a touch of each landmark by contact, the calibration, against the truth."""
-    from weldcal.tools.cli_options import finish, fresh_folder
+    from weldcal.tools.cli.options import finish, fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
         from weldcal.systems.scenario.schema import load_scenario

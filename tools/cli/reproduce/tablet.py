@@ -38,7 +38,7 @@ def reproduce_tablet(
     debug: DebugOption = False,
 ) -> None:
     """The tablet paper: Tables 7 to 12 beside ours, the sign of Eq. 20, and the models that predict better."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce tablet") as progress:
         from weldcal.tools.studies.tablet_command import TabletOptions, run_tablet_study
@@ -63,7 +63,7 @@ def benchmark_tablet(
     out: OutOption = None, seed: SeedOption = 0, json: JsonOption = False, debug: DebugOption = False
 ) -> None:
     """How long each tablet calibration takes, and how many times faster than the published search."""
-    from weldcal.tools.cli_options import finish, fresh_folder
+    from weldcal.tools.cli.options import finish, fresh_folder
 
     folder = out or fresh_folder("benchmark", "tablet", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark tablet") as progress:

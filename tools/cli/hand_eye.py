@@ -124,7 +124,7 @@ def benchmark(
     debug: DebugOption = False,
 ) -> None:
     """Hand-eye solvers on others' data beside OpenCV's, and on simulations: outliers, invariance, uncertainty, speed."""
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     folder = out or fresh_folder("benchmark", "hand-eye", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark hand-eye") as progress:
@@ -153,7 +153,7 @@ def _run(
     camera: str | None = None,
     refine: str | None = None,
 ) -> None:
-    from weldcal.tools.cli_options import fresh_folder
+    from weldcal.tools.cli.options import fresh_folder
 
     folder = out or fresh_folder("hand-eye", file.resolve().stem, seed)
     with console.boundary(json_wanted=json, debug=debug):
