@@ -8,7 +8,7 @@ from functools import cache
 import pytest
 
 from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario
+from weldcal.tools.commands.demo import DemoOptions, DemoResult, run_scenario
 
 SHORTER = "welding: {seam_length_mm: 30.0}\ncalibration: {minimum_scans: 4}"
 SHORT_JOB_SEED = 5

@@ -27,7 +27,7 @@ from weldcal.systems.drivers.ur.readiness import preflight as module
 from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo, read_kinematics
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
-from weldcal.tools.check_robot import emit_table
+from weldcal.tools.commands.check_robot import emit_table
 from weldcal.tools.emulators.ur.main import HOME
 
 # addresses of its own: this module waits for no other, and its second controller not for its first

@@ -11,9 +11,9 @@ import pytest
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.demo import DemoOptions, DemoResult, run_scenario
+from weldcal.tools.commands.demo import DemoOptions, DemoResult, run_scenario
+from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.emulators.ur.process import Emulator, emulator_process
-from weldcal.tools.robots import chosen_robot
 
 # An address of its own: this module waits for no other.
 HOST = "127.0.0.41"

@@ -20,7 +20,7 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.calibrate import CalibrationReport, calibrate_dataset
+from weldcal.tools.commands.calibrate import CalibrationReport, calibrate_dataset
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"

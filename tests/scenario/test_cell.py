@@ -21,9 +21,9 @@ from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.motion.clear_moves import clear_poses
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.schema import SCENARIO_FOLDER, Scenario, load_scenario
-from weldcal.tools.calibrate import calibrate_dataset
-from weldcal.tools.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result
-from weldcal.tools.outcome import calibration_error
+from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.commands.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result
+from weldcal.tools.commands.outcome import calibration_error
 from weldcal.tools.studies.cell_study import figures
 from weldcal.welding.record.weld_log import load_weld_log
 

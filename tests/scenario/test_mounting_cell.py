@@ -20,9 +20,9 @@ from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.demo import DemoOptions
-from weldcal.tools.mounting_live import MountingReport, run_mounting_live
-from weldcal.tools.procedures import kind_of
+from weldcal.tools.commands.demo import DemoOptions
+from weldcal.tools.commands.mounting_live import MountingReport, run_mounting_live
+from weldcal.tools.commands.procedures import kind_of
 
 # few poses near home, a coarse image, a controller at a quarter of its rate: seconds instead of a minute
 QUICK = "robot: !SimulatedUr {control_period_s: 0.008}\n"
@@ -108,7 +108,7 @@ def test_the_first_joint_shows_the_foot_no_other_side() -> None:
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> MountingReport:
     """The command's own way from the same run to files."""
-    from weldcal.tools import mounting_live
+    from weldcal.tools.commands import mounting_live
 
     run = finished("eye_on_arm")
     folder = tmp_path_factory.mktemp("live")

@@ -23,9 +23,9 @@ from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.demo import DemoOptions
-from weldcal.tools.procedures import runner_of
-from weldcal.tools.profiler_live import ProfilerLive, run_profiler_live
+from weldcal.tools.commands.demo import DemoOptions
+from weldcal.tools.commands.procedures import runner_of
+from weldcal.tools.commands.profiler.live import ProfilerLive, run_profiler_live
 
 # fewer scans and touches than shipped, and the first 60 mm of the seam
 SHORT = """

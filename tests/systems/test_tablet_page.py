@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from tests.browser import Browser
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.tablet import tablet
-from weldcal.tools.tablet_page.serve import TabletServer, addresses, is_loopback, open_server, page
+from weldcal.tools.commands.tablet.page.serve import TabletServer, addresses, is_loopback, open_server, page
 
 PAGE = Path(__file__).resolve().parents[2] / "tools" / "tablet_page" / "tablet.html"
 WIDTH, HEIGHT = 1000, 700

@@ -17,7 +17,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.hand_eye.files import read_pairs
-from weldcal.tools.hand_eye import HandEyeReport, run_hand_eye
+from weldcal.tools.commands.hand_eye import HandEyeReport, run_hand_eye
 
 from .hand_eye_poses import co_manipulation, eye_in_hand
 

@@ -13,7 +13,7 @@ from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import inverse
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.models.errors import InputError
-from weldcal.tools.hand_eye import run_hand_eye
+from weldcal.tools.commands.hand_eye import run_hand_eye
 
 from .hand_eye_poses import Array, co_manipulation, eye_in_hand
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.scenario.schema import load_scenario
-from weldcal.tools.demo import DemoOptions, run_scenario
+from weldcal.tools.commands.demo import DemoOptions, run_scenario
 
 SEAM_MM = 100.0
 

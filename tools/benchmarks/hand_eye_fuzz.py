@@ -15,7 +15,7 @@ from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.hand_eye import solve_pairs
+from weldcal.tools.commands.hand_eye import solve_pairs
 
 Array = NDArray[np.float64]
 

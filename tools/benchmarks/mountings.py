@@ -10,9 +10,9 @@ import numpy as np
 
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.scenario.schema import load_scenario, scenario_names
+from weldcal.tools.commands.demo import DemoOptions
+from weldcal.tools.commands.mounting_live import MountingReport, run_mounting_live
 from weldcal.tools.console import Progress
-from weldcal.tools.demo import DemoOptions
-from weldcal.tools.mounting_live import MountingReport, run_mounting_live
 from weldcal.tools.report.render import write_atomic
 
 HEADER = (

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.demo import DemoOptions, run_demo
+from weldcal.tools.commands.demo import DemoOptions, run_demo
 from weldcal.tools.report.render import write_atomic
 
 COLUMNS = (

@@ -112,8 +112,8 @@ def demo(
             raise typer.BadParameter("give the scenario once, by itself or with --scenario")
         scenario = name
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.demo import DemoOptions
-        from weldcal.tools.procedures import run_procedure
+        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.tools.commands.procedures import run_procedure
 
         options = DemoOptions(
             scenario=scenario,
@@ -178,7 +178,7 @@ def calibrate(
     rows: dict[str, str] = {}
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("calibrate") as progress:
         if dataset is not None:
-            from weldcal.tools.calibrate import calibrate_dataset
+            from weldcal.tools.commands.calibrate import calibrate_dataset
 
             folder = out or fresh_folder("calibrate", dataset.resolve().name, seed)
             report = calibrate_dataset(
@@ -196,8 +196,8 @@ def calibrate(
             if report.algorithm1 is not None:
                 rows["Algorithm 1"] = report.algorithm1.sentence
         else:
-            from weldcal.tools.demo import DemoOptions
-            from weldcal.tools.procedures import calibrate_live
+            from weldcal.tools.commands.demo import DemoOptions
+            from weldcal.tools.commands.procedures import calibrate_live
 
             assert scenario is not None
             folder = out or fresh_folder("calibrate", scenario, seed)
@@ -229,7 +229,7 @@ def verify(
 ) -> None:
     """How good is a calibration on scans it never saw? Position error and tilt per pose, at the flange."""
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("verify") as progress:
-        from weldcal.tools.verify import verify_dataset
+        from weldcal.tools.commands.verify import verify_dataset
 
         folder = out or fresh_folder("verify", dataset.resolve().name, seed)
         report = verify_dataset(
@@ -254,7 +254,7 @@ def weld(
 ) -> None:
     """Follow a seam in a scenario, with the scanner's pose taken as the scenario's mounting says."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.demo import DemoOptions, run_weld
+        from weldcal.tools.commands.demo import DemoOptions, run_weld
 
         folder = out or fresh_folder("weld", scenario, seed)
         options = DemoOptions(
@@ -316,7 +316,7 @@ def view(
 ) -> None:
     """Show a finished run again: its 3D recording and its report."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.view import find_pages, open_pages
+        from weldcal.tools.commands.view import find_pages, open_pages
 
         pages = find_pages(result)
         opened = browser and open_pages(pages)

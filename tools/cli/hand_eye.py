@@ -157,7 +157,7 @@ def _run(
 
     folder = out or fresh_folder("hand-eye", file.resolve().stem, seed)
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.hand_eye import run_hand_eye
+        from weldcal.tools.commands.hand_eye import run_hand_eye
 
         def say(sentence: str) -> None:
             if not json:

@@ -36,8 +36,8 @@ def live(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("hand-eye live") as progress:
         from weldcal.models.errors import InputError
         from weldcal.systems.scenario.schema import load_scenario
-        from weldcal.tools.demo import DemoOptions
-        from weldcal.tools.mounting_live import run_mounting_live
+        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.tools.commands.mounting_live import run_mounting_live
 
         loaded = load_scenario(scenario)
         if loaded.mounting is None:

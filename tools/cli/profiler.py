@@ -93,9 +93,9 @@ def edge(
 ) -> None:
     """The profiler's pose on the flange, from points of one straight edge seen in any poses; no guess is needed."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import calibrate_edge, write_calibration
-        from weldcal.tools.profiler_files import read_profiler_file
-        from weldcal.tools.profiler_noise import Sigmas
+        from weldcal.tools.commands.profiler.calibrate import calibrate_edge, write_calibration
+        from weldcal.tools.commands.profiler.files import read_profiler_file
+        from weldcal.tools.commands.profiler.noise import Sigmas
 
         given, usual = (sigma_robot, sigma_x, sigma_z), (0.03, 0.05, 0.06)
         robot, x, z = (1e-3 * (u if v is None else v) for v, u in zip(given, usual, strict=True))
@@ -128,8 +128,8 @@ def sphere(
 ) -> None:
     """The profiler's pose on the flange, from raw profiles of a sphere; no sides, no pure translations, no guess."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import calibrate_sphere, write_calibration
-        from weldcal.tools.profiler_noise import Sigmas
+        from weldcal.tools.commands.profiler.calibrate import calibrate_sphere, write_calibration
+        from weldcal.tools.commands.profiler.noise import Sigmas
 
         sigmas = Sigmas(1e-3 * sigma_robot, 1e-3 * sigma_z, 1e-3 * sigma_z)
         lost: list[int] = []
@@ -160,7 +160,7 @@ def compensate(
 ) -> None:
     """The sphere paper's own two steps and its compensation; 'sphere' does better from the same file."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import calibrate_compensate, write_calibration
+        from weldcal.tools.commands.profiler.calibrate import calibrate_compensate, write_calibration
 
         data, measured = _sphere(file, unit, dataset, trial, radius, "", touches, tip, seed)
         record, found = calibrate_compensate(data, measured, solve_tip=solve_tip)
@@ -188,8 +188,8 @@ def seam(
 ) -> None:
     """Both edges and the root of a V-groove in every raw profile, in the base frame, as seam.csv."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.profiler import map_seam
-        from weldcal.tools.profiler_files import read_profiler_file
+        from weldcal.tools.commands.profiler.calibrate import map_seam
+        from weldcal.tools.commands.profiler.files import read_profiler_file
 
         folder = _folder(out, file, seed)
         found = map_seam(read_profiler_file(file, unit=unit, trial=trial), calibration, folder)
@@ -211,8 +211,8 @@ def _sphere(
     import numpy as np
 
     from weldcal.models.errors import InputError
-    from weldcal.tools.profiler import sphere_data
-    from weldcal.tools.profiler_files import read_profiler_file
+    from weldcal.tools.commands.profiler.calibrate import sphere_data
+    from weldcal.tools.commands.profiler.files import read_profiler_file
 
     try:
         tip_m = 1e-3 * np.array([float(v) for v in tip.split(",")]) if tip else None

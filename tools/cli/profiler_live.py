@@ -35,8 +35,8 @@ def live(
     folder = out or fresh_folder("profiler-live", scenario, seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("profiler live") as progress:
         from weldcal.systems.scenario.schema import load_scenario
-        from weldcal.tools.demo import DemoOptions
-        from weldcal.tools.profiler_live import run_profiler_live, run_profiler_seeds
+        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.tools.commands.profiler.live import run_profiler_live, run_profiler_seeds
 
         options = DemoOptions(scenario=scenario, out=folder, seed=seed, recording=record)
         loaded = load_scenario(scenario)

@@ -105,7 +105,7 @@ def check_robot(
     """Is this robot ready? A table of what is right and what to change; nothing moves and nothing is written."""
     with console.boundary(json_wanted=json, debug=debug):
         from weldcal.systems.drivers.ur.readiness.preflight import preflight
-        from weldcal.tools.check_robot import as_json, emit_table
+        from weldcal.tools.commands.check_robot import as_json, emit_table
 
         report = preflight(host)
         if json:

@@ -30,7 +30,7 @@ def serve(
 ) -> None:
     """Hand the target's page to a tablet: landmarks at true scale, touches to a tenth of a pixel; until interrupted."""
     with console.boundary(json_wanted=False, debug=debug):
-        from weldcal.tools.tablet_page.serve import run_server
+        from weldcal.tools.commands.tablet.page.serve import run_server
 
         run_server(host, port, out, typer.echo)
 
@@ -87,7 +87,7 @@ def calibrate(
 
     folder = out or fresh_folder("tablet", file.stem, seed)
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.tablet_calibrate import TabletInputs, calibrate_tablet
+        from weldcal.tools.commands.tablet.calibrate import TabletInputs, calibrate_tablet
 
         inputs = TabletInputs(
             file,
@@ -146,8 +146,8 @@ def demo(
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
         from weldcal.systems.scenario.schema import load_scenario
-        from weldcal.tools.demo import DemoOptions
-        from weldcal.tools.tablet_demo import run_tablet_demo
+        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.tools.commands.tablet.demo import run_tablet_demo
 
         options = DemoOptions(
             scenario=scenario,

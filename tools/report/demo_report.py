@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
-from weldcal.tools.outcome import heat_input_kJ_mm, planned_seam
+from weldcal.tools.commands.outcome import heat_input_kJ_mm, planned_seam
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
 
 if TYPE_CHECKING:
-    from weldcal.tools.demo import DemoResult
+    from weldcal.tools.commands.demo import DemoResult
 
 STORY = {
     "start": "get ready",

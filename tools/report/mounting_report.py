@@ -12,7 +12,7 @@ from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, render
 
 if TYPE_CHECKING:
-    from weldcal.tools.mounting_live import MountingReport
+    from weldcal.tools.commands.mounting_live import MountingReport
 
 
 def mounting_report(report: MountingReport, picture: bytes) -> str:

@@ -18,7 +18,7 @@ from weldcal.tools.report.plots_advice import knowledge_map
 from weldcal.tools.report.render import fixed, render
 
 if TYPE_CHECKING:
-    from weldcal.tools.calibrate import CalibrationReport
+    from weldcal.tools.commands.calibrate import CalibrationReport
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, render
 
 if TYPE_CHECKING:
-    from weldcal.tools.verify import VerifyReport
+    from weldcal.tools.commands.verify import VerifyReport
 
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:

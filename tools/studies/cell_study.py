@@ -16,9 +16,9 @@ from weldcal.models.errors import InputError
 from weldcal.systems.cell import make_cell
 from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.schema import Scenario, scenario_names
+from weldcal.tools.commands.demo import DemoOptions, DemoResult, known_camera, measure
+from weldcal.tools.commands.outcome import FeltSeam, felt_seam
 from weldcal.tools.console import plain
-from weldcal.tools.demo import DemoOptions, DemoResult, known_camera, measure
-from weldcal.tools.outcome import FeltSeam, felt_seam
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.servo.laws import get_law
 

@@ -12,7 +12,7 @@ from weldcal.systems.cell import make_cell, work_point
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.schema import Scenario, check_scenario, load_scenario
-from weldcal.tools.outcome import calibration_error, calibration_status
+from weldcal.tools.commands.outcome import calibration_error, calibration_status
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.studies.live_redraw import Redrawn, Station, bound_covariance, joined, joints_of, redraw
 

@@ -25,9 +25,9 @@ from weldcal.systems.drivers.no_device import NoDevice
 from weldcal.systems.jobs.mounting.calibrator import solve_mounting
 from weldcal.systems.jobs.mounting.cell import FOOT, MountingRun, make_mounting_cell, run_mounting_cell
 from weldcal.systems.scenario.schema import Scenario, check_scenario
+from weldcal.tools.commands.demo import DemoOptions
+from weldcal.tools.commands.hand_eye import HandEyeReport
 from weldcal.tools.console import Progress
-from weldcal.tools.demo import DemoOptions
-from weldcal.tools.hand_eye import HandEyeReport
 from weldcal.tools.report.render import write_atomic
 
 Array = NDArray[np.float64]

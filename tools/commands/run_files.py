@@ -15,7 +15,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
-from weldcal.tools.outcome import WeldOutcome, columns
+from weldcal.tools.commands.outcome import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Protocol
 
 from weldcal.systems.scenario.schema import Scenario, load_scenario
+from weldcal.tools.commands.demo import DemoOptions, run_calibration_live, run_scenario
+from weldcal.tools.commands.mounting_live import run_mounting_live
+from weldcal.tools.commands.profiler.live import run_profiler_live
+from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.console import Progress
-from weldcal.tools.demo import DemoOptions, run_calibration_live, run_scenario
-from weldcal.tools.mounting_live import run_mounting_live
-from weldcal.tools.profiler_live import run_profiler_live
-from weldcal.tools.tablet_demo import run_tablet_demo
 
 
 class Outcome(Protocol):

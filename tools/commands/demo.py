@@ -17,7 +17,7 @@ from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Progress, Run, no_progress, run_cell
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, check_scenario, load_scenario
-from weldcal.tools.outcome import (
+from weldcal.tools.commands.outcome import (
     CalibrationError,
     WeldOutcome,
     calibration_error,
@@ -26,10 +26,10 @@ from weldcal.tools.outcome import (
     planned_seam,
     weld_outcome,
 )
+from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.commands.run_files import error_summary, weld_record, write_calibration, write_scans, write_weld_log
 from weldcal.tools.report.demo_report import demo_pictures, demo_report
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.robots import chosen_robot
-from weldcal.tools.run_files import error_summary, weld_record, write_calibration, write_scans, write_weld_log
 
 
 @dataclass(frozen=True)

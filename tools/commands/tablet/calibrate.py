@@ -19,10 +19,10 @@ from weldcal.calibration.tablet.wrist.diagnostics import wrist_doubts
 from weldcal.calibration.tablet.wrist.files import file_hash, load_visit
 from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
+from weldcal.tools.commands.tablet.planar import NAMES, best_model, fit_visit
+from weldcal.tools.commands.tablet.visits import ManyVisits, error_figures, fit_many
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.tablet_planar import NAMES, best_model, fit_visit
 from weldcal.tools.tablet_report import Shown, calibration_report, marked_picture
-from weldcal.tools.tablet_visits import ManyVisits, error_figures, fit_many
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ FIRST_COLUMNS = "landmark,time_utc,"
 
 def page() -> str:
     """The page: one self-contained HTML text."""
-    return files("weldcal.tools.tablet_page").joinpath("tablet.html").read_text(encoding="utf-8")
+    return files("weldcal.tools.commands.tablet.page").joinpath("tablet.html").read_text(encoding="utf-8")
 
 
 class TabletServer(ThreadingHTTPServer):

@@ -41,8 +41,8 @@ from weldcal.calibration.profiler.sphere.linear import (
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.tools.profiler_files import ProfilerFile
-from weldcal.tools.profiler_noise import Sigmas, edge_by_noise
+from weldcal.tools.commands.profiler.files import ProfilerFile
+from weldcal.tools.commands.profiler.noise import Sigmas, edge_by_noise
 from weldcal.tools.report.render import write_atomic
 
 CANDIDATES = 300

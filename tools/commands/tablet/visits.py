@@ -18,8 +18,8 @@ from weldcal.calibration.tablet.planar.files import PlanarFile
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.errors import WeldcalError
+from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.tablet_planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.tablet_report import Page
 
 Array = NDArray[np.float64]

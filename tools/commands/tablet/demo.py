@@ -19,14 +19,14 @@ from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit, make_tablet_cell
 from weldcal.systems.scenario.schema import Scenario, check_scenario
+from weldcal.tools.commands.demo import DemoOptions
+from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
+from weldcal.tools.commands.tablet.files import write_visit
+from weldcal.tools.commands.tablet.run import run_visit
 from weldcal.tools.console import Progress
-from weldcal.tools.demo import DemoOptions
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.robots import chosen_robot
-from weldcal.tools.tablet_calibrate import TabletCalibration, TabletInputs, calibrate_tablet
-from weldcal.tools.tablet_files import write_visit
 from weldcal.tools.tablet_report import visit_report
-from weldcal.tools.tablet_run import run_visit
 
 Array = NDArray[np.float64]
 MOST_LEAN_RAD = 0.15  # of the pen at them

@@ -22,9 +22,9 @@ from weldcal.models.errors import InputError
 from weldcal.systems.jobs.profiler.cell import ProfilerCell, ProfilerRun, make_profiler_cell, run_profiler_cell
 from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.scenario.schema import Scenario, check_scenario
+from weldcal.tools.commands.demo import DemoOptions
+from weldcal.tools.commands.profiler.outcome import LiveOutcome, PathOutcome, PoseOutcome, live_outcome
 from weldcal.tools.console import Progress
-from weldcal.tools.demo import DemoOptions
-from weldcal.tools.profiler_outcome import LiveOutcome, PathOutcome, PoseOutcome, live_outcome
 from weldcal.tools.report.profiler_live_report import live_report, seeds_report
 from weldcal.tools.report.render import write_atomic
 
