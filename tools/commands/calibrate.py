@@ -46,7 +46,7 @@ from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import Algorithm1Outcome, compare_algorithm1, summary_of
-from weldcal.tools.report.features import feature_residuals
+from weldcal.tools.report.flange_features import feature_residuals
 from weldcal.tools.report.plots_calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
 

@@ -28,7 +28,7 @@ from weldcal.tools.commands.outcome import (
 )
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.commands.run_files import error_summary, weld_record, write_calibration, write_scans, write_weld_log
-from weldcal.tools.report.demo_report import demo_pictures, demo_report
+from weldcal.tools.report.demo import demo_pictures, demo_report
 from weldcal.tools.report.render import write_atomic
 
 

@@ -194,8 +194,8 @@ def run_mounting_live(scenario: Scenario, options: DemoOptions, progress: Progre
 
 def write_mounting(report: MountingReport, meshcat: Meshcat | None) -> None:
     """Write hand_eye.yaml with its exports, sightings.csv, summary.txt, station.png, report.html and recording.html."""
-    from weldcal.tools.mounting_picture import station_picture
-    from weldcal.tools.report.mounting_report import mounting_report
+    from weldcal.tools.report.mounting import mounting_report
+    from weldcal.tools.report.mounting_picture import station_picture
 
     folder = report.folder
     scenario = yaml_dump_typed(report.run.cell.scenario)

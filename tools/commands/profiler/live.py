@@ -25,7 +25,7 @@ from weldcal.systems.scenario.schema import Scenario, check_scenario
 from weldcal.tools.commands.demo import DemoOptions
 from weldcal.tools.commands.profiler.outcome import LiveOutcome, PathOutcome, PoseOutcome, live_outcome
 from weldcal.tools.console import Progress
-from weldcal.tools.report.profiler_live_report import live_report, seeds_report
+from weldcal.tools.report.profiler_live import live_report, seeds_report
 from weldcal.tools.report.render import write_atomic
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ from weldcal.models.errors import InputError
 from weldcal.tools.commands.tablet.planar import NAMES, best_model, fit_visit
 from weldcal.tools.commands.tablet.visits import ManyVisits, error_figures, fit_many
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.tablet_report import Shown, calibration_report, marked_picture
+from weldcal.tools.report.tablet import Shown, calibration_report, marked_picture
 
 
 @dataclass(frozen=True)

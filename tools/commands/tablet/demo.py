@@ -26,7 +26,7 @@ from weldcal.tools.commands.tablet.files import write_visit
 from weldcal.tools.commands.tablet.run import run_visit
 from weldcal.tools.console import Progress
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.tablet_report import visit_report
+from weldcal.tools.report.tablet import visit_report
 
 Array = NDArray[np.float64]
 MOST_LEAN_RAD = 0.15  # of the pen at them

@@ -20,7 +20,7 @@ from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.tablet_report import Page
+from weldcal.tools.report.tablet import Page
 
 Array = NDArray[np.float64]
 
