@@ -8,11 +8,11 @@ from collections.abc import Iterator
 import pytest
 
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.tools.benchmarks.fault_bench import Bench
-from weldcal.tools.benchmarks.fault_cases import AT_START, GO, REFUSE, RUNNING, STOP, Case
-from weldcal.tools.benchmarks.fault_sequences import run_sequence
-from weldcal.tools.benchmarks.robot_faults import FaultReport, recover, run_case
 from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.studies.robot.bench import Bench
+from weldcal.tools.studies.robot.cases import AT_START, GO, REFUSE, RUNNING, STOP, Case
+from weldcal.tools.studies.robot.faults import FaultReport, recover, run_case
+from weldcal.tools.studies.robot.sequences import run_sequence
 
 CASES = [case for case in RUNNING + AT_START if case.short]
 

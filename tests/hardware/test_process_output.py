@@ -21,13 +21,13 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
 from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
-from weldcal.tools.benchmarks.fault_bench import Bench
-from weldcal.tools.benchmarks.robot_faults import recover
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version
+from weldcal.tools.studies.robot.bench import Bench
+from weldcal.tools.studies.robot.faults import recover
 
 OUTPUT = 3
 HOST = "127.0.0.47"  # an address of its own: this module waits for no other

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from weldcal.tools.benchmarks.robot import MISSED_S, RATE_HZ, STEP_S, StreamReport, Tap, run_robot_benchmark
+from weldcal.tools.studies.robot.stream import MISSED_S, RATE_HZ, STEP_S, StreamReport, Tap, run_robot_benchmark
 
 SECONDS = 6.0
 

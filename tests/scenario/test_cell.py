@@ -24,7 +24,7 @@ from weldcal.systems.scenario.schema import SCENARIO_FOLDER, Scenario, load_scen
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.commands.outcome import calibration_error
-from weldcal.tools.studies.cell_study import figures
+from weldcal.tools.studies.cell.study import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
 # Without calibrating: the scanner stands where the cell is told it stands.

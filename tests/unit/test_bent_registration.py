@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.models.bent_workpiece import bend, rolled
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece
-from weldcal.tools.benchmarks.plan_scenes import Scene, scan_part
-from weldcal.tools.benchmarks.plan_trials import sideways
+from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
+from weldcal.tools.studies.seam_planning.trials import sideways
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove_cloud import extract_groove

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.studies.cell_study import (
+from weldcal.tools.studies.cell.study import (
     TARGETS,
     CellRun,
     CellStudyOptions,
@@ -62,7 +62,7 @@ def test_the_table_has_every_run_and_grows_with_them(tmp_path: Path, monkeypatch
         assert len(json.loads(written.read_text())["runs"]) == seed if written.exists() else seed == 0
         return CellRun(**{**vars(GOOD), "scenario": name, "seed": seed, "torch_max_mm": 0.1 * (seed + 1)})
 
-    monkeypatch.setattr("weldcal.tools.studies.cell_study.weld_once", weld)
+    monkeypatch.setattr("weldcal.tools.studies.cell.study.weld_once", weld)
     study = run_cell_study(CellStudyOptions(tmp_path / "out", ("l_groove",), 2))
     assert study.met
     assert [r.seed for r in study.runs] == [0, 1]

@@ -19,7 +19,7 @@ from weldcal.calibration.geometry.circle_steps import circle_steps, middle, solv
 from weldcal.calibration.geometry.plane_moments import weighted_moments
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
-from weldcal.tools.studies.flange_frames import facing, flange_frame
+from weldcal.tools.studies.flange.frames import facing, flange_frame
 
 
 @settings(deadline=None)  # the first call compiles

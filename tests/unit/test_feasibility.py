@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from weldcal.tools.studies.seams import arcs, s_curve
+from weldcal.tools.studies.weld.seams import arcs, s_curve
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics, torch_events
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve

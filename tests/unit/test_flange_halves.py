@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import get_flange
-from weldcal.tools.studies.flange_halves import center_bound, edge_blur, study_parts
+from weldcal.tools.studies.flange.halves import center_bound, edge_blur, study_parts
 
 Array = NDArray[np.float64]
 STANDARD = get_flange("tool-ring-63")

@@ -11,10 +11,10 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
-from weldcal.tools.studies.few_scans import study_few_scans
-from weldcal.tools.studies.ingredients import Ingredient, study_ingredients
-from weldcal.tools.studies.live_redraw import Station, bound_covariance, joints_of, redraw
-from weldcal.tools.studies.live_target import live_scenario
+from weldcal.tools.studies.flange.few_scans import study_few_scans
+from weldcal.tools.studies.flange.ingredients import Ingredient, study_ingredients
+from weldcal.tools.studies.flange.live_redraw import Station, bound_covariance, joints_of, redraw
+from weldcal.tools.studies.flange.live_target import live_scenario
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])

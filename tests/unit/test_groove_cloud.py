@@ -19,9 +19,9 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
-from weldcal.tools.benchmarks import seam_planning
-from weldcal.tools.benchmarks.plan_scenes import Scene, box, cast, looking_at, scan_part, table
-from weldcal.tools.benchmarks.plan_trials import sideways
+from weldcal.tools.studies.seam_planning import benchmark as seam_planning
+from weldcal.tools.studies.seam_planning.scenes import Scene, box, cast, looking_at, scan_part, table
+from weldcal.tools.studies.seam_planning.trials import sideways
 from weldcal.welding.locate.groove_cloud import extract_groove
 from weldcal.welding.locate.groove_seam import (
     GrooveNotFound,

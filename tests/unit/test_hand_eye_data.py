@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.models.errors import InputError
-from weldcal.tools.benchmarks.hand_eye import HandEyeBenchmark, run_hand_eye_benchmark, write_table
+from weldcal.tools.studies.hand_eye.comparison import HandEyeBenchmark, run_hand_eye_benchmark, write_table
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/handeye"
 

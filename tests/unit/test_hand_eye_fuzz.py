@@ -12,7 +12,7 @@ from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, solve_problem
-from weldcal.tools.benchmarks.hand_eye_fuzz import MISTAKES, fuzz, judge, random_world
+from weldcal.tools.studies.hand_eye.fuzz import MISTAKES, fuzz, judge, random_world
 
 from .hand_eye_poses import Array, eye_in_hand, random_poses
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.tools.studies.budgets import KINEMATIC, NOMINAL, Budget
-from weldcal.tools.studies.metrics import RunMetrics, judge
-from weldcal.tools.studies.plant import simulate
-from weldcal.tools.studies.seams import TrueSeam, arcs, corner
-from weldcal.tools.studies.weld_rows import Case
-from weldcal.tools.studies.weld_study import study_config
+from weldcal.tools.studies.weld.budgets import KINEMATIC, NOMINAL, Budget
+from weldcal.tools.studies.weld.metrics import RunMetrics, judge
+from weldcal.tools.studies.weld.plant import simulate
+from weldcal.tools.studies.weld.rows import Case
+from weldcal.tools.studies.weld.seams import TrueSeam, arcs, corner
+from weldcal.tools.studies.weld.study import study_config
 from weldcal.welding.seam.refinement import RefinedSeam
 from weldcal.welding.servo.chord import UnknownLaw
 from weldcal.welding.servo.laws import LAWS, get_law, literal_tangent

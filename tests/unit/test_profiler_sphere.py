@@ -31,7 +31,7 @@ from weldcal.calibration.profiler.sphere.linear import (
 )
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.profiler_worlds import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
+from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared/data/profiler"
 MM = 1e-3

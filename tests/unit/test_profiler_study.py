@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.profiler_command import ProfilerStudyOptions, run_profiler_study
-from weldcal.tools.studies.profiler_edge import edge_rows
-from weldcal.tools.studies.profiler_fixed import fixed_lines, told
-from weldcal.tools.studies.profiler_pieces import groove_mesh, scan_groove
-from weldcal.tools.studies.profiler_sets import made_edge_trials
-from weldcal.tools.studies.profiler_sphere import METHODS, WorldData, measure
-from weldcal.tools.studies.profiler_worlds import SphereWorld, sphere_trial
+from weldcal.tools.studies.profiler.command import ProfilerStudyOptions, run_profiler_study
+from weldcal.tools.studies.profiler.edge import edge_rows
+from weldcal.tools.studies.profiler.fixed import fixed_lines, told
+from weldcal.tools.studies.profiler.pieces import groove_mesh, scan_groove
+from weldcal.tools.studies.profiler.sets import made_edge_trials
+from weldcal.tools.studies.profiler.sphere import METHODS, WorldData, measure
+from weldcal.tools.studies.profiler.worlds import SphereWorld, sphere_trial
 
 
 def test_on_other_edges_the_joint_method_is_near_its_bound_and_the_papers_is_not() -> None:

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.tools.studies.budgets import HARD, NOMINAL, PERFECT
-from weldcal.tools.studies.groove import DROP_M as DROP
-from weldcal.tools.studies.groove import SEAT_M as SEAT
-from weldcal.tools.studies.seams import s_curve
+from weldcal.tools.studies.weld.budgets import HARD, NOMINAL, PERFECT
+from weldcal.tools.studies.weld.groove import DROP_M as DROP
+from weldcal.tools.studies.weld.groove import SEAT_M as SEAT
+from weldcal.tools.studies.weld.seams import s_curve
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import (

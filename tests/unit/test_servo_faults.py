@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
-from weldcal.tools.studies.budgets import NOMINAL
-from weldcal.tools.studies.plant import simulate
-from weldcal.tools.studies.seams import TrueSeam, arcs
+from weldcal.tools.studies.weld.budgets import NOMINAL
+from weldcal.tools.studies.weld.plant import simulate
+from weldcal.tools.studies.weld.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoConfig, ServoSample, TouchConfig, WeldingState
 from weldcal.welding.servo.step import welding_step

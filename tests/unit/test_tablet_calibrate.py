@@ -25,7 +25,7 @@ from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.tablet import tablet
-from weldcal.tools.studies.tablet_paper import published_touches
+from weldcal.tools.studies.tablet.paper import published_touches
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
 P_FP = np.array([-0.002, -0.021, 0.163])

@@ -24,8 +24,8 @@ from weldcal.calibration.tablet.published.two_stage import (
 )
 from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.cli.reproduce.group import reproduce
-from weldcal.tools.studies.tablet_paper import STAGE_1, STAGE_2, published_touches
-from weldcal.tools.studies.tablet_study import compare_signs, dh_by_eq_20
+from weldcal.tools.studies.tablet.paper import STAGE_1, STAGE_2, published_touches
+from weldcal.tools.studies.tablet.study import compare_signs, dh_by_eq_20
 
 PUBLISHED = Path(__file__).resolve().parents[2].parent / "shared/data/profiler/tablet_published.npz"
 GATE_MM = 0.0015  # the issue's: half the last printed digit is 0.005

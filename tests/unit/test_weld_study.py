@@ -12,13 +12,13 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.reproduce.group import reproduce
-from weldcal.tools.studies.budgets import HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.studies.groove import DROP_M, SEAT_M, Groove, Tip, floor
-from weldcal.tools.studies.metrics import RunMetrics
-from weldcal.tools.studies.seams import NAMES, UnknownSeam, get_seam
-from weldcal.tools.studies.turns import run_turn
-from weldcal.tools.studies.weld_rows import ROWS, Case, Target, UnknownRow, get_rows
-from weldcal.tools.studies.weld_study import CaseResult, hold_against, run_case
+from weldcal.tools.studies.weld.budgets import HARD, NOMINAL, PERFECT, planned_seam, roughness
+from weldcal.tools.studies.weld.groove import DROP_M, SEAT_M, Groove, Tip, floor
+from weldcal.tools.studies.weld.metrics import RunMetrics
+from weldcal.tools.studies.weld.rows import ROWS, Case, Target, UnknownRow, get_rows
+from weldcal.tools.studies.weld.seams import NAMES, UnknownSeam, get_seam
+from weldcal.tools.studies.weld.study import CaseResult, hold_against, run_case
+from weldcal.tools.studies.weld.turns import run_turn
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 

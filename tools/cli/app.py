@@ -280,7 +280,7 @@ def benchmark_cell(
     """How fast the whole cell runs: real-time factor of the welding phase, finger camera included."""
     folder = out or fresh_folder("benchmark", "cell", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark cell") as progress:
-        from weldcal.tools.benchmarks.cell import run_cell_benchmark
+        from weldcal.tools.studies.cell.speed import run_cell_benchmark
 
         summary = run_cell_benchmark(folder, seed, progress)
     finish("benchmark cell", summary, folder, json_wanted=json)
@@ -298,7 +298,7 @@ def benchmark_seeds(
     """The demo over many seeds: does every run end done, and how far off are calibration and torch at worst."""
     folder = out or fresh_folder("benchmark", f"seeds-{scenario}", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark seeds") as progress:
-        from weldcal.tools.benchmarks.seeds import run_seeds
+        from weldcal.tools.studies.cell.seeds import run_seeds
 
         summary = run_seeds(scenario, folder, range(seed, seed + runs), progress)
     finish("benchmark seeds", summary, folder, json_wanted=json)

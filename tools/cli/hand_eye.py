@@ -128,7 +128,7 @@ def benchmark(
 
     folder = out or fresh_folder("benchmark", "hand-eye", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark hand-eye") as progress:
-        from weldcal.tools.benchmarks.hand_eye import run_hand_eye_benchmark, write_table
+        from weldcal.tools.studies.hand_eye.comparison import run_hand_eye_benchmark, write_table
 
         report = run_hand_eye_benchmark(data, quick=quick, seed=seed, progress=progress)
         text = write_table(report, folder)

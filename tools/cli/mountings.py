@@ -69,7 +69,7 @@ def benchmark_mountings(
 
     folder = out or fresh_folder("benchmark", "mountings", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark mountings") as progress:
-        from weldcal.tools.benchmarks.mountings import run_mountings
+        from weldcal.tools.studies.hand_eye.mountings import run_mountings
 
         summary, table = run_mountings(folder, range(seed, seed + runs), tuple(names or ()), progress)
     if not json:

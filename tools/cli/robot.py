@@ -39,7 +39,7 @@ def benchmark_robot_faults(
     """Every fault of the robot link at 0.05 m/s on an emulated controller: does the arm stop, stay, and say why."""
     folder = out or fresh_folder("benchmark", "robot-faults", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark robot-faults") as progress:
-        from weldcal.tools.benchmarks.robot_faults import run_fault_benchmark
+        from weldcal.tools.studies.robot.faults import run_fault_benchmark
 
         report = run_fault_benchmark(
             folder, address=address, sequences=sequences, seconds=seconds, seed=seed, progress=progress
@@ -59,7 +59,7 @@ def benchmark_robot(
     """A 125 Hz command stream to an emulated controller: periods, latencies, and every deadline missed by 20 ms."""
     folder = out or fresh_folder("benchmark", "robot", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark robot") as progress:
-        from weldcal.tools.benchmarks.robot import run_robot_benchmark
+        from weldcal.tools.studies.robot.stream import run_robot_benchmark
 
         report = run_robot_benchmark(folder, address=address, minutes=minutes, seed=seed, progress=progress)
     finish("benchmark robot", report.summary(), folder, json_wanted=json)

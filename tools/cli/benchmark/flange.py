@@ -44,7 +44,7 @@ def speed(
 ) -> None:
     """How fast the flange is found in a scan, beside the paper's loop, an Open3D chain and a PCL-style search."""
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange") as progress:
-        from weldcal.tools.benchmarks.flange import run_flange_benchmark
+        from weldcal.tools.studies.flange.speed import run_flange_benchmark
 
         rows = run_flange_benchmark(seed, loop=loop, progress=progress)
     reference = {r.name: r for r in rows}["weldcal, " + rows[0].name.removeprefix("weldcal, ")]
@@ -78,7 +78,7 @@ def frames(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-frames") as progress:
         from weldcal.models.flanges import get_flange
         from weldcal.models.scanners import get_scanner
-        from weldcal.tools.studies.flange_found import study_frames
+        from weldcal.tools.studies.flange.found import study_frames
 
         found = study_frames(get_scanner("phoxi_m", width), get_flange(flange), count, seed=seed, progress=progress)
     summary: dict[str, object] = {
@@ -117,7 +117,7 @@ def hidden(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-hidden") as progress:
         from weldcal.models.flanges import get_flange
         from weldcal.models.scanners import get_scanner
-        from weldcal.tools.studies.flange_hidden import WAYS, study_hidden
+        from weldcal.tools.studies.flange.hidden import WAYS, study_hidden
 
         scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
         rows = [study_hidden(w, scanner, standard, count, share=share, seed=seed, progress=progress) for w in WAYS]
@@ -142,7 +142,7 @@ def parts(
         from weldcal.calibration.data.dataset import load_dataset
         from weldcal.models.errors import InputError
         from weldcal.models.flanges import get_flange
-        from weldcal.tools.studies.flange_halves import study_parts
+        from weldcal.tools.studies.flange.halves import study_parts
 
         data = load_dataset(dataset)
         if not data.clouds:
@@ -168,7 +168,7 @@ def honesty(
     """Do stated 95 % regions hold the truth 95 times in 100, and held-out errors agree with true ones?"""
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-honesty") as progress:
         from weldcal.tools.report.render import write_atomic
-        from weldcal.tools.studies.coverage import coverage_picture, study_corrected, study_coverage
+        from weldcal.tools.studies.flange.coverage import coverage_picture, study_corrected, study_coverage
 
         studies = [study_coverage(n, runs, seed, progress) for n in (5, 6, 8, 12, 20)]
         studies += [study_corrected(n, runs, seed, progress) for n in (6, 8, 12, 20)]
@@ -213,8 +213,8 @@ def live(
         import numpy as np
 
         from weldcal.tools.report.render import write_atomic
-        from weldcal.tools.studies.live_redraw import joined
-        from weldcal.tools.studies.live_target import TARGET_M, TARGET_RAD, live_picture, study_live
+        from weldcal.tools.studies.flange.live_redraw import joined
+        from weldcal.tools.studies.flange.live_target import TARGET_M, TARGET_RAD, live_picture, study_live
 
         rows = study_live(
             seeds, first=seed, scans=scans, repeatability_mm=repeatability, redraws=redraws, progress=progress
@@ -280,7 +280,7 @@ def ingredients(
     ):
         import numpy as np
 
-        from weldcal.tools.studies.ingredients import study_ingredients
+        from weldcal.tools.studies.flange.ingredients import study_ingredients
 
         found = study_ingredients(dataset, seed, progress)
         rows: list[dict[str, object]] = []
@@ -320,7 +320,7 @@ def few(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-few") as progress:
         import numpy as np
 
-        from weldcal.tools.studies.few_scans import study_few_scans
+        from weldcal.tools.studies.flange.few_scans import study_few_scans
 
         found = study_few_scans(dataset, draws, seed, progress=progress)
         rows: list[dict[str, object]] = []

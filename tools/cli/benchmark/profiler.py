@@ -28,7 +28,7 @@ def profiler(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark profiler") as progress:
-        from weldcal.tools.benchmarks.profiler import lines, run_profiler_benchmark
+        from weldcal.tools.studies.profiler.speed import lines, run_profiler_benchmark
 
         folder = out or fresh_folder("benchmark", "profiler", seed)
         summary = run_profiler_benchmark(folder, seed, data, progress)

@@ -33,7 +33,7 @@ def seam_planning(
     folder = out or fresh_folder("benchmark", "seam-planning", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark seam-planning") as progress:
         from weldcal.models.scanners import get_scanner
-        from weldcal.tools.benchmarks.seam_planning import run_seam_planning_benchmark
+        from weldcal.tools.studies.seam_planning.benchmark import run_seam_planning_benchmark
 
         names = [get_scanner(name).name for name in preset] if preset else None
         summary, rows = run_seam_planning_benchmark(folder, runs, seed, names, progress, full=full, troubles=troubles)

@@ -32,7 +32,7 @@ def cell(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce cell") as progress:
-        from weldcal.tools.studies.cell_study import CellStudyOptions, run_cell_study
+        from weldcal.tools.studies.cell.study import CellStudyOptions, run_cell_study
 
         names = tuple(name.strip() for name in scenarios.split(",") if name.strip())
         folder = out or fresh_folder("reproduce", "cell", seed)
@@ -40,7 +40,7 @@ def cell(
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.cell_tables import print_cell_study
+        from weldcal.tools.studies.cell.tables import print_cell_study
 
         print_cell_study(study)
     if not study.met:

@@ -35,8 +35,8 @@ def flange(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce flange") as progress:
-        from weldcal.tools.studies.flange_command import StudyOptions, run_study
-        from weldcal.tools.studies.flange_rows import summary
+        from weldcal.tools.studies.flange.published.command import StudyOptions, run_study
+        from weldcal.tools.studies.flange.published.rows import summary
 
         folder = out or fresh_folder("reproduce", "flange", seed)
         study = run_study(StudyOptions(folder, data, seed, quick), progress)
@@ -44,6 +44,6 @@ def flange(
     if json:
         console.emit_json(found)
         return
-    from weldcal.tools.studies.flange_tables import print_study
+    from weldcal.tools.studies.flange.published.tables import print_study
 
     print_study(study)

@@ -28,7 +28,7 @@ def profiler_seeds(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce profiler-seeds") as progress:
-        from weldcal.tools.studies.profiler_seeds import run_profiler_seeds
+        from weldcal.tools.studies.profiler.seeds import run_profiler_seeds
 
         folder = out or fresh_folder("reproduce", "profiler-seeds", seed)
         study = run_profiler_seeds(folder, seed, seeds, data, progress)

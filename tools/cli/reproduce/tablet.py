@@ -41,7 +41,7 @@ def reproduce_tablet(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce tablet") as progress:
-        from weldcal.tools.studies.tablet_command import TabletOptions, run_tablet_study
+        from weldcal.tools.studies.tablet.command import TabletOptions, run_tablet_study
 
         folder = out or fresh_folder("reproduce", "tablet", seed)
         study = run_tablet_study(TabletOptions(folder, seed, evolution_seeds, trials), progress)
@@ -67,7 +67,7 @@ def benchmark_tablet(
 
     folder = out or fresh_folder("benchmark", "tablet", seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark tablet") as progress:
-        from weldcal.tools.benchmarks.tablet import run_tablet_benchmark
+        from weldcal.tools.studies.tablet.speed import run_tablet_benchmark
 
         summary = run_tablet_benchmark(folder, seed, progress)
     finish("benchmark tablet", summary, folder, json_wanted=json)

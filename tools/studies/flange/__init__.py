@@ -1,0 +1,1 @@
+"""Studies of the flange calibration: speed, coverage, limits."""

@@ -1,0 +1,191 @@
+"""Do the regions that a calibration states hold the truth as often as they say? Simulated calibrations by the hundred."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from scipy.stats import binom, chi2
+
+from weldcal.calibration.errors import CoplanarPoses
+from weldcal.calibration.eye_on_base.estimate import with_scanner
+from weldcal.calibration.eye_on_base.scanner_fit import from_motion
+from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
+from weldcal.calibration.planning.observability import check_diversity
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.report.pictures import svg
+from weldcal.tools.studies.flange.frames import facing
+
+Array = NDArray[np.float64]
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Of ``runs`` calibrations from ``poses`` sightings each: how often the truth lies within the stated 95 % region of
+    X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both means
+    over the runs, with the noise of the scan that is left out in both (NaN where that was not looked at). ``corrected``: with a
+    scanner that is off in scale and gradient, and its correction."""
+
+    poses: int
+    runs: int
+    pose: float
+    point: float
+    held_out_over_true: float
+    corrected: bool = False
+
+    def chance(self) -> tuple[float, float]:
+        """Shares between which 99 % of such studies fall where the regions are exact."""
+        low, high = (binom.ppf(q, self.runs, LEVEL) / self.runs for q in (0.005, 0.995))
+        return float(low), float(high)
+
+
+def simulated_sightings(
+    n: int, rng: np.random.Generator, *, sigma_m: float = 1e-4, sigma_rad: float = 1e-3
+) -> tuple[list[Observation], RigidTransform]:
+    """Sightings (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``sigma_m`` and ``sigma_rad`` an
+    axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
+    are drawn again."""
+    X_BC = RigidTransform(
+        RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
+    )
+    while True:
+        out = [_simulated_sighting(f"p{k}", X_BC, rng, sigma_m, sigma_rad) for k in range(n)]
+        try:
+            check_diversity(np.array([o.p_BR for o in out]), np.ones(n, dtype=bool))
+        except CoplanarPoses:
+            continue
+        return out, X_BC
+
+
+def _simulated_sighting(
+    id: str, X_BC: RigidTransform, rng: np.random.Generator, sigma_m: float, sigma_rad: float
+) -> Observation:
+    p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
+    X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
+    A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
+    covariance = A @ A.T
+    normal_sigma = rng.uniform(2e-5, 2e-4)
+    seen = p + A @ rng.standard_normal(3) + sigma_m * rng.standard_normal(3)
+    z = X_CR.rotation().matrix()[:, 2]
+    lean = float(np.hypot(sigma_rad, normal_sigma)) * rng.standard_normal(3)
+    normal = exp_rotation(lean - z * float(z @ lean)).matrix() @ z
+    return Observation(id, X_BC @ X_CR, seen, normal, covariance, normal_sigma)
+
+
+WRONG = ScannerCorrection(1.002, (0.006, -0.004))
+"""What the simulated scanner needs: 0.2 % in scale, and up to 0.06 % per 100 mm across its image."""
+
+
+def seen_by_a_wrong_scanner(
+    sightings: list[Observation], rng: np.random.Generator, *, sigma_ratio: float = 1e-3
+) -> tuple[list[Observation], dict[str, HolePattern]]:
+    """The same sightings as a scanner makes them that needs WRONG, and the hole circle that it sees in each."""
+    out, patterns = [], {}
+    for o in sightings:
+        seen = as_measured(np.asarray(o.p_CR))
+        J = WRONG.jacobian(seen)
+        assert o.n_C is not None
+        normal = J.T @ o.n_C
+        out.append(replace(o, p_CR=seen, n_C=normal / np.linalg.norm(normal)))
+        x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
+        ratio = 2.0 / float(x @ J @ x + y @ J @ y) + sigma_ratio * rng.standard_normal()
+        R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
+        patterns[o.id] = HolePattern(np.zeros((4, 3)), np.zeros(4), seen, RigidTransform(R, seen), ratio, 0.0)
+    return out, patterns
+
+
+def as_measured(p_C: Array) -> Array:
+    """Where the scanner that needs WRONG puts a point (3,) m that truly is at p_C."""
+    seen = p_C.copy()
+    for _ in range(20):  # a contraction: the correction is near the identity
+        seen = seen + p_C - WRONG.points(seen)
+    return seen
+
+
+def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
+    """As study_coverage, with a scanner that is off and a correction from the same sightings. Deterministic for ``seed``."""
+    inside_pose, inside_point, done = 0, 0, 0
+    limits = chi2.ppf(LEVEL, 6), chi2.ppf(LEVEL, 3)
+    p_C = np.array([0.02, -0.05, 0.72])
+    for k in range(runs):
+        if k % 20 == 0:
+            progress(f"corrected calibrations from {poses} scans", k / runs)
+        rng = np.random.default_rng([seed, poses, k, 3])
+        sightings, X_BC = simulated_sightings(poses, rng)
+        sightings, patterns = seen_by_a_wrong_scanner(sightings, rng)
+        rigid = estimate_eye_on_base(sightings, SolveConfig(seed=seed, hypotheses=60, leave_one_out=False))
+        found = from_motion(sightings, patterns, usual=True, start=rigid.X_BC)
+        assert found.X_BC is not None
+        estimate = with_scanner(rigid, found.correction, found.X_BC, found.joint, found.redundancy)
+        e = _error(estimate.X_BC, X_BC)
+        inside_pose += float(e @ np.linalg.solve(estimate.covariance, e)) < limits[0]
+        p_BQ = X_BC @ p_C
+        d = p_BQ - estimate.X_BC @ found.correction.points(as_measured(p_C))
+        inside_point += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < limits[1]
+        done += 1
+    return Coverage(poses, runs, inside_pose / done, inside_point / done, float("nan"), corrected=True)
+
+
+def _error(X: RigidTransform, X_true: RigidTransform) -> Array:
+    """Error (6,) of an estimate in the tangent of its covariance."""
+    turn = rotation_vector(X_true.rotation() @ X.rotation().inverse())
+    return np.concatenate([turn, X_true.translation() - X.translation()])
+
+
+def coverage_picture(studies: list[Coverage]) -> bytes:
+    """Shares inside their stated 95 % regions against the number of scans, and the band in which exact regions fall."""
+    figure = Figure(figsize=(8.2, 3.6), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
+    low, high = studies[0].chance()
+    for ax, corrected, title in zip(
+        axes, (False, True), ("a right scanner", "a scanner off by 0.2 %, corrected"), strict=True
+    ):
+        chosen = [s for s in studies if s.corrected == corrected]
+        n = [s.poses for s in chosen]
+        ax.axhspan(100 * low, 100 * high, color="#1d5f8a", alpha=0.10, linewidth=0)
+        ax.axhline(95.0, color="#444", linewidth=1, linestyle="--")
+        ax.plot(n, [100 * s.pose for s in chosen], color="#1d5f8a", marker="o", label="X_BC")
+        ax.plot(n, [100 * s.point for s in chosen], color="#b08a2e", marker="s", label="the work point")
+        ax.set_xticks(n)
+        ax.set_xlabel("number of scans")
+        ax.set_title(title, fontsize=10, loc="left")
+        ax.set_ylim(88.0, 100.0)
+    axes[0].set_ylabel("inside the stated 95 % region, %")
+    axes[0].legend(frameon=False, fontsize=9, loc="lower right")
+    return svg(figure, *axes)
+
+
+def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
+    """Calibrate ``runs`` times from ``poses`` simulated sightings. Deterministic for ``seed``."""
+    inside_pose, inside_point = 0, 0
+    stated, true = [], []
+    limits = chi2.ppf(LEVEL, 6), chi2.ppf(LEVEL, 3)
+    for k in range(runs):
+        if k % 20 == 0:
+            progress(f"calibrations from {poses} scans", k / runs)
+        rng = np.random.default_rng([seed, poses, k])
+        sightings, X_BC = simulated_sightings(poses, rng)
+        estimate = estimate_eye_on_base(sightings, SolveConfig(seed=seed, hypotheses=60))
+        e = _error(estimate.X_BC, X_BC)
+        inside_pose += float(e @ np.linalg.solve(estimate.covariance, e)) < limits[0]
+        p_C = np.array([0.02, -0.05, 0.72])
+        p_BQ = X_BC @ p_C
+        d = p_BQ - estimate.X_BC @ p_C
+        inside_point += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < limits[1]
+        # the same noise as a sighting of this run has, at a place that it did not use
+        other = np.random.default_rng([seed, poses, k, 2])
+        place = other.uniform(np.array([-0.18, -0.13, 0.5]), np.array([0.18, 0.13, 0.9]))
+        seen = place + 1e-4 * other.standard_normal(3) + 4e-5 * other.standard_normal(3)
+        true.append(float(np.linalg.norm(estimate.X_BC @ seen - X_BC @ place)))
+        stated += estimate.held_out.position_m.tolist()
+    return Coverage(
+        poses, runs, inside_pose / runs, inside_point / runs, float(np.mean(stated) / np.mean(true)) if runs else np.nan
+    )

@@ -1,0 +1,1 @@
+"""The flange paper's tables and figures, computed again."""

@@ -1,0 +1,169 @@
+"""How fast the flange is found: ours, the paper's loop, an Open3D chain and a PCL-style random search, in one run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import open3d as o3d
+from numpy.typing import NDArray
+
+from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
+from weldcal.models.scanners import get_scanner
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.studies.flange.frames import Frame, facing, flange_frame
+
+Array = NDArray[np.float64]
+
+FLANGE = "iso9409-1-50-4-m6"
+_E_D, _E_R, _K_MAX = 0.0003, 0.001, 10_000  # paper, section 3.2.2
+_SEGMENTED = 13_000  # points, as the recorded clouds have
+
+
+@dataclass(frozen=True)
+class Timing:
+    """One row: what ran on what, median and least milliseconds of processor time, and the centre's error, mm (None: it found nothing)."""
+
+    name: str
+    median_ms: float
+    least_ms: float
+    error_mm: float | None
+    target_ms: float | None = None
+
+
+def run_flange_benchmark(
+    seed: int = 0, *, repeats: int = 15, loop: bool = True, progress: Progress = no_progress
+) -> list[Timing]:
+    """Every way on the same simulated PhoXi M scans; single thread where the method's library lets us ask for it.
+
+    ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
+    """
+    standard = get_flange(FLANGE)
+    frames: dict[str, Frame] = {}
+    for name, width in (("0.5", 824), ("3.2", 2064)):
+        progress("ray-casting the scans", 0.05 * len(frames))
+        X_CR = facing(np.array([0.04, -0.03, 0.62]), np.radians(12.0), 0.7, 0.3)
+        frames[name] = flange_frame(get_scanner("phoxi_m", width), standard, np.random.default_rng(seed), X_CR=X_CR)
+    cloud, truth = _segmented(frames["3.2"], standard.outer_m)
+    rows: list[Timing] = []
+
+    def find(points: Array, guess: FlangeGuess | None = None) -> Callable[[], Array]:
+        return lambda: fit_flange(points, standard, guess=guess).center_C
+
+    ours: list[tuple[str, Callable[[], Array], float]] = [(f"segmented cloud, {len(cloud)} points", find(cloud), 1.0)]
+    for name, target in (("0.5", 20.0), ("3.2", 30.0)):
+        points = frames[name].points_C
+        ours.append((f"{name} Mpx frame", find(points), target))
+        last = fit_flange(points, standard)
+        guess = FlangeGuess(last.center_C, 0.7 * standard.outer_m, last.normal_C)
+        ours.append((f"{name} Mpx frame, tracked", find(points, guess), 2.0))
+    for k, (name, job, target) in enumerate(ours):
+        progress("ours", 0.1 + 0.08 * k)
+        rows.append(_time(f"weldcal, {name}", job, repeats, truth, target))
+    progress("the others", 0.55)
+    rows.append(_time("PCL-style random circles in NumPy, segmented cloud", lambda: _ransac(cloud, seed), 3, truth))
+    progress("the others", 0.65)
+    rows.append(
+        _time("Open3D chain, 0.5 Mpx frame", lambda: _open3d_chain(frames["0.5"].points_C, float(truth[2])), 1, truth)
+    )
+    if loop:
+        progress("the paper's loop", 0.8)
+        rows.append(
+            _time("paper's search as a Python loop, segmented cloud", lambda: _paper_loop(cloud, seed), 1, truth)
+        )
+    return rows
+
+
+def _time(
+    name: str, job: Callable[[], Array | None], repeats: int, truth: Array, target: float | None = None
+) -> Timing:
+    spans, center = [], None
+    for k in range(repeats + (repeats > 1)):
+        start = time.process_time()
+        center = job()
+        if k or repeats == 1:  # the first of many warms the caches
+            spans.append(1e3 * (time.process_time() - start))
+    error = None if center is None else float(1e3 * np.linalg.norm(center - truth))
+    return Timing(name, float(np.median(spans)), float(min(spans)), error, target)
+
+
+def _segmented(frame: Frame, outer_m: float) -> tuple[Array, Array]:
+    """The flange's own points of a frame, thinned to a recorded cloud's number, and the true centre."""
+    assert frame.X_CR is not None
+    p = frame.points_C.reshape(-1, 3)
+    p = p[np.isfinite(p).all(axis=1)]
+    d = frame.X_CR.inverse() @ p.T
+    near = (np.hypot(d[0], d[1]) < 0.53 * outer_m) & (np.abs(d[2]) < 0.0015)
+    p = p[near]
+    keep = np.sort(np.random.default_rng(0).choice(len(p), min(_SEGMENTED, len(p)), replace=False))
+    return p[keep], np.asarray(frame.X_CR.translation())
+
+
+def _circle(a: Array, b: Array, c: Array) -> tuple[Array, float]:
+    """Circle through three points in space."""
+    u, v = b - a, c - a
+    w = np.cross(u, v)
+    ww = float(w @ w)
+    if ww < 1e-18:
+        return a, np.inf
+    out = (np.cross(w, u) * float(v @ v) + np.cross(v, w) * float(u @ u)) / (2.0 * ww)
+    return a + out, float(np.linalg.norm(out))
+
+
+def _paper_loop(points: Array, seed: int) -> Array | None:
+    """Section 2.1.4 as its Python program goes: draw, check the radius, count the points one by one."""
+    rng = np.random.default_rng(seed)
+    best, count = None, 0
+    everything = points.tolist()
+    for _ in range(_K_MAX):
+        center, radius = _circle(*points[rng.integers(0, len(points), 3)])
+        if abs(radius - PAPER_RADIUS_M) > _E_R:
+            continue
+        x, y, z = center.tolist()
+        agree = 0
+        for px, py, pz in everything:
+            if abs(((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2) ** 0.5 - radius) < _E_D:
+                agree += 1
+        if agree > count:
+            best, count = center, agree
+    return best
+
+
+def _ransac(points: Array, seed: int) -> Array | None:
+    """The same search with each candidate's count as one array operation, as PCL's SACMODEL_CIRCLE3D does in C++."""
+    rng = np.random.default_rng(seed)
+    best, count = None, 0
+    for _ in range(_K_MAX):
+        center, radius = _circle(*points[rng.integers(0, len(points), 3)])
+        if abs(radius - PAPER_RADIUS_M) > _E_R:
+            continue
+        agree = int((np.abs(np.linalg.norm(points - center, axis=1) - radius) < _E_D).sum())
+        if agree > count:
+            best, count = center, agree
+    return best
+
+
+def _open3d_chain(frame: Array, depth_m: float) -> Array | None:
+    """Gate about the known depth, statistical outlier removal, planes one after another, clusters, circle search: library calls all through."""
+    p = frame.reshape(-1, 3)
+    p = p[np.isfinite(p).all(axis=1)]
+    p = p[np.abs(p[:, 2] - depth_m) < 0.04]
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p))
+    cloud, _ = cloud.remove_statistical_outlier(50, 2.0)
+    o3d.utility.random.seed(0)
+    for _ in range(6):
+        if len(cloud.points) < 500:
+            return None
+        _, inside = cloud.segment_plane(0.0008, 3, 500)
+        face = cloud.select_by_index(inside)
+        labels = np.asarray(face.cluster_dbscan(0.003, 8))
+        points = np.asarray(face.points)
+        for k in range(int(labels.max()) + 1):
+            part = points[labels == k]
+            if len(part) > 400 and 0.055 < float(np.ptp(part, axis=0).max()) < 0.07:
+                return _ransac(part, 0)
+        cloud = cloud.select_by_index(inside, invert=True)
+    return None

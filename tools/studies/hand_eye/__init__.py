@@ -1,0 +1,1 @@
+"""Hand-eye solvers on recorded and random data."""

@@ -1,0 +1,1 @@
+"""The profiler papers' tables, computed again, and studies of the profiler calibration."""

@@ -1,0 +1,159 @@
+"""The pictures of the profiler's study: the edge paper's Fig. 6 to 8, the seam's deviations and the boss."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from weldcal.tools.report.plots_weld import OURS, PLANNED, svg
+from weldcal.tools.studies.profiler.edge import COUNTS, EdgeRow
+from weldcal.tools.studies.profiler.sphere import METHODS, WorldResult
+
+if TYPE_CHECKING:
+    from weldcal.tools.studies.profiler.seeds import Line
+
+PAPER = PLANNED
+_COLOURS = {METHODS[0]: "black", METHODS[1]: PAPER, METHODS[2]: "#6aa5c9", METHODS[3]: OURS}
+
+
+def _tidy(axes: Axes, x: str, y: str) -> None:
+    axes.set(xlabel=x, ylabel=y)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25)
+
+
+def against_rotations(
+    rows: list[EdgeRow], names: tuple[str, ...], what: str, label: str, titles: dict[str, str]
+) -> bytes:
+    """Mean and standard deviation (bars) of a criterion over the number of rotations, a panel a set (Fig. 6 and 7)."""
+    picture = Figure(figsize=(7.2, 2.6), layout="constrained")
+    panels = np.atleast_1d(picture.subplots(1, len(names), sharey=True))
+    for axes, name in zip(panels, names, strict=True):
+        for method, colour, shift in (("paper", PAPER, -0.35), ("joint", OURS, 0.35)):
+            r = {x.rotations: x for x in rows if x.name == name and x.method == method}
+            mean = [getattr(r[n], f"{what}_mean_{label}") for n in COUNTS]
+            std = [getattr(r[n], f"{what}_std_{label}") for n in COUNTS]
+            low = np.minimum(std, mean)  # neither angle nor distance can be negative
+            axes.errorbar(
+                np.array(COUNTS) + shift,
+                mean,
+                yerr=[low, std],
+                color=colour,
+                marker="o",
+                ms=4,
+                lw=1.2,
+                capsize=3,
+                label=f"{method} method",
+            )
+        axes.set_xticks(COUNTS)
+        axes.set_title(titles[name], fontsize=9)
+        _tidy(axes, "rotations", "")
+    panels[0].set_ylabel({"deg": "angle to the edge, deg", "mm": "distance to the edge, mm"}[label])
+    picture.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=8
+    )
+    return svg(picture)
+
+
+def true_error(rows: list[EdgeRow], names: tuple[str, ...], titles: dict[str, str]) -> bytes:
+    """What the criteria hardly show: the pose's own rms error, with the Cramer-Rao bound."""
+    picture = Figure(figsize=(7.2, 2.6), layout="constrained")
+    panels = np.atleast_1d(picture.subplots(1, len(names), sharey=True))
+    for axes, name in zip(panels, names, strict=True):
+        for method, colour in (("paper", PAPER), ("joint", OURS)):
+            r = {x.rotations: x for x in rows if x.name == name and x.method == method}
+            axes.semilogy(
+                COUNTS,
+                [r[n].translation_mm for n in COUNTS],
+                color=colour,
+                marker="o",
+                ms=4,
+                lw=1.2,
+                label=f"{method} method",
+            )
+        axes.semilogy(COUNTS, [r[n].crb_mm for n in COUNTS], color="black", lw=1.0, ls=":", label="Cramér-Rao bound")
+        axes.set_xticks(COUNTS)
+        axes.set_title(titles[name], fontsize=9)
+        _tidy(axes, "rotations", "")
+    panels[0].set_ylabel("translation error, mm")
+    picture.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=8
+    )
+    return svg(picture)
+
+
+def ball(points: np.ndarray) -> bytes:
+    """A ball's profiles (n, m, 3) m brought together, a colour for each orientation of the flange (Fig. 8)."""
+    picture = Figure(figsize=(7.2, 4.0), layout="constrained")
+    axes = picture.add_subplot(projection="3d")
+    middle = points.reshape(-1, 3).mean(axis=0)
+    for k, p in enumerate(points):
+        axes.plot(*(1e3 * (p - middle)).T, color=f"C{(k // 6) % 10}", lw=0.8)
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+    axes.set_box_aspect((1, 1, 0.6))
+    return svg(picture)
+
+
+def seam(results: list[WorldResult]) -> bytes:
+    """Deviation of the seam's features from where the torch finds them, station by station (the sphere paper's Fig. 6)."""
+    shown = [r for r in results if r.seam_each_mm is not None]
+    first = [r for r in shown if r.world == shown[0].world]
+    picture = Figure(figsize=(7.2, 5.2), layout="constrained")
+    panels = picture.subplots(3, 1, sharex=True)
+    for axes, j, title in zip(panels, range(3), ("first edge", "root", "second edge"), strict=True):
+        for r in first:
+            assert r.seam_each_mm is not None
+            axes.semilogy(r.seam_each_mm[:, j], color=_COLOURS[r.method], marker=".", ms=3, lw=1.0, label=r.method)
+        axes.set_title(title, fontsize=9, loc="left")
+        _tidy(axes, "", "off, mm")
+    panels[-1].set_xlabel("station along the seam")
+    picture.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=8
+    )
+    return svg(picture)
+
+
+def boss(result: WorldResult) -> bytes:
+    """The boss's cloud by the planes it was divided into, with the slanted edges that were measured (Fig. 7 and 8)."""
+    assert result.cloud is not None
+    assert result.boss is not None
+    b, p = result.boss, result.cloud
+    middle = b.corners_top.mean(axis=0)
+    picture = Figure(figsize=(7.2, 4.4), layout="constrained")
+    axes = picture.add_subplot(projection="3d", computed_zorder=False)
+    for label in (0, 2, 3, 4, 5, 1):
+        q = 1e3 * (p[b.labels == label] - middle)
+        near = np.abs(q[:, :2]).max(axis=1) < 60.0
+        axes.scatter(*q[near][:: 8 if label == 0 else 4].T, s=0.8, color=f"C{label}", depthshade=False, rasterized=True)
+    for top, base in zip(b.corners_top, b.corners_base, strict=True):
+        axes.plot(*(1e3 * (np.array([top, base]) - middle)).T, color="black", lw=1.4, zorder=10)
+    axes.set(xlabel="x, mm", ylabel="y, mm", zlabel="z, mm")
+    axes.set_box_aspect((1, 1, 0.45))
+    axes.view_init(elev=38, azim=-60)
+    return svg(picture)
+
+
+def over_seeds(lines: Sequence[Line]) -> bytes:
+    """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
+    picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
+    axes = picture.add_subplot()
+    for k, line in enumerate(lines):
+        axes.plot(line.values / line.target, np.full(len(line.values), k), "o", ms=4, mew=0, alpha=0.5, color=OURS,
+                  label="one seed" if k == 0 else None)  # fmt: skip
+        low, high = np.nanmin(line.bounds) / line.target, np.nanmax(line.bounds) / line.target
+        axes.plot([low, high], [k + 0.28] * 2, "-", lw=3, color="0.45", solid_capstyle="round",
+                  label="its bound, over the seeds" if k == 0 else None)  # fmt: skip
+        if line.fixed is not None:
+            axes.plot(line.fixed.value / line.target, k, "D", ms=5, mfc="none", mec="black", mew=1.4,
+                      label="the fixed files" if k == 0 else None)  # fmt: skip
+    axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
+    axes.set_yticks(range(len(lines)), [f"{line.what}, {line.target:g} {line.unit}" for line in lines], fontsize=8)
+    axes.invert_yaxis()
+    _tidy(axes, "reached over target", "")
+    axes.set_xlim(left=0.0)
+    picture.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    return svg(picture)

@@ -1,0 +1,117 @@
+"""The profiler study's report page: targets, then the tables of both papers with ours beside them, and the pictures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from weldcal.calibration.data.results import software_version
+from weldcal.tools.report.render import fixed, render
+from weldcal.tools.studies.profiler import edge, plots, sphere
+from weldcal.tools.studies.profiler.fixed import told
+
+if TYPE_CHECKING:
+    from weldcal.tools.studies.profiler.command import ProfilerStudy
+
+Lines = list[tuple[str, ...]]
+
+
+def target_lines(study: ProfilerStudy) -> Lines:
+    """What, reached, target, verdict."""
+    return [(what, told(v, unit), f"≤ {limit:g} {unit}", verdict) for what, unit, v, limit, verdict in study.targets()]
+
+
+def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
+    """Tables 1 to 3 of the edge paper, over 10 to 25 rotations: as printed for its three objects, then every set and method."""
+    n = edge.COUNTS
+    alpha: Lines = []
+    d: Lines = []
+    radius: Lines = []
+    for j, thing in enumerate(("bar", "scale", "blade")):
+        head = ("printed" if j == 0 else "", thing)
+        alpha.append(
+            (*head, *(f"{fixed(edge.PRINTED_ALPHA[k][j], 2)} ± {fixed(edge.PRINTED_ALPHA_STD[k][j], 2)}" for k in n))
+        )
+        d.append((*head, *(f"{fixed(edge.PRINTED_D[k][j], 2)} ± {fixed(edge.PRINTED_D_STD[k][j], 2)}" for k in n)))
+        radius.append((*head, *(fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)))
+    for name in study.names:
+        for method in edge.METHODS:
+            r = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
+            head = (edge.TITLES[name] if method == edge.METHODS[0] else "", method)
+            alpha.append((*head, *(f"{fixed(r[k].alpha_mean_deg, 2)} ± {fixed(r[k].alpha_std_deg, 2)}" for k in n)))
+            d.append((*head, *(f"{fixed(r[k].d_mean_mm, 3)} ± {fixed(r[k].d_std_mm, 3)}" for k in n)))
+            radius.append((*head, *(fixed(r[k].radius_mm, 3) for k in n)))
+    return alpha, d, radius
+
+
+def error_lines(study: ProfilerStudy) -> Lines:
+    """The calibration's own error, which the criteria hardly show."""
+    lines: Lines = []
+    for name in study.names:
+        for n in edge.COUNTS:
+            p, j = (
+                next(r for r in study.edge if (r.name, r.rotations, r.method) == (name, n, m)) for m in edge.METHODS
+            )
+            lines.append(
+                (edge.TITLES[name] if n == edge.COUNTS[0] else "", str(n), f"{fixed(p.rotation_deg, 3)} / {fixed(p.translation_mm, 3)}",
+                 f"{fixed(j.rotation_deg, 3)} / {fixed(j.translation_mm, 3)}", f"{fixed(j.crb_deg, 3)} / {fixed(j.crb_mm, 3)}")
+            )  # fmt: skip
+    return lines
+
+
+def sphere_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
+    """Tables 1 to 3 of the sphere paper."""
+    points: Lines = []
+    seam: Lines = []
+    boss: Lines = []
+    for method in sphere.METHODS:
+        results = study.of(method)
+        printed = sphere.PRINTED_POINTS.get(method)
+        mean = np.mean([r.points_mm for r in results], axis=0)
+        points.append(
+            (
+                method,
+                *([fixed(v, 3) for v in printed] if printed else ["–"] * 3),
+                *(fixed(v, 3) for v in mean),
+                fixed(float(mean.mean()), 3),
+            )
+        )
+        s = [r.seam_mm for r in results if r.seam_mm is not None]
+        shown = [fixed(v, 3) for v in sphere.PRINTED_SEAM] if method == "compensated" else ["–"] * 3
+        seam.append((method, *shown, *(fixed(v, 3) for v in np.mean(s, axis=0))))
+        b = [r.boss_error for r in results if r.boss_error is not None]
+        shown = [fixed(v, 3) for v in sphere.PRINTED_BOSS] if method == "compensated" else ["–"] * 2
+        boss.append((method, *shown, *(f"{fixed(min(v), 3)} to {fixed(max(v), 3)}" for v in zip(*b, strict=True))))
+    return points, seam, boss
+
+
+def profiler_report(study: ProfilerStudy) -> str:
+    """The whole report as one self-contained HTML text."""
+    lines = target_lines(study)
+    alpha, d, radius = criteria_lines(study)
+    points, seam, boss = sphere_lines(study)
+    rows = list(study.edge)
+    with_boss = next(r for r in study.of(sphere.METHODS[3]) if r.boss is not None)
+    fixed_files = study.options.data is not None
+    return render(
+        "profiler_study.html.j2",
+        study=study,
+        source="the fixed files" if fixed_files else f"worlds made from seed {study.options.seed}",
+        lines=lines,
+        papers=len(lines) - len(study.fixed),
+        missed=sum(line[3] != "met" for line in lines),
+        alpha=alpha, d=d, radius=radius, errors=error_lines(study), points=points, seam=seam, boss=boss,
+        fig_alpha=plots.against_rotations(rows, study.names, "alpha", "deg", _short()),
+        fig_d=plots.against_rotations(rows, study.names, "d", "mm", _short()),
+        fig_error=plots.true_error(rows, study.names, _short()),
+        fig_ball=plots.ball(study.ball),
+        fig_seam=plots.seam(list(study.sphere)),
+        fig_boss=plots.boss(with_boss),
+        command="weldcal reproduce profiler" + (" --data FOLDER" if fixed_files else f" --seed {study.options.seed}") + (" --quick" if study.options.quick else ""),
+        software=software_version(),
+    )  # fmt: skip
+
+
+def _short() -> dict[str, str]:
+    return {name: title.replace("noise as in the paper", "paper noise") for name, title in edge.TITLES.items()}

@@ -1,0 +1,227 @@
+"""How fast a profiler is calibrated by an edge without a guess, and who else finds the answer: the paper's method, a search."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.profiler.edge.joint import edge_joint
+from weldcal.calibration.profiler.edge.linear import edge_linear
+from weldcal.calibration.profiler.edge.model import EdgeState
+from weldcal.calibration.profiler.edge.start import edge_starts
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew
+from weldcal.models.errors import InputError
+from weldcal.tools.console import Progress, plain
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials
+
+SETS = 20
+SEARCHED = 5  # sets on which the search is tried
+GRID_ROTATIONS, GRID_REACH_M, GRID_STEPS, POLISHED = 2000, 0.2, 5, 20
+TARGET_S = 0.2
+SAME_DEG, SAME_MM = 0.01, 0.01  # from the optimum that a start at the truth leads to: that one was found
+
+Answer = tuple[Floats, Floats]
+
+
+@dataclass(frozen=True)
+class SpeedRow:
+    """A method on sets of one kind: seconds (median and most; of the processor too, which other work does not lengthen), in how
+    many sets the optimum was found, rms error over the sets."""
+
+    method: str
+    poses: str
+    sets: int
+    median_s: float
+    most_s: float
+    processor_s: float
+    most_processor_s: float
+    found: int | None
+    rotation_deg: float
+    translation_mm: float
+
+
+def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress: Progress) -> dict[str, object]:
+    """Time them in one run on the same sets; writes benchmark.json.
+
+    Raises:
+        InputError: the fixed files are not in the folder named.
+    """
+    if data is not None and not data.is_dir():
+        raise InputError(f"There is no folder '{data}': give the one with edge_features.npz.")
+
+    def sets(name: str, count: int) -> list[EdgeTrial]:
+        every = made_edge_trials(name, count, seed) if data is None else fixed_edge_trials(data, name)
+        return list(every)[:count]
+
+    rows: list[SpeedRow] = []
+    for k, level in enumerate(("paper", "nominal")):
+        free = sets(f"free_{level}", SETS)
+        progress(f"40 free poses, {level} noise", 0.15 * k)
+        best = [_from_truth(t) for t in free]
+        rows.append(_row("joint, no guess", f"40 free, {level} noise", free, _joint, best))
+        if level == "paper":
+            rows.append(_row("its 24 starts alone", f"40 free, {level} noise", free, _starts, None))
+            progress("the search", 0.2)
+            few = free[:SEARCHED]
+            rows.append(_row("grid search, SciPy", f"40 free, {level} noise", few, _searched, best[:SEARCHED]))
+    arcs = sets("tilt_paper", 10)
+    progress("the paper's method", 0.8)
+    rows.append(_row("joint, no guess", "25 x 10, paper noise", arcs, _joint, [_from_truth(t) for t in arcs]))
+    rows.append(_row("paper, all pairs as printed", "25 x 10, paper noise", arcs, _paper_pairs, None))
+    rows.append(_row("paper, centred", "25 x 10, paper noise", arcs, _paper, None))
+    free_rows = [r for r in rows if r.method == "joint, no guess" and r.poses.startswith("40")]
+    summary: dict[str, object] = {
+        "state": "done",
+        "data": "fixed files" if data is not None else f"seed {seed}",
+        "rows": [asdict(r) for r in rows],
+        "found_of_sets": [f"{r.found} of {r.sets}" for r in free_rows],
+        "slowest_s": max(r.most_s for r in free_rows),
+        "slowest_processor_s": max(r.most_processor_s for r in free_rows),
+        "target_s": TARGET_S,
+    }
+    write_atomic(folder / "benchmark.json", json.dumps(plain(summary), indent=1) + "\n")
+    return summary
+
+
+def lines(summary: dict[str, object]) -> dict[str, str]:
+    """For a person: method and poses, then what it took and found."""
+    out = {}
+    rows = summary["rows"]
+    assert isinstance(rows, list)
+    for r in rows:
+        found = "" if r["found"] is None else f", optimum found in {r['found']} of {r['sets']}"
+        error = (
+            ""
+            if np.isnan(r["rotation_deg"])
+            else f", off by {r['rotation_deg']:.3f} deg / {r['translation_mm']:.3f} mm"
+        )
+        took = f"{1e3 * r['median_s']:.1f} ms, at most {1e3 * r['most_s']:.1f}"
+        took += f" (of the processor {1e3 * r['processor_s']:.1f}, {1e3 * r['most_processor_s']:.1f})"
+        out[f"{r['method']}; {r['poses']}"] = f"{took}{found}{error}"
+    return out
+
+
+def _row(
+    method: str,
+    poses: str,
+    trials: Sequence[EdgeTrial],
+    solve: Callable[[EdgeTrial], Answer | None],
+    best: list[Answer] | None,
+) -> SpeedRow:
+    seconds, worked, errors, found = [], [], [], 0
+    for k, trial in enumerate(trials):
+        start, begun = time.perf_counter(), time.process_time()
+        answer = solve(trial)
+        seconds.append(time.perf_counter() - start)
+        worked.append(time.process_time() - begun)
+        if answer is None:
+            continue
+        errors.append(_apart(answer, (trial.truth.rotation, trial.truth.translation)))
+        if best is not None:
+            deg, mm = _apart(answer, best[k])
+            found += bool(deg < SAME_DEG and mm < SAME_MM)
+    rms = np.sqrt(np.mean(np.square(errors), axis=0)) if errors else np.full(2, np.nan)
+    return SpeedRow(
+        method=method,
+        poses=poses,
+        sets=len(trials),
+        median_s=float(np.median(seconds)),
+        most_s=max(seconds),
+        processor_s=float(np.median(worked)),
+        most_processor_s=max(worked),
+        found=None if best is None else found,
+        rotation_deg=float(rms[0]),
+        translation_mm=float(rms[1]),
+    )
+
+
+def _apart(a: Answer, b: Answer) -> tuple[float, float]:
+    turn = np.degrees(Rotation.from_matrix(a[0].T @ b[0]).magnitude())
+    return float(turn), 1e3 * float(np.linalg.norm(a[1] - b[1]))
+
+
+def _joint(t: EdgeTrial) -> Answer:
+    X = t.poses
+    e = edge_joint(X.rotation, X.translation, t.points, sigma_robot_m=t.noise.robot_m, sigma_xz_m=t.noise.xz_m)
+    return e.rotation, e.translation
+
+
+def _from_truth(t: EdgeTrial) -> Answer:
+    return _from(t, t.truth)
+
+
+def _from(t: EdgeTrial, start: EdgeState) -> Answer:
+    X, noise = t.poses, t.noise
+    e = edge_joint(X.rotation, X.translation, t.points, sigma_robot_m=noise.robot_m, sigma_xz_m=noise.xz_m, init=start)
+    return e.rotation, e.translation
+
+
+def _starts(t: EdgeTrial) -> None:
+    edge_starts(t.poses, t.points)
+
+
+def _paper(t: EdgeTrial) -> Answer:
+    group = np.repeat(np.arange(len(t.poses) // TRANSLATIONS), TRANSLATIONS)
+    e = edge_linear(t.poses.rotation, t.poses.translation, t.points, group)
+    return e.rotation, e.translation
+
+
+def _paper_pairs(t: EdgeTrial) -> Answer:
+    """Its translation from every pair of poses of different groups (Eq. 28 to 35), after its rotation."""
+    group = np.repeat(np.arange(len(t.poses) // TRANSLATIONS), TRANSLATIONS)
+    e = edge_linear(t.poses.rotation, t.poses.translation, t.points, group)
+    i, j = np.triu_indices(len(t.poses), 1)
+    other = group[i] != group[j]
+    i, j = i[other], j[other]
+    across = skew(e.direction).T
+    p = np.column_stack([t.points[:, 0], np.zeros(len(t.points)), t.points[:, 1]]) @ e.rotation.T
+    seen = np.einsum("nij,nj->ni", t.poses.rotation, p) + t.poses.translation
+    A = across @ (t.poses.rotation[j] - t.poses.rotation[i])
+    b = -(seen[j] - seen[i]) @ across.T
+    return e.rotation, np.linalg.lstsq(A.reshape(-1, 3), b.ravel(), rcond=None)[0]
+
+
+def _searched(t: EdgeTrial) -> Answer:
+    """Distance to the best line on a grid of rotations and translations, SciPy from the twenty best, the best one polished."""
+    p_S = np.column_stack([t.points[:, 0], np.zeros(len(t.points)), t.points[:, 1]])
+    axis = np.linspace(-GRID_REACH_M, GRID_REACH_M, GRID_STEPS)
+    shifts = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    shifted = np.einsum("nij,kj->nki", t.poses.rotation, shifts)
+    found: list[tuple[float, Floats]] = []
+    for R in Rotation.random(GRID_ROTATIONS, random_state=0):
+        seen = np.einsum("nij,nj->ni", t.poses.rotation, p_S @ R.as_matrix().T) + t.poses.translation
+        at = seen[:, None] + shifted
+        at = at - at.mean(axis=0)
+        values = np.linalg.eigvalsh(np.einsum("nki,nkj->kij", at, at))
+        k = int(np.argmin(values[:, 0] + values[:, 1]))
+        found.append((float(values[k, 0] + values[k, 1]), np.concatenate([R.as_rotvec(), shifts[k]])))
+    found.sort(key=lambda one: one[0])
+
+    def off(x: Floats) -> Floats:
+        return _off_line(x, t.poses, p_S)
+
+    fits = [
+        least_squares(off, x, x_scale=[1.0] * 3 + [0.1] * 3, loss="cauchy", f_scale=2e-4) for _, x in found[:POLISHED]
+    ]
+    best = min(fits, key=lambda fit: float(fit.cost))
+    turn, shift = np.asarray(Rotation.from_rotvec(best.x[:3]).as_matrix()), np.asarray(best.x[3:])
+    at = np.einsum("nij,nj->ni", t.poses.rotation, p_S @ turn.T + shift) + t.poses.translation
+    e = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][0]
+    return _from(t, EdgeState(turn, shift, at.mean(axis=0), e))
+
+
+def _off_line(x: Floats, poses: FlangePoses, p_S: Floats) -> Floats:
+    """Components (3 n,) of the points' offsets from the line through them."""
+    p_F = p_S @ Rotation.from_rotvec(x[:3]).as_matrix().T + x[3:]
+    at = np.einsum("nij,nj->ni", poses.rotation, p_F) + poses.translation
+    at = at - at.mean(axis=0)
+    e = np.linalg.eigh(at.T @ at)[1][:, 2]
+    return np.asarray((at - np.outer(at @ e, e)).ravel())

@@ -1,0 +1,193 @@
+"""The sphere paper's Tables 1 to 3: points, seam and boss, by its method before and after compensation and by the joint one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.calibration.profiler.arm_errors import DhArm
+from weldcal.calibration.profiler.features.frustum import Frustum, fit_frustum, without_spikes
+from weldcal.calibration.profiler.features.groove import groove_features
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.profiler.sphere.arc import fit_circle
+from weldcal.calibration.profiler.sphere.joint import sphere_joint
+from weldcal.calibration.profiler.sphere.linear import compensate, fit_touch_sphere, sphere_center, sphere_linear
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.models.errors import InputError
+from weldcal.tools.studies.profiler.pieces import GrooveScan, scan_boss, scan_groove
+from weldcal.tools.studies.profiler.worlds import SphereTests, SphereTrial, SphereWorld, sphere_trial
+
+MM = 1e-3
+METHODS = ("linear", "compensated", "joint, affine", "joint, affine+joints")
+# as printed: mean deviations before and after (Table 1), after (Table 2), boss length and angle (Table 3)
+PRINTED_POINTS = {"linear": (4.3132, 4.5731, 4.0331), "compensated": (0.8183, 0.7069, 0.6371)}
+PRINTED_SEAM = (0.4567, 0.6374, 0.4856)
+PRINTED_BOSS = (0.5071, 0.2145)
+TARGET_POINTS = {"joint, affine": 0.141, "joint, affine+joints": 0.110}
+TARGET_SEAM = (0.122, 0.219, 0.146)
+TARGET_BOSS = (0.042, 0.10)
+HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class WorldData:
+    """One world: what is calibrated from, and what is measured afterwards where there is any."""
+
+    trial: SphereTrial
+    groove: GrooveScan | None = None
+    boss: tuple[Floats, Floats] | None = None
+    sigmas: SphereSigmas | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WorldResult:
+    """Of one world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and the boss."""
+
+    world: int
+    method: str
+    points_mm: Floats
+    seam_mm: Floats | None
+    seam_each_mm: Floats | None
+    boss: Frustum | None
+    cloud: Floats | None
+
+    @property
+    def boss_error(self) -> tuple[float, float] | None:
+        """Mean error of the slanted edges mm and of the slopes deg."""
+        if self.boss is None:
+            return None
+        length = np.abs(self.boss.hips_m / MM - HIP_MM).mean()
+        return float(length), float(np.abs(np.degrees(self.boss.dihedrals_rad) - SLOPE_DEG).mean())
+
+
+def made_worlds(count: int, seed: int, grooves: int, bosses: int) -> Iterator[WorldData]:
+    """Made from seeds, as the fixed files were; no two seeds share a world."""
+    for k in range(count):
+        one = 1000 * seed + k
+        world = SphereWorld.like_the_files(one)
+        groove = scan_groove(world, one) if k < grooves else None
+        yield WorldData(sphere_trial(world, one), groove, scan_boss(world, one) if k < bosses else None)
+
+
+def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
+    """Of the fixed files.
+
+    Raises:
+        InputError: they are not there.
+    """
+    for name in ("sphere", "groove", "boss"):
+        if not (folder / f"{name}.npz").is_file():
+            raise InputError(f"There is no {name}.npz in '{folder}': leave --data away to make worlds from seeds.")
+    d, g, b = (dict(np.load(folder / f"{name}.npz")) for name in ("sphere", "groove", "boss"))
+    arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
+    for w in range(min(count, len(d["scan_T"]))):
+        data = SphereData(
+            _poses(d["scan_T"][w]), [p * MM for p in d["scan_prof"][w].astype(float)], float(d["radius"]) * MM,
+            _poses(d["touch_T"][w]), d["tip_nominal"][w] * MM, arm, d["scan_q"][w], d["touch_q"][w],
+        )  # fmt: skip
+        tests = SphereTests(d["test_q_view"][w], d["test_m"][w] * MM, d["test_q_touch"][w], d["test_point"][w])
+        groove = boss = None
+        if w < len(g["q"]):
+            groove = GrooveScan(g["q"][w], g["prof"][w].astype(float) * MM, g["feat"][w] * MM, g["q_touch"][w])
+        if w < len(b["q"]):
+            boss = b["q"][w], b["prof"][w].astype(float) * MM
+        yield WorldData(SphereTrial(data, d["scan_sign"][w], d["scan_kind"][w] == 0, tests), groove, boss)
+
+
+def _poses(T: Floats) -> FlangePoses:
+    return FlangePoses(T[:, :3, :3], T[:, :3, 3] * MM)
+
+
+def calibrations(world: WorldData) -> dict[str, ProfilerRecord]:
+    """The four methods on one world's scans and touches."""
+    data = world.trial.data
+    assert data.touches is not None
+    assert data.tip is not None
+    R, t = data.poses.rotation, data.poses.translation
+    centers = np.array(
+        [
+            sphere_center(fit_circle(p)[0], data.radius_m, s)
+            for p, s in zip(data.profiles, world.trial.sign, strict=True)
+        ]
+    )
+    linear = sphere_linear(R, t, centers, world.trial.translated)
+    felt = fit_touch_sphere(data.touches.rotation, data.touches.translation, data.tip, data.radius_m)
+    best = compensate(linear, R, t, centers, felt.center)
+    return {
+        METHODS[0]: ProfilerRecord(METHODS[0], linear.rotation, linear.translation, tip=data.tip),
+        METHODS[1]: ProfilerRecord(METHODS[1], best.rotation, best.translation, tip=data.tip),
+        **joint_records(world),
+    }
+
+
+def joint_records(world: WorldData) -> dict[str, ProfilerRecord]:
+    """The joint methods on one world's scans and touches."""
+    data = world.trial.data
+    affine = sphere_joint(data, "affine", world.sigmas)
+    joints = sphere_joint(data, "affine+joints", world.sigmas, init=affine)
+    return {
+        METHODS[2]: ProfilerRecord.of(METHODS[2], affine, {}, ""),
+        METHODS[3]: ProfilerRecord.of(METHODS[3], joints, {}, "", data.arm),
+    }
+
+
+def measure(k: int, world: WorldData) -> list[WorldResult]:
+    """All methods on one world."""
+    features = None
+    if world.groove is not None:
+        features = np.array([groove_features(p).points for p in world.groove.profiles])
+    return [measured(k, method, record, world, features) for method, record in calibrations(world).items()]
+
+
+def measured(
+    k: int, method: str, record: ProfilerRecord, world: WorldData, features: Floats | None, *, boss: bool = True
+) -> WorldResult:
+    """Points, seam and boss of one world by one calibration; features (n, 3, 2) m as found in the groove's profiles."""
+    arm, tests = world.trial.data.arm, world.trial.tests
+    assert arm is not None
+    assert tests is not None
+    off = _off(record, arm, tests.q_view, tests.seen, tests.q_touch)
+    points = np.array([off[tests.point == j].mean() for j in range(3)])
+    seam = each = found = cloud = None
+    if world.groove is not None and features is not None:
+        each = np.column_stack(
+            [_off(record, arm, world.groove.q, features[:, j], world.groove.q_touch[:, j]) for j in range(3)]
+        )
+        seam = each.mean(axis=0)
+    if world.boss is not None and boss:
+        cloud = cloud_of(record, arm, *world.boss)
+        found = fit_frustum(cloud)
+    return WorldResult(k, method, points, seam, each, found, cloud)
+
+
+def _flange(record: ProfilerRecord, arm: DhArm, q: Floats) -> FlangePoses:
+    X = arm.frames(q)[:, 6]
+    return record.flange(FlangePoses(X[:, :3, :3], X[:, :3, 3]), q)
+
+
+def _off(record: ProfilerRecord, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats) -> Floats:
+    """Distances (n,) mm from where a point is sensed to where the tip touched it."""
+    X, touch = _flange(record, arm, q), _flange(record, arm, q_touch)
+    assert record.tip is not None
+    sensed = np.einsum("nij,nj->ni", X.rotation, record.points_F(seen)) + X.translation
+    return np.asarray(np.linalg.norm(sensed - touch.rotation @ record.tip - touch.translation, axis=1) / MM)
+
+
+def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) -> Floats:
+    """A boss's profiles (n, m, 2) m brought together in B by a calibration, (k, 3) m."""
+    X = _flange(record, arm, q)
+    parts = [record.points_F(without_spikes(p)) @ X.rotation[k].T + X.translation[k] for k, p in enumerate(profiles)]
+    return np.vstack(parts)
+
+
+def all_worlds(worlds: Iterator[WorldData], count: int, progress: Callable[[str, float], None]) -> list[WorldResult]:
+    """Every world, all methods."""
+    results: list[WorldResult] = []
+    for k, world in enumerate(worlds):
+        progress(f"world {k}", k / count)
+        results += measure(k, world)
+    return results

@@ -1,0 +1,1 @@
+"""The robot link measured: timing and faults."""

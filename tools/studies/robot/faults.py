@@ -1,0 +1,309 @@
+"""What the hardware link does in each fault: a matrix, and random sequences in which nothing may move without a command."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import time
+from collections import Counter
+from collections.abc import Callable
+from collections.abc import Sequence as Several
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
+from weldcal.systems.pacing import no_long_garbage_collections
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.console import plain
+from weldcal.tools.emulators.ur.process import HOST, emulator_process
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.robot.bench import SPEED_M_S, Bench, StoppedUnasked
+from weldcal.tools.studies.robot.cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
+from weldcal.tools.studies.robot.sequences import Sequence, run_sequence
+
+OUTCOME_COLUMNS = (
+    "name", "must", "did", "fault", "rest_after_ms", "travel_mm", "seen_after_ms", "sentence", "played", "problems", "retries",
+)  # fmt: skip
+SEQUENCE_COLUMNS = (
+    "seed", "seconds", "starts", "starts_refused", "moves_without_a_command", "moves_after_a_fault", "unattended_s", "unseen",
+    "unasked_stops", "thrown", "reported",
+)  # fmt: skip
+
+GOING_S = 0.4
+STARTS = 3
+# what a computer that is busy with something else looks like: a row that is not as it must be is tried again then, and counted
+LOADED = ("LINK_STALE", "COMMAND_LATE", "WORKER_DIED")
+PLAYED_S = 0.25
+HASTE_S = 0.1
+ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes its connections
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one fault led to. Times from the fault on; `problems` is empty where everything is as it must be."""
+
+    name: str
+    must: str
+    did: str  # stopped, went on, refused
+    fault: str
+    sentence: str
+    rest_after_ms: float | None
+    travel_mm: float | None
+    seen_after_ms: float | None
+    played: str  # what the dashboard said to Play after the repair
+    problems: tuple[str, ...]
+    retries: int = 0  # attempts that the load of this computer ended; also among `unasked_stops`
+
+    @property
+    def ok(self) -> bool:
+        """As it must be."""
+        return not self.problems
+
+    @property
+    def line(self) -> str:
+        """For a person."""
+        parts = [] if self.ok else ["WRONG"]
+        parts.append(self.did)
+        if self.rest_after_ms is not None and self.travel_mm is not None:
+            parts.append(f"at rest after {self.rest_after_ms:.0f} ms and {self.travel_mm:.1f} mm")
+        return ", ".join(parts) + (f": {self.sentence}" if self.sentence else "")
+
+
+def run_case(bench: Bench, case: Case, *, hasty: bool = False) -> Outcome:
+    """Throws in one fault and watches; leaves the controller in order, with no link.
+
+    `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long.
+    """
+    for retries in range(STARTS):
+        overruns = bench.emulator.state()["overruns"]
+        try:
+            outcome = _at_start(bench, case) if case.must == REFUSE else _running(bench, case, hasty)
+            busy = outcome.fault in LOADED or bench.emulator.state()["overruns"] > overruns
+            if not outcome.ok and busy and retries < STARTS - 1:
+                continue
+            return replace(outcome, retries=retries)
+        except StoppedUnasked as error:
+            reason = str(error)
+        except WeldcalError as error:
+            reason = str(error)
+            break
+        finally:
+            bench.end(kill=hasty)
+            recover(bench)
+    return Outcome(case.name, case.must, "failed", "", reason, None, None, None, "", (reason,), retries)
+
+
+def recover(bench: Bench) -> None:
+    emulator = bench.emulator
+    emulator.do("recover")
+    emulator.wait("runtime_state", "STOPPED")
+    emulator.do("set_q", q=bench.home.tolist())
+
+
+def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
+    children: list[int] = []
+    if case.wrist_3:
+        bench.emulator.do("set_q", q=[*bench.home[:5].tolist(), case.wrist_3])
+    if case.elsewhere:
+        children = bench.start_elsewhere()
+    else:
+        bench.start()
+    bench.cruise()
+    at = case.throw(bench)
+    time.sleep(GOING_S)
+    if case.must != STOP:
+        paused = bench.at_rest_after(at, REST_S)["rest_after_s"] is not None and case.must == GO
+        if not paused and bench.stream.state.fault is Fault.NONE:
+            speed = bench.tool_speed()
+            problems = () if abs(speed - SPEED_M_S) < 0.1 * SPEED_M_S else (f"its speed is {speed:.4f} m/s",)
+            return Outcome(case.name, case.must, "went on", "", "", None, None, None, "", problems)
+    time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
+    return _stopped(bench, case, at, children, PLAYED_S - (HASTE_S if hasty else 0.0))
+
+
+def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played_s: float) -> Outcome:
+    found = bench.at_rest_after(at, case.rest_s)
+    problems: list[str] = []
+    rest, travel = found["rest_after_s"], found["travel_m"]
+    if not found["ok"]:
+        problems.append(f"not at rest within {case.rest_s} s, or moved again: {found}")
+    if case.must == GO:
+        problems.append("it should have gone on")
+    fault, sentence, seen = Fault.NONE, "", None
+    if case.elsewhere:
+        while (left := [number for number in children if _alive(number)]) and time.monotonic() < at + ENDED_S:
+            time.sleep(0.02)
+        if left:
+            problems.append(f"processes were left behind: {left}")
+    else:
+        state = bench.stream.state
+        fault, sentence, seen = state.fault, state.status.fault or "", 1e3 * (state.fault_time - at)
+        if fault not in case.faults:
+            problems.append(f"it said {fault.name}, not {' or '.join(sorted(f.name for f in case.faults))}")
+    played = _repair_and_play(bench, case, played_s)
+    again = bench.at_rest_after(at, case.rest_s)
+    if again["moved_again_s"] is not None and found["moved_again_s"] is None:
+        problems.append(f"it moved {again['moved_again_s']:.3f} s after the fault, when Play was pressed: {played}")
+    summary = bench.emulator.ask(check="summary")
+    if summary["moves_without_a_command"]:
+        problems.append("it moved without a command")
+    return Outcome(
+        case.name,
+        case.must,
+        "stopped",
+        fault.name if fault else "",
+        sentence,
+        None if rest is None else 1e3 * float(rest),
+        None if travel is None else 1e3 * float(travel),
+        seen,
+        played,
+        tuple(problems),
+    )
+
+
+def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:
+    """Put the world right and press Play, as a person would who does not know better; commands go on all the while."""
+    for deed in case.repair:
+        bench.emulator.do(deed.name)
+        time.sleep(deed.after_s)
+    played = bench.press_play()
+    time.sleep(watch_s)
+    return played
+
+
+def _at_start(bench: Bench, case: Case) -> Outcome:
+    bench.emulator.do("reset_checker")
+    at = case.throw(bench)
+    problems: list[str] = []
+    sentence = ""
+    try:
+        prepared = PrepareRobot(UrRtde(host=bench.host), load_arm())
+        if prepared.handle is not None:
+            prepared.handle.close()
+        problems.append("it started")
+    except WeldcalError as error:
+        sentence = str(error)
+        if case.says.lower() not in sentence.lower():
+            problems.append(f"its sentence does not say {case.says!r}")
+    found = bench.at_rest_after(at, REST_S)
+    if not found["ok"]:
+        problems.append("it moved")
+    return Outcome(case.name, case.must, "refused", "", sentence, None, None, None, "", tuple(problems))
+
+
+def _alive(process: int) -> bool:
+    try:
+        with open(f"/proc/{process}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] not in ("Z", "X")
+    except OSError:
+        return False
+
+
+def run_matrix(
+    bench: Bench,
+    cases: Several[Case],
+    progress: Progress = no_progress,
+    said: Callable[[Outcome], None] | None = None,
+    *,
+    hasty: bool = False,
+) -> list[Outcome]:
+    """Every case, one after the other, on one controller: that the next one starts is what a fresh start must do."""
+    outcomes = []
+    for k, case in enumerate(cases):
+        progress(case.name, k / len(cases))
+        outcomes.append(run_case(bench, case, hasty=hasty))
+        if said is not None:
+            said(outcomes[-1])
+    return outcomes
+
+
+@dataclass(frozen=True)
+class FaultReport:
+    """All outcomes and all sequences."""
+
+    outcomes: list[Outcome]
+    sequences: list[Sequence]
+    folder: Path
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names what was not as it must be."""
+        stopped = [outcome for outcome in self.outcomes if outcome.did == "stopped"]
+        wrong = [{"id": o.name, "reason": "; ".join(o.problems)} for o in self.outcomes if not o.ok]
+        wrong += [{"id": f"sequence {s.seed}", "reason": s.verdict} for s in self.sequences if not s.ok]
+        return {
+            "state": "failed" if wrong else "done",
+            "reason": f"{len(wrong)} faults or sequences were not as they must be; see `wrong`." if wrong else None,
+            "faults": len(self.outcomes),
+            "stopped": len(stopped),
+            "went_on": sum(outcome.did == "went on" for outcome in self.outcomes),
+            "refused": sum(outcome.did == "refused" for outcome in self.outcomes),
+            "rest_after_ms": _spread([o.rest_after_ms for o in stopped]),
+            "travel_mm": _spread([o.travel_mm for o in stopped]),
+            "unasked_stops": sum(o.retries for o in self.outcomes) + sum(s.unasked_stops for s in self.sequences),
+            "sequences": len(self.sequences),
+            "sequence_seconds": sum(s.seconds for s in self.sequences),
+            "sequence_faults": sum(s.thrown.total() for s in self.sequences),
+            "sequence_starts": sum(s.starts for s in self.sequences),
+            "moves_without_a_command": sum(s.moves_without_a_command for s in self.sequences),
+            "moves_after_a_fault": sum(s.moves_after_a_fault for s in self.sequences),
+            "unattended_s": sum(s.unattended_s for s in self.sequences),
+            "wrong": wrong,
+        }
+
+
+def run_fault_benchmark(
+    out: Path,
+    *,
+    address: str = HOST,
+    sequences: int = 20,
+    seconds: float = 60.0,
+    seed: int = 0,
+    progress: Progress = no_progress,
+) -> FaultReport:
+    """The matrix, then the random sequences, each on a controller of its own; faults.csv and sequences.csv grow row by row."""
+    report = FaultReport([], [], out)
+    share = 150.0 / (150.0 + sequences * seconds)
+
+    def said(outcome: Outcome) -> None:
+        report.outcomes.append(outcome)
+        write_atomic(out / "faults.csv", _table(OUTCOME_COLUMNS, report.outcomes))
+
+    with emulator_process(host=address, seed=seed) as emulator, no_long_garbage_collections():
+        run_matrix(Bench(emulator), RUNNING + AT_START, lambda stage, done: progress(stage, share * done), said)
+    for k in range(sequences):
+        progress(f"sequence {k + 1} of {sequences}", share + (1.0 - share) * k / sequences)
+        with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
+            report.sequences.append(run_sequence(Bench(emulator), seed + k, seconds))
+        write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
+    write_atomic(out / "robot_faults.json", json.dumps(plain(report.summary()), indent=1))
+    return report
+
+
+def _spread(values: Several[float | None]) -> dict[str, float]:
+    found = np.array([value for value in values if value is not None])
+    return {"median": float(np.median(found)), "max": float(found.max())} if found.size else {}
+
+
+def _table(columns: tuple[str, ...], rows: Several[object]) -> str:
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(columns)
+    for row in rows:
+        writer.writerow([_cell(getattr(row, name)) for name in columns])
+    return table.getvalue()
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.2f}"
+    if isinstance(value, Counter):
+        return "; ".join(f"{name} {count}" for name, count in sorted(value.items()))
+    if isinstance(value, tuple | list):
+        return "; ".join(map(str, value))
+    return "" if value is None else str(value)

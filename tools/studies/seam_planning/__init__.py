@@ -1,0 +1,1 @@
+"""Seam planning from one scan, over parts, scanners and disturbances."""

@@ -1,0 +1,63 @@
+"""How well the seam is planned from one scan, by drawing and from the cloud alone, for each scanner and in each trouble."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from weldcal.models.scanners import SCANNERS
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.seam_planning.trials import (
+    FIRST_HELD_OUT,
+    METHODS,
+    SHAPES,
+    WIDEST_PX,
+    Trial,
+    run_trial,
+    scan,
+    summary_rows,
+    table_text,
+)
+from weldcal.tools.studies.seam_planning.troubles import run_troubles, trouble_rows
+
+
+def run_seam_planning_benchmark(
+    out: Path,
+    runs: int = 2,
+    seed: int = 0,
+    presets: list[str] | None = None,
+    progress: Progress = no_progress,
+    *,
+    full: bool = False,
+    troubles: bool = True,
+) -> tuple[dict[str, object], dict[str, str]]:
+    """Every preset, shape and method over `runs` held-out poses: trials.csv in `out`, and the rows of the table.
+
+    full: images as wide as the scanner has them. troubles: occlusion, clutter and wrong workpieces as well (troubles.csv).
+    """
+    presets = list(SCANNERS) if presets is None else presets
+    trials: list[Trial] = []
+    total = len(presets) * len(SHAPES) * runs
+    for preset in presets:
+        for shape in SHAPES:
+            for k in range(runs):
+                number = FIRST_HELD_OUT + seed + k
+                scene = scan(preset, shape, number, None if full else WIDEST_PX)
+                trials += [run_trial(scene, preset, shape, number, method) for method in METHODS]
+                progress("planning", len(trials) / (len(METHODS) * total))
+                write_atomic(out / "trials.csv", table_text(trials))
+    rows = summary_rows(trials)
+    if troubles:
+        cases = run_troubles(runs, FIRST_HELD_OUT + seed)
+        write_atomic(out / "troubles.csv", table_text(cases))
+        rows |= trouble_rows(cases)
+    done = [t for t in trials if not t.refused]
+    summary: dict[str, object] = {
+        "state": "done",
+        "trials": len(trials),
+        "planned": len(done),
+        "worst_mm": max((t.worst_mm for t in done), default=math.nan),
+        "most_seconds": max((t.seconds for t in trials), default=math.nan),
+    }
+    return summary, rows

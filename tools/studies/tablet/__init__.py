@@ -1,0 +1,1 @@
+"""The tablet paper's tables, computed again."""

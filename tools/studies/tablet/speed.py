@@ -1,0 +1,53 @@
+"""What a tablet calibration costs: the closed form, PnP, the paper's stages, and the published search beside them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar
+from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
+from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
+from weldcal.tools.console import Progress, plain
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.tablet.paper import published_touches
+from weldcal.tools.studies.tablet.study import PUBLISHED_EVALUATIONS, evaluation_seconds, median_seconds
+from weldcal.tools.studies.tablet.world import simulate_trial
+
+
+def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[str, object]:
+    """Time every calibration on the published data (closed form also on a simulated trial); write benchmark.json."""
+    touches = published_touches()
+    progress("closed form", 0.0)
+    rays, hand, theta = touched_rays(touches).T.copy(), touches.hand_m.T.copy(), touches.theta_rad
+    closed = median_seconds(lambda: solve_closed_form(rays, hand, theta), 5000)
+    trial = simulate_trial((seed, 0)).touches
+    other = touched_rays(trial).T.copy(), trial.hand_m.T.copy(), trial.theta_rad
+    simulated = median_seconds(lambda: solve_closed_form(*other), 5000)
+    checked = median_seconds(lambda: fit_linear(touches), 500)
+    progress("PnP", 0.3)
+    config = PlanarConfig(free_scale=True)
+    planar = median_seconds(lambda: fit_planar(touches, config, leave_one_out=False), 100)
+    progress("two stages", 0.5)
+    stage1 = tablet_stage1(touches)
+    two_stages = median_seconds(lambda: tablet_stage2(touches, tablet_stage1(touches).parameters), 3)
+    alone, crowd = evaluation_seconds(touches)
+    published = PUBLISHED_EVALUATIONS * alone
+    summary = {
+        "state": "done",
+        "closed_form_us": 1e6 * closed,
+        "closed_form_simulated_us": 1e6 * simulated,
+        "closed_form_checked_us": 1e6 * checked,
+        "pnp_us": 1e6 * planar,
+        "two_stages_s": two_stages,
+        "stage_1_evaluations": stage1.evaluations,
+        "evaluation_us": 1e6 * alone,
+        "evaluation_in_crowd_us": 1e6 * crowd,
+        "published_search_extrapolated_s": published,
+        "published_search_in_crowds_extrapolated_s": PUBLISHED_EVALUATIONS * crowd,
+        "closed_form_times_faster": published / closed,
+        "two_stages_times_faster": 2.0 * published / two_stages,
+        "closed_form_in_evaluations": closed / alone,
+    }
+    write_atomic(folder / "benchmark.json", json.dumps(plain(summary), indent=1) + "\n")
+    return summary

@@ -1,0 +1,1 @@
+"""The weld law in a small kinematic world, against its targets."""
