@@ -20,7 +20,7 @@ from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDat
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 import weldcal.systems
-from tests.systems.still_link import StillLink
+from tests.systems.drivers.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from tests.unit.tablet_image import grid, picture, project
+from tests.calibration.tablet.image import grid, picture, project
 from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.errors import LandmarksNotFound
 from weldcal.calibration.tablet.plane_depth import plane_depth

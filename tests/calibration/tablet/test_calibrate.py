@@ -16,7 +16,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
-from tests.unit.tablet_image import grid, picture, project
+from tests.calibration.tablet.image import grid, picture, project
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
