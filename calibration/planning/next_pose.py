@@ -15,7 +15,7 @@ from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.problem import Problem, State, linearise
 from weldcal.calibration.hand_eye.solve import HandEyeResult, as_transform
-from weldcal.calibration.hand_eye.view import View, view_of
+from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import known_arms, load_arm

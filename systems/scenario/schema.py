@@ -28,7 +28,7 @@ from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
 DRAWN_ARMS = ("ur10e",)
-SCENARIO_FOLDER = Path(__file__).resolve().parent.parent / "models" / "scenarios"
+SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
 
 @dc.dataclass

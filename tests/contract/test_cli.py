@@ -38,7 +38,7 @@ def leaves(command: Any, name: str = "weldcal") -> Iterator[tuple[str, Any]]:
         yield name, command
 
 
-LEAVES = dict(leaves(typer.main.get_command(cli.app)))
+LEAVES = dict(leaves(typer.main.get_command(cli)))
 
 
 @pytest.mark.parametrize("name", LEAVES)

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import typer.main
 
+from tests.places import ROOT
 from weldcal.tools.cli.app import app
 
-ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 # Places of one machine or one mirror; in two parts so that this file does not name them itself.

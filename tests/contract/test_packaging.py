@@ -14,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 FOLDERS = ("models", "calibration", "welding", "systems", "tools")
 PROJECT_FILES = ("pyproject.toml", "README.md", "LICENSE", "NOTICE")
 

@@ -11,13 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.hardware.emulator_process import Emulator, emulator_process
+from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.dashboard import ask, stop_program
@@ -35,7 +35,7 @@ HOST, PORT = "127.0.0.21", 30091
 HOST_X, PORT_X = "127.0.0.22", 30092
 # this machine, and nothing listens there
 NOBODY = "127.0.0.23"
-NOMINAL = Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml"
+NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 MOVING = "def foreign():\n  movej([0.5, -1.57, 1.57, -1.57, -1.57, 0], a=1, v=0.05)\nend\n"
 
 
@@ -468,7 +468,7 @@ def test_the_command_needs_no_project_and_no_robot() -> None:
 
 
 def test_the_document_names_every_check_and_every_fault() -> None:
-    text = (Path(__file__).parents[2] / "docs/hardware.md").read_text()
+    text = (ROOT / "docs/hardware.md").read_text()
     assert [name for name in CHECKS if f"\n| {name} |" not in text] == []
     heads = {sentence.partition(":")[0] for sentence in SENTENCES.values() if sentence.partition(":")[0].isupper()}
     assert len(heads) > 10

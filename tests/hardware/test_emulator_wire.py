@@ -13,6 +13,7 @@ import pytest
 
 from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import HOST, Emulator, emulator_process
+from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.dh import dh_parameters
@@ -247,7 +248,7 @@ def test_the_real_time_port_streams_1220_bytes(shared: Emulator) -> None:
 
 def calibrated(folder: Path) -> Path:
     """A factory calibration of the kind a robot has: tenths of a millimetre and of a milliradian, axes not parallel."""
-    text = (Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml").read_text()
+    text = (ROOT / "models/arms/ur10e/default_kinematics.yaml").read_text()
     changes = {
         "z: 0.1807": "z: 0.1810",
         "x: -0.6127\n    y: 0.0\n    z: 0.0\n    roll: 0.0\n    pitch: 0.0\n    yaw: 0.0": (

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.scenario.schema import Scenario, load_scenario
@@ -26,7 +27,7 @@ STOOD_STILL = (
     "GUARD: the script on the controller stopped the arm, because no new command",
 )
 FELL_BEHIND_S = 1.0  # of the job's forty
-NOMINAL = Path(__file__).parents[2] / "models/arms/ur10e/default_kinematics.yaml"
+NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 
 
 SEED = 5  # its planned poses lie near each other

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import open3d
 import pytest
 
+from tests.places import SHARED_DATA
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import PAPER_RADIUS_M, STANDARDS, face_points, flange_mesh, flange_ring, get_flange
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange/cad"
+DATA = SHARED_DATA / "flange/cad"
 
 
 def test_the_cobot_flange_has_the_dimensions_of_the_standard() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -22,7 +23,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.calibrate import CalibrationReport, calibrate_dataset
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
+DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
 

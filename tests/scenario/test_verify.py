@@ -14,6 +14,7 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result, save_result
 from weldcal.calibration.eye_on_base.observations import see_flanges
@@ -27,7 +28,7 @@ from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.verify import VerifyReport, verify_dataset
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
+DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
 

@@ -20,6 +20,7 @@ from pydrake.systems.framework import InputPort, LeafSystem, OutputPort, PortDat
 from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 import weldcal.systems
+from tests.systems.cells import Q_HOME, TOOL, plain_station, the_arm
 from tests.systems.drivers.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
@@ -80,8 +81,6 @@ from weldcal.systems.station import CheatPoses
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import ServoConfig
-
-from .cells import Q_HOME, TOOL, plain_station, the_arm
 
 X = RigidTransform()
 IDEAL = get_scanner("ideal", width=206, height=154)

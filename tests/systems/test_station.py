@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import VectorLogSink
 
+from tests.systems.cells import EXACT_PLATE, Q_HOME, TOOL, Drive, plain_station, scenario, the_arm, weld_only_cell
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.no_device import NoDevice
@@ -22,8 +23,6 @@ from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Image, JobCommand, Scan
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, apply_driver_config, make_station
-
-from .cells import EXACT_PLATE, Q_HOME, TOOL, Drive, plain_station, scenario, the_arm, weld_only_cell
 
 INPUTS = {"ur10e.velocity_command", "scanner.trigger", "finger_camera.streaming"}
 OUTPUTS = {

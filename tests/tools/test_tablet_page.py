@@ -16,11 +16,12 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.browser import Browser
+from tests.places import ROOT
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.tablet import tablet
 from weldcal.tools.commands.tablet.page.serve import TabletServer, addresses, is_loopback, open_server, page
 
-PAGE = Path(__file__).resolve().parents[2] / "tools" / "tablet_page" / "tablet.html"
+PAGE = ROOT / "tools/commands/tablet/page/tablet.html"
 WIDTH, HEIGHT = 1000, 700
 PX_PER_MM = 4.0
 

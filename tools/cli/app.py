@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.cli.app import hand_eye as cli_hand_eye
+from weldcal.tools.cli import hand_eye as cli_hand_eye
 from weldcal.tools.cli.benchmark.flange import mount as mount_flange
 from weldcal.tools.cli.benchmark.profiler import profiler as benchmark_profiler
 from weldcal.tools.cli.benchmark.seam_planning import seam_planning

@@ -20,11 +20,11 @@ from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.joints import refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
-from weldcal.calibration.hand_eye.next_pose import NextPose, next_pose
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.hand_eye.view import View, view_of
+from weldcal.calibration.planning.next_pose import NextPose, next_pose
+from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner

@@ -16,10 +16,9 @@ from pydrake.multibody.parsing import LoadModelDirectivesFromString, Parser, Pro
 from pydrake.multibody.plant import MultibodyPlant
 from scipy.spatial.transform import Rotation
 
+from tests.calibration.hand_eye.poses import co_manipulation, eye_in_hand
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.tools.commands.hand_eye import HandEyeReport, run_hand_eye
-
-from .hand_eye_poses import co_manipulation, eye_in_hand
 
 LAST_DIGIT = 2e-9  # of the nine decimals written, rad and m
 

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.calibration.hand_eye.poses import Array, co_manipulation, eye_in_hand
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import inverse
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.models.errors import InputError
 from weldcal.tools.commands.hand_eye import run_hand_eye
-
-from .hand_eye_poses import Array, co_manipulation, eye_in_hand
 
 HEADER = ",".join(f"{who}_{c}" for who in ("robot", "camera") for c in ("x", "y", "z", "qw", "qx", "qy", "qz"))
 

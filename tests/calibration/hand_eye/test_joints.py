@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.calibration.hand_eye.poses import Array, noise, random_poses
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.calibration.hand_eye.files import PosePairs
@@ -16,8 +17,6 @@ from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeResult, solve_problem
 from weldcal.models.arms.chain import Chain, chain_forward, load_chain
 from weldcal.models.errors import InputError
-
-from .hand_eye_poses import Array, noise, random_poses
 
 TURN, SHIFT = np.radians(0.02), 1e-4
 OFFSET_RAD = np.radians(

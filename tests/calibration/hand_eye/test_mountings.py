@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
+from tests.calibration.hand_eye.poses import Array, noise, random_poses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
 from weldcal.calibration.hand_eye.mountings import MOUNTINGS, Sighting, calibrate_mounting, get_mounting
-from weldcal.calibration.hand_eye.next_pose import next_pose
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform, solve_problem
-from weldcal.calibration.hand_eye.view import view_of
+from weldcal.calibration.planning.next_pose import next_pose
+from weldcal.calibration.planning.view import view_of
 from weldcal.models.arms.chain import chain_forward, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import get_scanner
-
-from .hand_eye_poses import Array, noise, random_poses
 
 TURN, SHIFT = np.radians(0.05), 2e-4
 QUICK = HandEyeConfig(folds=0)

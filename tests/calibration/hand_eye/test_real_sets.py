@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.hand_eye.comparison import HandEyeBenchmark, run_hand_eye_benchmark, write_table
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/handeye"
+DATA = SHARED_DATA / "handeye"
 
 
 # held-out degrees and millimetres of the best of OpenCV's seven methods per column, as published beside the data

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.calibration.hand_eye.poses import Array, co_manipulation, eye_in_hand, random_poses
 from weldcal.calibration.errors import (
     CoplanarPoses,
     InconsistentPoses,
@@ -28,8 +29,6 @@ from weldcal.calibration.hand_eye.solve import (
     solve_problem,
 )
 from weldcal.models.errors import InputError, WeldcalError
-
-from .hand_eye_poses import Array, co_manipulation, eye_in_hand, random_poses
 
 TURN, SHIFT = np.radians(0.05), 2e-4
 QUICK = HandEyeConfig(folds=0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.calibration.hand_eye.poses import random_poses
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.mountings import Sighting, get_mounting, problem_of
@@ -13,8 +14,6 @@ from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, as_transform, solve_problem
 from weldcal.calibration.hand_eye.stated_noise import with_stated_noise
 from weldcal.models.errors import InputError
-
-from .hand_eye_poses import random_poses
 
 TURN, SHIFT = 1e-4, 5e-5
 QUICK = HandEyeConfig(folds=0, candidates=CANDIDATES[:1])

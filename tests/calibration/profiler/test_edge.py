@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
@@ -23,7 +23,7 @@ from weldcal.calibration.profiler.errors import (
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.models.errors import InputError
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/profiler"
+DATA = SHARED_DATA / "profiler"
 MM = 1e-3
 SIGMA_ROBOT, SIGMA_XZ = 0.03 * MM, (0.05 * MM, 0.06 * MM)
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="The published profiler data are not here.")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.errors import FeatureNotFound
 from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
@@ -17,7 +17,7 @@ from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joi
 from weldcal.calibration.profiler.sphere.model import SphereData
 from weldcal.models.errors import InputError
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/profiler"
+DATA = SHARED_DATA / "profiler"
 MM = 1e-3
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="The published profiler data are not here.")
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import (
     ArcNotFound,
@@ -33,7 +33,7 @@ from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereTrial, SphereWorld, sphere_trial
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/profiler"
+DATA = SHARED_DATA / "profiler"
 MM = 1e-3
 SIGMAS = SphereSigmas(sensor_m=0.05 * MM, robot_m=0.04 * MM, touch_m=0.04 * MM)
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="The published profiler data are not here.")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TooFewLandmarks
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over, refine_rounded
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
@@ -17,7 +17,7 @@ from weldcal.calibration.tablet.touches import TabletTouches
 from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.world import TabletNoise, TabletTrial, simulate_trial
 
-SYNTH = Path(__file__).resolve().parents[2].parent / "shared/data/profiler/tablet_synth.npz"
+SYNTH = SHARED_DATA / "profiler/tablet_synth.npz"
 EXACT = TabletNoise(1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.5, 0.0)
 ROUNDED = PlanarConfig(step_m=1e-3)
 

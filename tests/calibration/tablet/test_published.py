@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.published.calibration import hand_to_touch, tablet_stage1, tablet_stage2
 from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
@@ -27,7 +27,7 @@ from weldcal.tools.cli.reproduce.group import reproduce
 from weldcal.tools.studies.tablet.paper import STAGE_1, STAGE_2, published_touches
 from weldcal.tools.studies.tablet.study import compare_signs, dh_by_eq_20
 
-PUBLISHED = Path(__file__).resolve().parents[2].parent / "shared/data/profiler/tablet_published.npz"
+PUBLISHED = SHARED_DATA / "profiler/tablet_published.npz"
 GATE_MM = 0.0015  # the issue's: half the last printed digit is 0.005
 
 

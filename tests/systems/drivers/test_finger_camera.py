@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import CameraInfo
 
+from tests.systems.cells import Q_HOME, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.drivers.simulated.picture_worker import Finish, Pixels
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
@@ -25,8 +26,6 @@ from weldcal.systems.jobs.weld.aruco_deformation_estimator import (
 from weldcal.systems.messages import Image
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, tag_cells
-
-from .cells import Q_HOME, TOOL, Drive, plain_station, scenario, the_arm
 
 TAG = TagModel(dictionary=TOOL.tag_dictionary, id=TOOL.tag_id, size_m=TOOL.tag_size_m)
 CAMERA = RenderedFingerCamera().camera()

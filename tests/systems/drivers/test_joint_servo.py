@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
+from tests.systems.cells import Q_HOME, Drive, the_arm
 from weldcal.calibration.geometry.rigid import rotation_vector
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
@@ -14,8 +15,6 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
-
-from .cells import Q_HOME, Drive, the_arm
 
 TICK_S = 0.002
 SPEEDS = "ur10e.velocity_command"

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
+from tests.systems.cells import Q_HOME, the_arm
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
@@ -25,8 +26,6 @@ from weldcal.systems.jobs.profiler.robot_error import RobotError
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import make_station
-
-from .cells import Q_HOME, the_arm
 
 CLEAN = RenderedProfiler(noise_mm=0.0, jitter_mm=0.0, quantum_mm=0.0, share_missing=0.0, share_spikes=0.0, samples=4000)
 X_BP = RigidTransform(RotationMatrix.MakeZRotation(0.3), [0.5, -0.3, 0.02])

@@ -23,6 +23,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F
 
+from tests.systems.cells import Q_HOME, the_arm
 from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene
@@ -38,8 +39,6 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 from weldcal.systems.scenario.schema import load_scenario
 from weldcal.systems.station import make_station
-
-from .cells import Q_HOME, the_arm
 
 DISTANCE_M = 0.7
 HALF_M = np.array([0.10, 0.07])  # half the sides of the plate that is looked at

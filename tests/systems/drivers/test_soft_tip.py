@@ -9,14 +9,13 @@ import pytest
 from pydrake.geometry import Role
 from pydrake.math import RigidTransform, RotationMatrix
 
+from tests.systems.cells import Q_HOME, TOOL, Drive, plain_station
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import kinematics_and_jacobian
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import measure_deformation
 from weldcal.welding.servo.deformation import TagModel
-
-from .cells import Q_HOME, TOOL, Drive, plain_station
 
 START_S = 0.05  # where along the straight groove, m
 SPEED_M_S = 0.008

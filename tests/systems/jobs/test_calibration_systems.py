@@ -10,6 +10,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
+from tests.systems.cells import Q_HOME, TOOL, Drive, plain_station, the_arm
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.models.arms.inverse import nearest_solution
@@ -26,8 +27,6 @@ from weldcal.systems.jobs.weld.iterative_calibrator import (
 )
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
-
-from .cells import Q_HOME, TOOL, Drive, plain_station, the_arm
 
 RING = get_flange("tool-ring-63")
 X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, -np.pi / 2), [0.65, 0.0, 0.95])

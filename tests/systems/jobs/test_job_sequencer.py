@@ -12,6 +12,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
+from tests.systems.cells import Q_HOME
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, HeldOut
 from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
@@ -19,8 +20,6 @@ from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
 from weldcal.systems.runner import SHARES
 from weldcal.welding.seam.curve import SeamCurve
-
-from .cells import Q_HOME
 
 PLAN = JobPlan(
     calibrate=True,

@@ -8,6 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 
+from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.cell import servo_config
@@ -17,8 +18,6 @@ from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
-
-from .cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 
 STRAIGHT = make_workpiece("straight", length_m=0.200)
 X_BP = RigidTransform(RollPitchYaw(0.0, 0.0, np.pi / 2), [0.65, 0.0, 0.02])

@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import LeafSystem
 
+from tests.systems.cells import Q_HOME, TOOL, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics, kinematics_and_jacobian
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.jobs.weld.welding_velocity_servo import TELEMETRY, ServoReport, WeldingVelocityServo
@@ -22,8 +23,6 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.state import DeflectionSample, ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
-
-from .cells import Q_HOME, TOOL, the_arm
 
 WELD = JobCommand(phase="weld", mode="weld", process_on=True)
 

@@ -11,10 +11,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import Integrator, VectorLogSink
 
+from tests.systems.cells import Q_HOME
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.motion.flange_mover import FlangeMover, move_duration, quintic
-
-from .cells import Q_HOME
 
 GOAL = Q_HOME + np.array([0.4, -0.2, 0.1, 0.0, -0.05, 0.3])
 DT = 1e-4

@@ -12,14 +12,13 @@ from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
+from tests.systems.cells import Q_HOME, weld_only_cell
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.sequencer import JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
-
-from .cells import Q_HOME, weld_only_cell
 
 WELD = JobCommand(phase="weld", mode="weld", process_on=True)
 ON_THE_WAY = np.array([0.0, 0.0, 0.0, 0.0, 0.008, 0.0])

@@ -13,6 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.analysis import Simulator
 from scipy.spatial import ConvexHull
 
+from tests.systems.cells import TOOL, scenario
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
@@ -27,8 +28,6 @@ from weldcal.systems.viewer.phase_labels import TEXT, label_image
 from weldcal.systems.viewer.weld_gauge import gauge_picture
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Measurement, Phase, WeldingCommand, WeldingState
-
-from .cells import TOOL, scenario
 
 
 @pytest.fixture(scope="module")

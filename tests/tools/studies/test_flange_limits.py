@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
@@ -16,7 +15,7 @@ from weldcal.tools.studies.flange.ingredients import Ingredient, study_ingredien
 from weldcal.tools.studies.flange.live_redraw import Station, bound_covariance, joints_of, redraw
 from weldcal.tools.studies.flange.live_target import live_scenario
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
+DATA = SHARED_DATA / "flange"
 Q_HOME = np.deg2rad([180.0, -70.0, 120.0, -50.0, 90.0, 0.0])
 X_CB = RigidTransform(RollPitchYaw(3.1, 0.05, -1.5), [0.0, 0.6, 0.9])
 WORK = np.array([0.65, 0.0, 0.05])

@@ -10,6 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
+from tests.places import SHARED_DATA
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.flange.observation import Observation
@@ -34,7 +35,7 @@ from weldcal.tools.studies.flange.published.simulation import (
     simulate,
 )
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared/data/flange"
+DATA = SHARED_DATA / "flange"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the recorded flange data are not there")
 
 

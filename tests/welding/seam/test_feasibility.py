@@ -7,13 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from tests.welding.weld_kinematics import l_curve, straight
 from weldcal.tools.studies.weld.seams import arcs, s_curve
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics, torch_events
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
-
-from .weld_kinematics import l_curve, straight
 
 D, V = 0.060, 0.008
 

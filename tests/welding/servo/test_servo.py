@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
+from tests.welding.weld_kinematics import Run, l_curve, straight, weld
 from weldcal.tools.studies.weld.budgets import HARD, NOMINAL, PERFECT
 from weldcal.tools.studies.weld.groove import DROP_M as DROP
 from weldcal.tools.studies.weld.groove import SEAT_M as SEAT
@@ -29,8 +30,6 @@ from weldcal.welding.servo.state import (
 )
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
-
-from .weld_kinematics import Run, l_curve, straight, weld
 
 CALIBRATED = ServoConfig(touch=TouchConfig(calibrate_gain=True))
 SPEED = CALIBRATED.weld_speed_m_s
