@@ -46,6 +46,24 @@ class Image(Message):
     exposed_at: float = -np.inf
 
 
+@dataclass(frozen=True, eq=False)
+class ProfileScan(Message):
+    """One profile: points (n, 2) [x, z] m in S, NaN where nothing returned; the time it was taken; 0 before the first."""
+
+    sequence: int = 0
+    capture_time: float = -np.inf
+    points: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class TorchTouch(Message):
+    """The newest touch: its number, when it began, and whether it lasts."""
+
+    sequence: int = 0
+    time: float = -np.inf
+    down: bool = False
+
+
 @dataclass(frozen=True)
 class UrStatus(Message):
     """What the controller says of itself, in the words of the RTDE enumerations."""

@@ -1,4 +1,4 @@
-"""Running a cell: advance the Diagram until its job ends, keep to the wall clock where the robot is real, keep every scan."""
+"""The one run loop: advance a cell's Diagram until its job ends, keep to the wall clock where the robot is real, keep every scan."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Generic
 
 import numpy as np
 from pydrake.geometry import Meshcat
@@ -14,33 +15,13 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
-from weldcal.systems.cell import Cell, job_plan
-from weldcal.systems.drivers.simulated.rendered_finger_camera import StreamingColourCamera
-from weldcal.systems.jobs.weld.sequencer import JobState
-from weldcal.systems.messages import Scan
+from weldcal.systems.cell import Cell, JobOf
+from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
+from weldcal.systems.motion.spine import FIRST
 from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
 
 Progress = Callable[[str, float], None]
-# How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
-SHARES = {
-    "start": 0.0,
-    "move_home": 0.0,
-    "move_to_pose": 0.05,
-    "move_to_verify": 0.28,
-    "scan_verify": 0.30,
-    "park": 0.31,
-    "scan_workpiece": 0.33,
-    "approach_above": 0.34,
-    "approach": 0.36,
-    "weld": 0.38,
-    "retract": 0.96,
-    "home": 0.97,
-    "done": 0.98,
-    "held": 0.98,
-}
-
-
 LOOKS = {
     "job": 0.008,
     "progress": 1.0,
@@ -49,6 +30,7 @@ LOOKS = {
 AT_REST_RAD_S = 1e-3
 COMMANDED_RAD_S = 1e-6
 COMES_TO_REST_S = 1.0  # how long a run goes on after its job has ended, at most, until the arm is at rest
+OVERTIME_S = 5.0  # beyond the time after which the job holds itself
 
 
 def no_progress(stage: str, fraction: float) -> None:
@@ -56,13 +38,13 @@ def no_progress(stage: str, fraction: float) -> None:
 
 
 @dataclass
-class Run:
+class Run(Generic[JobOf]):
     """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
 
     `interrupted`: why a person ended it before its job had. `clock`: what kept it to the wall clock, where something did.
     """
 
-    cell: Cell
+    cell: Cell[JobOf]
     simulator: Simulator
     wall_seconds: float = 0.0
     phases: list[tuple[str, float, float]] = field(default_factory=list)
@@ -71,36 +53,55 @@ class Run:
     clock: WallClock | None = None
 
     @property
-    def held(self) -> bool:
-        """The job did not come to its end."""
-        return self.interrupted is not None or self.job.command.held
-
-    @property
-    def reason(self) -> str | None:
-        """Why it did not."""
-        return self.interrupted or self.job.command.reason
-
-    @property
     def root(self) -> Context:
         """The context of the whole Diagram."""
         return self.simulator.get_context()
 
     @property
-    def job(self) -> JobState:
-        """Where the job stands."""
-        return self.cell.sequencer.job_state(self.cell.sequencer.GetMyContextFromRoot(self.root))
+    def seconds(self) -> float:
+        """Simulated seconds."""
+        return float(self.root.get_time())
+
+    @property
+    def command(self) -> JobCommand:
+        """What the job asked last."""
+        return self.cell.job.command(self.root)
+
+    @property
+    def held(self) -> bool:
+        """The job did not come to its end."""
+        return self.interrupted is not None or self.command.held or not self.command.finished
+
+    @property
+    def reason(self) -> str | None:
+        """Why it did not."""
+        return self.interrupted or self.command.reason
 
     def real_time_factor(self, phase: str | None = None) -> float:
         """Simulated seconds per wall second of the whole run, or of one phase."""
         if phase is None:
-            return float(self.root.get_time()) / max(self.wall_seconds, 1e-9)
+            return self.seconds / max(self.wall_seconds, 1e-9)
         spans = [(b[1] - a[1], b[2] - a[2]) for a, b in pairwise(self.phases) if a[0] == phase]
         return float(sum(s for s, _ in spans) / max(sum(w for _, w in spans), 1e-9))
 
+    def timing(self) -> dict[str, object]:
+        """The figures of time that every run's JSON object ends with."""
+        found: dict[str, object] = {
+            "simulated_seconds": self.seconds,
+            "wall_seconds": self.wall_seconds,
+            "real_time_factor": self.real_time_factor(),
+        }
+        if self.clock is not None:
+            found["late_ms"], found["thinking_ms"] = 1e3 * self.clock.late_s, 1e3 * self.clock.thinking_s
+            found["reanchored"] = self.clock.reanchored
+            if (behind := self.clock.sentence()) is not None:
+                found["fell_behind"] = behind
+        return found
+
 
 def run_cell(
-    cell: Cell, progress: Progress = no_progress, meshcat: Meshcat | None = None, realtime: bool = False
-) -> Run:
+    cell: Cell[JobOf], progress: Progress = no_progress, meshcat: Meshcat | None = None, realtime: bool = False
+) -> Run[JobOf]:
     """Advance until the job is done or held (or its own time limit holds it) and the arm is at rest.
 
     Records into `meshcat` where one is given. A station with a pace is kept to the wall clock. Whatever happens, Ctrl-C
@@ -130,19 +131,19 @@ def run_cell(
             run.clock.wait_for(root.get_time(), _commanded(cell, root))
         if not due("job", root.get_time()):
             return EventStatus.DidNothing()
-        command = cell.sequencer.job_state(cell.sequencer.GetMyContextFromRoot(root)).command
+        command = cell.job.command(root)
         if not run.phases or command.phase != run.phases[-1][0]:
             _keep_scan(run, root)
             run.phases.append((command.phase, root.get_time(), time.perf_counter() - start))
-            progress(command.phase.replace("_", " "), _share(run, root, command.phase))
-        elif command.phase == "weld" and due("progress", root.get_time()):
-            progress("weld", _share(run, root, "weld"))
+            progress(*cell.job.stage(root, run.phases))
+        elif due("progress", root.get_time()):
+            progress(*cell.job.stage(root, run.phases))
         if run.clock is None and has_panel and due("panel", root.get_time()):
             _keep_pace(run, root)
         if command.finished:
             finished_at = min(finished_at, root.get_time())
             if _at_rest(cell, root) or root.get_time() - finished_at > COMES_TO_REST_S:
-                return EventStatus.ReachedTermination(cell.sequencer, command.phase)
+                return EventStatus.ReachedTermination(cell.diagram, command.phase)
         return EventStatus.DidNothing()
 
     simulator.set_monitor(watch)
@@ -153,9 +154,9 @@ def run_cell(
                 _first_pictures(cell, run.root)
                 around.enter_context(real_time_priority())
             simulator.Initialize()
-            simulator.AdvanceTo(job_plan(cell.scenario).maximum_time_s + 5.0)
+            simulator.AdvanceTo(cell.job.maximum_time_s + OVERTIME_S)
     except KeyboardInterrupt:
-        run.interrupted = f"A person stopped the run with Ctrl-C, in the phase '{run.job.command.phase}'."
+        run.interrupted = f"A person stopped the run with Ctrl-C, in the phase '{run.command.phase}'."
     finally:
         station.close()
     run.wall_seconds = time.perf_counter() - start
@@ -165,31 +166,31 @@ def run_cell(
     return run
 
 
-def _commanded(cell: Cell, root: Context) -> bool:
+def _commanded(cell: Cell[JobOf], root: Context) -> bool:
     """Whether the arm is told to move."""
     station = cell.station.diagram
-    command = station.GetInputPort("ur10e.velocity_command").Eval(station.GetMyContextFromRoot(root))
+    command = station.GetInputPort(f"{FIRST}.velocity_command").Eval(station.GetMyContextFromRoot(root))
     return bool(np.max(np.abs(command)) > COMMANDED_RAD_S)
 
 
-def _at_rest(cell: Cell, root: Context) -> bool:
+def _at_rest(cell: Cell[JobOf], root: Context) -> bool:
     station = cell.station.diagram
-    measured = station.GetOutputPort("ur10e.velocity_measured").Eval(station.GetMyContextFromRoot(root))
+    measured = station.GetOutputPort(f"{FIRST}.velocity_measured").Eval(station.GetMyContextFromRoot(root))
     return bool(np.max(np.abs(measured)) < AT_REST_RAD_S)
 
 
-def _first_pictures(cell: Cell, root: Context) -> None:
+def _first_pictures(cell: Cell[JobOf], root: Context) -> None:
     """A renderer's first picture takes a second: let it be taken while nothing moves."""
     for system in cell.station.diagram.GetSystems():
         if isinstance(system, RgbdSensor):
             context = system.GetMyContextFromRoot(root)
             for port in (system.color_image_output_port(), system.depth_image_32F_output_port()):
                 port.Eval(context)
-        elif isinstance(system, StreamingColourCamera):
+        elif hasattr(system, "first_picture"):
             system.first_picture(system.GetMyContextFromRoot(root))
 
 
-def _keep_pace(run: Run, root: Context) -> None:
+def _keep_pace(run: Run[JobOf], root: Context) -> None:
     """The viewer's slider sets how fast the simulation may go."""
     panel = run.cell.diagram.GetSubsystemByName("operator_panel")
     pace = float(panel.GetOutputPort("pace").Eval(panel.GetMyContextFromRoot(root))[0])
@@ -197,27 +198,12 @@ def _keep_pace(run: Run, root: Context) -> None:
         run.simulator.set_target_realtime_rate(pace)
 
 
-def _share(run: Run, root: Context, phase: str) -> float:
-    share = SHARES.get(phase, 0.05)
-    if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
-        scans = sum(1 for name, _, _ in run.phases if name == "scan_pose")
-        return min(0.02 + 0.03 * scans, 0.27)
-    if phase == "weld":
-        begun = next((t for name, t, _ in run.phases if name == "weld"), root.get_time())
-        length = (
-            0.3 if run.cell.scenario.welding.seam_length_mm is None else run.cell.scenario.welding.seam_length_mm * 1e-3
-        )
-        expected = (length + 0.06) / run.cell.servo_config.weld_speed_m_s + 5.0
-        return share + 0.58 * min(float(root.get_time() - begun) / expected, 1.0)
-    return share
-
-
-def _keep_scan(run: Run, root: Context) -> None:
+def _keep_scan(run: Run[JobOf], root: Context) -> None:
     """A phase that follows a scan begins after the scan was digested: keep it, with its purpose."""
-    if not run.phases or not run.phases[-1][0].startswith("scan_"):
-        return
     station = run.cell.station.diagram
+    if not run.phases or not run.phases[-1][0].startswith("scan_") or not station.HasOutputPort("scanner.scan"):
+        return
     scan: Scan = station.GetOutputPort("scanner.scan").Eval(station.GetMyContextFromRoot(root))
-    command = run.job.command
+    command = run.command
     if scan.sequence:
         run.scans[command.scan_label] = (scan, command.scan_purpose)

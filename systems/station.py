@@ -1,11 +1,11 @@
-"""The station: arm, scanner and finger camera behind fixed ports; the scenario's driver configs say what is real."""
+"""The station: arms, sensors and tools behind fixed ports; the scenario's driver configs say what is real."""
 
 from __future__ import annotations
 
 import dataclasses as dc
 import inspect
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -14,23 +14,21 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
-from weldcal.models.base_circles import base_circle
 from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
-from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
-from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, ProfilerTruth
-from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
+from weldcal.systems.drivers.config import DEVICES, DriverConfig, NoDevice
+from weldcal.systems.drivers.simulated.furnishing import Furnishing
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
-from weldcal.systems.drivers.simulated.second_arm import PlacedArm, apply_second_robot, place_second_arm
-from weldcal.systems.drivers.simulated.tablet_world import tablet_fittings
+from weldcal.systems.drivers.simulated.second_arm import SECOND, PlacedArm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -55,7 +53,8 @@ class Station:
     tool: WeldingTool | None
     cad: Workpiece | None  # the part as drawn
     truth: Truth
-    world: SimulatedWorld
+    world: SimulatedWorld | None  # None where no device is simulated
+    second: ArmModel | None = None
 
     @property
     def arm(self) -> ArmModel:
@@ -130,15 +129,27 @@ class CheatPoses(LeafSystem):
         output.SetFromVector(self._poses.Eval(context)[self._flange] @ self._tool.X_FT @ self._tool.p_TW)
 
 
-def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = None) -> Station:
+class Furnish(Protocol):
+    """What a job puts into the simulated world (Job.furnish)."""
+
+    def __call__(
+        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+    ) -> Furnishing:
+        """Draw it from the run's random numbers."""
+
+
+def make_station(
+    scenario: Scenario, seed: int, robot: PreparedRobot | None = None, furnish: Furnish | None = None
+) -> Station:
     """Build the station that the scenario describes; every random difference between world and drawing comes from `seed`.
 
-    `robot` is the robot as somebody else has found it; None: the driver in the scenario is asked.
+    `robot` is the robot as somebody else has found it; None: the driver in the scenario is asked. `furnish` is the job's.
+    A station in which no device is simulated holds no simulated world: the arm is drawn where it is measured.
 
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
-    `finger_camera.image`, `.capture_time`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`, `cheat.torch`,
-    `query_object`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
+    `finger_camera.image`, `.capture_time`, `query_object`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`,
+    `cheat.torch`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
     profiler: in `profiler.trigger`, out `profiler.profile`, `torch.touch`.
 
     Raises:
@@ -150,74 +161,84 @@ def make_station(scenario: Scenario, seed: int, robot: PreparedRobot | None = No
         nominal = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
         robot = prepare_robot(scenario.robot, nominal, np.deg2rad(scenario.home_deg))
     try:
-        return _make_station(scenario, seed, robot)
+        return _make_station(scenario, seed, robot, furnish)
     except BaseException:
         robot.close()
         raise
 
 
-def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot) -> Station:
+def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: Furnish | None) -> Station:
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
-    visit = tablet_fittings(scenario, rng)
-    second = _second_arm(scenario, rng)
-    fixture = _fixture(scenario, rng, real, X_BP)
+    devices: dict[str, DriverConfig] = {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
-    world = build_world(
-        builder,
-        robot.arm,
-        tool,
-        robot.q_start,
-        flange=scenario.flange,
-        table_z_m=scenario.calibration.table_z_m,
-        workpiece=real,
-        X_BP=X_BP,
-        fittings=() if visit is None else (visit,),
-        second=second,
-        foot=None if scenario.mounting is None else base_circle(scenario.arm),
-        profiler=fixture,
-        time_step_s=_time_step(scenario, fixture),
-    )
-    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, world, robot, visit, fixture)
-    if second is not None:
-        apply_second_robot(scenario.robot_2, second, build, apply_driver_config)
-    apply_driver_config(scenario.robot, build)
-    X_LC = apply_driver_config(scenario.scanner, build)
-    apply_driver_config(scenario.finger_camera, build)
-    apply_driver_config(scenario.wrist_camera, build)
-    apply_driver_config(scenario.digitizer, build)
-    apply_driver_config(scenario.profiler, build)
-    on_base = isinstance(scenario.scanner, NoDevice) or scenario.scanner.mounted_on == "base"
+    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot)
+    furnishing = Furnishing()
+    world = None
+    if any(config.SIMULATED for config in devices.values()):
+        furnishing = Furnishing() if furnish is None else furnish(scenario, rng, real, X_BP)
+        world = build_world(
+            builder,
+            robot.arm,
+            tool,
+            robot.q_start,
+            flange=scenario.flange,
+            table_z_m=scenario.calibration.table_z_m,
+            workpiece=real,
+            X_BP=X_BP,
+            fittings=furnishing.fittings,
+            second=furnishing.second,
+            foot=furnishing.foot,
+            profiler=furnishing.profiler,
+            time_step_s=furnishing.time_step_s,
+        )
+        build.parts = (world, *furnishing.parts)
+    X_LC = None
+    for name, config in devices.items():
+        if name == "robot_2" and furnishing.second is not None:
+            _apply_second_robot(config, furnishing.second, build)
+            continue
+        placed = apply_driver_config(config, build)
+        X_LC = placed if name == "scanner" else X_LC
+    scanner = scenario.scanner_config()
+    on_base = scanner is None or scanner.mounted_on == "base"
     truth = Truth(
         X_LC if on_base else None,
-        X_BP,
-        real,
-        None if visit is None else visit.truth,
+        X_BP if world is not None else None,
+        real if world is not None else None,
+        build.find(TabletTruth),
         X_LC,
-        None if second is None else second.X_BD,
-        None if fixture is None else fixture.truth,
+        None if furnishing.second is None else furnishing.second.X_BD,
+        build.find(ProfilerTruth),
     )
-    _export(build, truth)
+    _export(build, world, truth, scenario)
     diagram = builder.Build()
     diagram.set_name("station")
-    return Station(diagram, robot, tool, cad, truth, world)
+    second = None if furnishing.second is None else furnishing.second.arm
+    return Station(diagram, robot, tool, cad, truth, world, second)
 
 
-def _time_step(scenario: Scenario, fixture: ProfilerFixture | None) -> float:
-    """Of the plant, s: as fine as what is touched asks for, and nothing is touched in a mounting job."""
-    if fixture is not None:
-        return fixture.time_step_s
-    return 0.002 if scenario.mounting is None else 0.004
-
-
-def _second_arm(scenario: Scenario, rng: np.random.Generator) -> PlacedArm | None:
-    """The second arm where it truly stands; nothing is drawn from the seed where there is none."""
-    config = None if scenario.mounting is None else scenario.mounting.second_arm
-    if config is None:
-        return None
-    off = random_pose_error(rng, 1e-3 * config.placement_translation_mm, np.deg2rad(config.placement_rotation_deg))
-    return place_second_arm(config, off)
+def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
+    """Let the driver that knows one arm drive the second: it is handed a world whose arm this is, and its ports are renamed."""
+    world = build.require(SimulatedWorld)
+    assert world.second is not None
+    own = dc.replace(
+        build,
+        arm=placed.arm,
+        tool=None,
+        q_start=placed.q_start,
+        parts=(dc.replace(world, arm=world.second),),
+        inputs={},
+        outputs={},
+    )
+    before = {id(s) for s in build.builder.GetSystems()}
+    apply_driver_config(config, own)
+    for system in build.builder.GetSystems():
+        if id(system) not in before:
+            system.set_name(system.get_name().replace("ur10e", SECOND))
+    build.inputs |= {name.replace("ur10e", SECOND): port for name, port in own.inputs.items()}
+    build.outputs |= {name.replace("ur10e", SECOND): port for name, port in own.outputs.items()}
 
 
 def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
@@ -253,17 +274,6 @@ def _workpieces(
     return cad, real, spec.pose_guess.pose() @ placed
 
 
-def _fixture(
-    scenario: Scenario, rng: np.random.Generator, real: Workpiece | None, X_BP: RigidTransform | None
-) -> ProfilerFixture | None:
-    """What the profiler looks at, where there is one."""
-    p, job = scenario.profiler, scenario.profiler_job
-    if not isinstance(p, RenderedProfiler) or job is None:
-        return None
-    error = 1e-3 * p.mounting_translation_mm, float(np.deg2rad(p.mounting_rotation_deg))
-    return draw_fixture(drawn_pose(p), *error, job, rng, scenario.calibration.table_z_m, real, X_BP)
-
-
 def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
     """A plate lies flat on its fixture: it may be moved and turned in its plane."""
     error = random_pose_error(rng, translation_m, rotation_rad)
@@ -274,12 +284,23 @@ def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: f
     return RigidTransform(RollPitchYaw(0.0, 0.0, sign * rotation_rad), p)
 
 
-def _export(build: StationBuild, truth: Truth) -> None:
-    builder, world = build.builder, build.simulated_world()
+def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, scenario: Scenario) -> None:
+    builder = build.builder
     for name, port in build.inputs.items():
         builder.ExportInput(port, name)
     for name, port in build.outputs.items():
         builder.ExportOutput(port, name)
+    if world is None:
+        drawn = add_drawn_arm(
+            builder,
+            build.arm,
+            build.tool,
+            scenario.flange,
+            scenario.calibration.table_z_m,
+            build.outputs["ur10e.position_measured"],
+        )
+        builder.ExportOutput(drawn.get_query_output_port(), "query_object")
+        return
     source = builder.AddSystem(ConstantValueSource(AbstractValue.Make(truth)))
     source.set_name("truth")
     builder.ExportOutput(source.get_output_port(), "cheat.truth")

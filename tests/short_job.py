@@ -7,8 +7,10 @@ from functools import cache
 
 import pytest
 
-from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.commands.demo import DemoOptions, DemoResult, run_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.demo import DemoResult, run_scenario
+from weldcal.tools.outcomes.options import RunOptions
 
 SHORTER = "welding: {seam_length_mm: 30.0}\ncalibration: {minimum_scans: 4}"
 SHORT_JOB_SEED = 5
@@ -28,7 +30,7 @@ def short_jobs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Demo
     def finished(preset: str) -> DemoResult:
         folder = tmp_path_factory.mktemp(preset) / "run"
         return run_scenario(
-            short_job_scenario(preset), DemoOptions("a test's own", folder, SHORT_JOB_SEED, recording=False)
+            short_job_scenario(preset), RunOptions("a test's own", folder, SHORT_JOB_SEED, recording=False)
         )
 
     return finished

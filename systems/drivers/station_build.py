@@ -1,9 +1,10 @@
-"""What a driver is given while the station is built: the builder, the world it is simulated in, and where to export ports."""
+"""What a driver is given while the station is built: the builder, what else the station holds, and where to export ports."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
@@ -11,10 +12,7 @@ from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
 
-if TYPE_CHECKING:
-    from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
-    from weldcal.systems.drivers.simulated.tablet_world import TabletFittings
-    from weldcal.systems.drivers.simulated.world import SimulatedWorld
+Part = TypeVar("Part")
 
 
 class Closable(Protocol):
@@ -45,22 +43,28 @@ class PreparedRobot:
 
 @dataclass
 class StationBuild:
-    """Collects what the drivers add; `make_station` exports it under fixed names. `q_start` (6,) rad: where the arm stands."""
+    """Collects what the drivers add; `make_station` exports it under fixed names. `q_start` (6,) rad: where the arm stands.
+
+    `parts` are what else the station holds, found by their type: the simulated world, and what a job puts into it.
+    """
 
     builder: DiagramBuilder
     arm: ArmModel
     tool: WeldingTool | None
     q_start: np.ndarray
     rng: np.random.Generator
-    world: SimulatedWorld | None = None
     robot: PreparedRobot | None = None
-    visit: TabletFittings | None = None  # camera, pen and tablet as they truly are, where there is a tablet
-    profiler: ProfilerFixture | None = None
+    parts: Sequence[object] = ()
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
 
-    def simulated_world(self) -> SimulatedWorld:
-        """The world that simulated drivers act in."""
-        if self.world is None:
-            raise RuntimeError("this driver is simulated and needs a simulated world in the station")
-        return self.world
+    def find(self, kind: type[Part]) -> Part | None:
+        """The part of this type; None where the station has none."""
+        return next((part for part in self.parts if isinstance(part, kind)), None)
+
+    def require(self, kind: type[Part]) -> Part:
+        """The part of this type; raises RuntimeError where the station has none."""
+        found = self.find(kind)
+        if found is None:
+            raise RuntimeError(f"this driver needs a {kind.__name__} in the station")
+        return found

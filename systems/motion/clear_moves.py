@@ -11,7 +11,7 @@ from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
 from weldcal.models.errors import InputError
-from weldcal.systems.jobs.weld.sequencer import stands_at
+from weldcal.systems.motion.goals import stands_at
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 

@@ -1,34 +1,17 @@
-"""What a scenario YAML may say: typed configuration of one cell, unknown keys are errors."""
+"""What a scenario YAML may say: typed configuration of one cell; devices and jobs add their own keys."""
 
 import dataclasses as dc
-import re
-from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
-from pydrake.common.yaml import yaml_load_typed
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.published.algorithm1 import COST_AXES, named_cost
-from weldcal.models.errors import InputError
-from weldcal.systems.drivers.no_device import NoDevice
-from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
-from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
-from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
-from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
-from weldcal.systems.drivers.simulated.tablet import SimulatedTablet
-from weldcal.systems.drivers.simulated.ur import SimulatedUr
-from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
-from weldcal.systems.jobs.profiler.config import ProfilerJob, check_profiler_job
-from weldcal.systems.jobs.tablet.config import TabletConfig, check_tablet
-from weldcal.systems.scenario.numbers import check_numbers
+from weldcal.calibration.published.algorithm1 import COST_AXES
+from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
-from weldcal.welding.servo.laws import get_law
 
-SLOWEST_FACTOR = 0.05
-DRAWN_ARMS = ("ur10e",)
-SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
+JobConfigOf = TypeVar("JobConfigOf")
 
 
 @dc.dataclass
@@ -152,131 +135,37 @@ class VisualizationConfig:
 
 @dc.dataclass
 class Scenario:
-    """One cell: arm, station drivers, calibration, workpiece, welding and job."""
+    """One cell: arm, devices, calibration, workpiece, welding and job.
+
+    The class that YAML is read into (see loading.scenario_class) narrows each device to the drivers that are installed, and
+    adds a key for each kind of job.
+    """
 
     description: str = ""
     arm: str = "ur10e"
     kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
     flange: str = "iso9409-1-50-4-m6"  # of the arm
     tool: str = "welding"  # welding, pen or none
-    robot: SimulatedUr | UrRtde | NoDevice = dc.field(default_factory=SimulatedUr)
-    robot_2: SimulatedUr | NoDevice = dc.field(default_factory=NoDevice)
-    scanner: RenderedScanner | NoDevice = dc.field(default_factory=RenderedScanner)
-    finger_camera: RenderedFingerCamera | NoDevice = dc.field(default_factory=RenderedFingerCamera)
-    wrist_camera: RenderedWristCamera | NoDevice = dc.field(default_factory=NoDevice)
-    digitizer: SimulatedTablet | NoDevice = dc.field(default_factory=NoDevice)
-    profiler: RenderedProfiler | NoDevice = dc.field(default_factory=NoDevice)
-    profiler_job: ProfilerJob | None = None
+    robot: DriverConfig = dc.field(default_factory=NoDevice)
+    robot_2: DriverConfig = dc.field(default_factory=NoDevice)
+    scanner: DriverConfig = dc.field(default_factory=NoDevice)
+    finger_camera: DriverConfig = dc.field(default_factory=NoDevice)
+    wrist_camera: DriverConfig = dc.field(default_factory=NoDevice)
+    digitizer: DriverConfig = dc.field(default_factory=NoDevice)
+    profiler: DriverConfig = dc.field(default_factory=NoDevice)
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
-    mounting: MountingJob | None = None
     workpiece: WorkpieceConfig | None = None
     planning: PlanningConfig = dc.field(default_factory=PlanningConfig)
     welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
-    tablet: TabletConfig | None = None  # a visit to a tablet instead of the job
     job: JobConfig = dc.field(default_factory=JobConfig)
     visualization: VisualizationConfig = dc.field(default_factory=VisualizationConfig)
 
+    def part(self, kind: type[JobConfigOf]) -> JobConfigOf | None:
+        """The part of the scenario of this type, such as a job's; None where it has none."""
+        found = (getattr(self, field.name) for field in dc.fields(self))
+        return next((value for value in found if isinstance(value, kind)), None)
 
-def scenario_names() -> list[str]:
-    """Names of the scenarios that ship with weldcal."""
-    return sorted(path.stem for path in SCENARIO_FOLDER.glob("*.yaml"))
-
-
-def load_scenario(name: str, overrides: str = "") -> Scenario:
-    """Load a scenario by name or path; `overrides` is a second YAML text merged on top.
-
-    Raises:
-        InputError: unknown name, unknown key, wrong type; the sentence says which.
-    """
-    path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
-    if not path.is_file():
-        raise InputError(
-            f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file."
-        )
-    scenario = Scenario()
-    for label, text in ((str(path.name), path.read_text(encoding="utf-8")), ("the overrides", overrides)):
-        if not text.strip():
-            continue
-        try:
-            scenario = yaml_load_typed(schema=Scenario, data=text, defaults=scenario)
-        except Exception as error:  # Drake's loader raises several kinds, and not every text names the key
-            what = " ".join(str(error).split())
-            raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
-    check_scenario(scenario)
-    return scenario
-
-
-def _part_at_fault(text: str) -> str:
-    """Which top-level part of a YAML text does not load by itself, as words for a sentence; empty where that is not clear."""
-    parts = re.split(r"^(?=\w+ *:)", text, flags=re.MULTILINE)
-    for part in filter(str.strip, parts):
-        try:
-            yaml_load_typed(schema=Scenario, data=part, defaults=Scenario())
-        except Exception:  # the same loader as above: any failure names this part
-            return f" at '{part.split(':')[0].strip()}'"
-    return ""
-
-
-def check_scenario(scenario: Scenario) -> None:
-    """Refuse what no cell could do, before any work.
-
-    Raises:
-        InputError: one sentence that says what to change.
-    """
-    if scenario.arm not in DRAWN_ARMS:
-        raise InputError(
-            f"The cell is built round the {' or '.join(DRAWN_ARMS)}, whose shape its clearances are made for, not '{scenario.arm}'."
-        )
-    if isinstance(scenario.robot, NoDevice):
-        raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
-    asked = [name for name in ("tablet", "mounting", "profiler_job") if getattr(scenario, name) is not None]
-    if len(asked) > 1:
-        raise InputError(f"A scenario is one procedure: take {' or '.join(asked)} out of it, and make another of that.")
-    check_tablet(scenario)
-    if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
-        raise InputError(
-            "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."
-        )
-    check_numbers(scenario)
-    check_mounting(
-        scenario.calibration.configuration,
-        scenario.mounting,
-        "base" if isinstance(scenario.scanner, NoDevice) else scenario.scanner.mounted_on,
-        simulated=isinstance(scenario.robot, SimulatedUr),
-        second_robot=not isinstance(scenario.robot_2, NoDevice),
-        weld=scenario.job.weld,
-    )
-    scenario.welding.process.process()
-    scenario.planning.planning_method()
-    if not SLOWEST_FACTOR <= scenario.job.speed_factor <= 1.0:
-        raise InputError(
-            f"job.speed_factor must be from {SLOWEST_FACTOR:g} to 1, and it is {scenario.job.speed_factor:g}."
-        )
-    calibration = scenario.calibration
-    if calibration.feature not in ("tool_ring", "flange"):
-        raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
-    named_cost(calibration.cost, 1e-3 * calibration.work_radius_mm, calibration.cost_axes)
-    if scenario.tool not in ("welding", "pen", "none"):
-        raise InputError(f"tool must be welding, pen or none, not '{scenario.tool}'.")
-    if (calibration.feature == "tool_ring") != (scenario.tool == "welding"):
-        raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
-    if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:
-        raise InputError("calibration.minimum_scans must be at least 4 and not above calibration.maximum_scans.")
-    if scenario.job.weld and (
-        scenario.workpiece is None or scenario.tool == "none" or isinstance(scenario.finger_camera, NoDevice)
-    ):
-        raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
-    get_law(scenario.welding.law)
-    if isinstance(scenario.profiler, RenderedProfiler):
-        scenario.profiler.preset()
-    check_profiler_job(
-        scenario.profiler_job,
-        has_profiler=not isinstance(scenario.profiler, NoDevice),
-        has_groove=scenario.workpiece is not None,
-        tool=scenario.tool,
-    )
-    if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
-        raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
-    if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:
-        raise InputError("A weld without calibrating first needs job.X_BC, the known pose of the scanner in the base.")
+    def scanner_config(self) -> ScannerConfig | None:
+        """The scanner; None where there is none."""
+        return self.scanner if isinstance(self.scanner, ScannerConfig) else None

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import Ellipsoid, Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Rgba, Role
+from pydrake.geometry import Ellipsoid, Meshcat, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.perception import BaseField, Fields, PointCloud
-from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, EventStatus, LeafSystem, OutputPort
 
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
@@ -18,9 +18,9 @@ from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message, PlannedSeam, Scan
 from weldcal.systems.scenario.schema import VisualizationConfig
-from weldcal.systems.station import Station
 from weldcal.systems.viewer.phase_labels import add_phase_label
 from weldcal.systems.viewer.weld_view import WeldView
+from weldcal.systems.wiring import Wiring
 
 ROOT = "/weldcal"
 CLOUD, CIRCLE, BELIEF = Rgba(0.95, 0.80, 0.25, 0.9), Rgba(0.90, 0.15, 0.35, 1.0), Rgba(0.10, 0.70, 0.55, 0.35)
@@ -176,25 +176,17 @@ class CellVisualizer(LeafSystem):
 
 
 def add_visualizer(
-    builder: DiagramBuilder,
-    meshcat: Meshcat,
-    station: Station,
+    wiring: Wiring,
     circle_radius_m: float,
     X_BC_guess: RigidTransform,
-    config: VisualizationConfig,
     weld_speed_m_s: float,
     ports: dict[str, OutputPort],
 ) -> CellVisualizer:
-    """Add Drake's own visualizer for the bodies and ours for the beliefs; one Meshcat, passed in."""
-    params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=1.0 / config.recording_fps)
-    visualizer = MeshcatVisualizer(meshcat, params)
-    visualizer.set_name("meshcat_visualizer")
-    builder.AddSystem(visualizer)
-    builder.Connect(station.diagram.GetOutputPort("query_object"), visualizer.query_object_input_port())
+    """Add the viewer of the job's beliefs; the bodies are drawn by the cell itself."""
+    assert wiring.meshcat is not None
+    station, config = wiring.station, wiring.scenario.visualization
     cad = None if station.cad is None else station.cad.mesh
-    viewer = CellVisualizer(meshcat, station.tool, X_BC_guess, circle_radius_m, config, cad, weld_speed_m_s)
-    viewer.set_name("cell_visualizer")
-    builder.AddSystem(viewer)
-    for name, port in ports.items():
-        builder.Connect(port, viewer.GetInputPort(name))
+    viewer = CellVisualizer(wiring.meshcat, station.tool, X_BC_guess, circle_radius_m, config, cad, weld_speed_m_s)
+    wiring.add("cell_visualizer", viewer)
+    wiring.connect(viewer, **ports)
     return viewer

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.systems.textured_board import textured_board
+from weldcal.systems.bodies.textured_board import textured_board
 
 WIDTH_M, HEIGHT_M = 0.72, 0.09
 # Above and behind the cell, facing a viewer who stands in front of the robot (+x) and looks back at it.

@@ -11,9 +11,9 @@ from pydrake.perception import BaseField, Fields, PointCloud
 from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
 from weldcal.models.tool import WeldingTool
+from weldcal.systems.bodies.textured_board import textured_board
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import PlannedSeam
-from weldcal.systems.textured_board import textured_board
 from weldcal.systems.viewer.phase_labels import HEIGHT_M as SIGN_HEIGHT_M
 from weldcal.systems.viewer.phase_labels import WIDTH_M as SIGN_WIDTH_M
 from weldcal.systems.viewer.phase_labels import X_WS, label_image

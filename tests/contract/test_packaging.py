@@ -117,7 +117,7 @@ def test_an_installed_wheel_works_far_from_the_repository(built: Built, tmp_path
     libraries = [path for path in sys.path if path.endswith("site-packages")]
     script = (
         "import sys; import weldcal.tools.cli.app as cli; from weldcal.tools.report.render import environment;"
-        "from weldcal.systems.scenario.schema import SCENARIO_FOLDER;"
+        "from weldcal.systems.scenario.loading import SCENARIO_FOLDER;"
         f"assert cli.__file__.startswith({str(target)!r}), cli.__file__;"
         "assert environment().get_template('base.html.j2');"
         "print(*sorted(path.name for path in SCENARIO_FOLDER.glob('*.yaml')))"

@@ -11,10 +11,12 @@ import pytest
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
-from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.commands.demo import DemoOptions, DemoResult, run_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.demo import DemoResult, run_scenario
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.emulators.ur.process import Emulator, emulator_process
+from weldcal.tools.outcomes.options import RunOptions
 
 # An address of its own: this module waits for no other.
 HOST = "127.0.0.41"
@@ -40,7 +42,7 @@ scanner: !RenderedScanner {preset: ideal, width: 824, height: 616}
 
 def finished_job(folder: Path, robot: str, pace: float | None) -> DemoResult:
     """Calibrate, verify, plan, approach, weld, retract: all that a job is, as short as it gets."""
-    options = DemoOptions("a test's own", folder, SEED, robot=robot, pace=pace, recording=False)
+    options = RunOptions("a test's own", folder, SEED, robot=robot, pace=pace, recording=False)
     return run_scenario(load_scenario("s_groove", SHORTEST), options)
 
 
@@ -130,7 +132,7 @@ def run_until(controller: Emulator, folder: Path, stage: str, happens: Callable[
         if phase == stage:
             happens()
 
-    options = DemoOptions("a test's own", folder, robot=HOST, pace=PACE, recording=False)
+    options = RunOptions("a test's own", folder, robot=HOST, pace=PACE, recording=False)
     controller.do("reset_checker")
     result = run_scenario(weld_only(), options, watch)
     assert result.state == "held"

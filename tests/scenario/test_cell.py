@@ -20,10 +20,12 @@ from weldcal.systems.cell import job_plan, make_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.motion.clear_moves import clear_poses
 from weldcal.systems.runner import run_cell
-from weldcal.systems.scenario.schema import SCENARIO_FOLDER, Scenario, load_scenario
+from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.demo import DemoOptions, DemoResult, measure, run_scenario, run_weld, write_result
-from weldcal.tools.commands.outcome import calibration_error
+from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.studies.cell.study import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
@@ -40,7 +42,7 @@ FAST = "welding: {speed_mm_s: 16.0}"
 
 
 def run(scenario: Scenario, folder: Path, seed: int = 0) -> DemoResult:
-    return run_scenario(scenario, DemoOptions("a test's own", folder, seed, recording=False))
+    return run_scenario(scenario, RunOptions("a test's own", folder, seed, recording=False))
 
 
 @pytest.fixture(scope="module")
@@ -303,7 +305,7 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     assert closed
     assert found.held
     assert found.reason == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
-    result = measure(found, DemoOptions("a test's own", tmp_path / "run", recording=False))
+    result = measure(found, RunOptions("a test's own", tmp_path / "run", recording=False))
     write_result(result, None)
     assert result.summary()["state"] == "held"
     assert (tmp_path / "run" / "report.html").exists()
@@ -341,7 +343,7 @@ def test_a_robot_that_cannot_be_had_is_refused_with_one_sentence(
     options: dict[str, Any], said: str, tmp_path: Path
 ) -> None:
     with pytest.raises(WeldcalError, match=said) as refusal:
-        run_scenario(load_scenario("straight_groove", TOLD), DemoOptions("x", tmp_path / "run", **options))
+        run_scenario(load_scenario("straight_groove", TOLD), RunOptions("x", tmp_path / "run", **options))
     assert str(refusal.value).count(". ") == 0
     assert not (tmp_path / "run").exists()
 
@@ -350,4 +352,4 @@ def test_a_weld_needs_a_workpiece(tmp_path: Path) -> None:
     path = tmp_path / "bare.yaml"
     path.write_text("welding: {seam_length_mm: 20.0}\n")
     with pytest.raises(WeldcalError, match="needs a workpiece"):
-        run_weld(DemoOptions(str(path), tmp_path / "out", recording=False))
+        run_weld(RunOptions(str(path), tmp_path / "out", recording=False))

@@ -12,7 +12,7 @@ from pydrake.systems.analysis import Simulator
 from tests.browser import Browser, colours
 from weldcal.systems.cell import Cell, make_cell
 from weldcal.systems.motion.operator_panel import HOLD_BUTTON
-from weldcal.systems.scenario.schema import load_scenario
+from weldcal.systems.scenario.loading import load_scenario
 
 
 @pytest.fixture(scope="module")

@@ -19,10 +19,11 @@ from weldcal.systems.jobs.mounting.cell import MountingRun, make_mounting_cell, 
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.commands.demo import DemoOptions
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.mounting_live import MountingReport, run_mounting_live
 from weldcal.tools.commands.procedures import kind_of
+from weldcal.tools.outcomes.options import RunOptions
 
 # few poses near home, a coarse image, a controller at a quarter of its rate: seconds instead of a minute
 QUICK = "robot: !SimulatedUr {control_period_s: 0.008}\n"
@@ -154,7 +155,7 @@ def test_what_does_not_belong_together_is_refused_before_any_work(tmp_path: Path
     refused("eye_in_hand", "robot: !UrRtde {host: 192.168.1.10}", "simulated arms only")
     refused("eye_on_arm", "mounting: {spread_deg: -3.0}", "positive")
     with pytest.raises(InputError, match="runs on the arms of its scenario"):
-        run_mounting_live(short("eye_on_arm"), DemoOptions("eye_on_arm", tmp_path, robot="emulated"), lambda *_: None)
+        run_mounting_live(short("eye_on_arm"), RunOptions("eye_on_arm", tmp_path, robot="emulated"), lambda *_: None)
     assert not any(tmp_path.iterdir())
     assert kind_of(load_scenario("eye_in_hand")) == "mounting"
     assert kind_of(load_scenario("calibrate_only")) == "job"

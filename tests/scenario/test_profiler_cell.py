@@ -21,11 +21,11 @@ from weldcal.systems.jobs.profiler.planning_context import Room
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.systems.scenario.schema import load_scenario
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.demo import DemoOptions
 from weldcal.tools.commands.procedures import runner_of
 from weldcal.tools.commands.profiler.live import ProfilerLive, run_profiler_live
+from weldcal.tools.outcomes.options import RunOptions
 
 # fewer scans and touches than shipped, and the first 60 mm of the seam
 SHORT = """
@@ -40,7 +40,7 @@ profiler_job:
 def live(tmp_path_factory: pytest.TempPathFactory) -> ProfilerLive:
     scenario = load_scenario("profiler_seam", SHORT)
     assert runner_of(scenario) is run_profiler_live
-    options = DemoOptions("profiler_seam", tmp_path_factory.mktemp("live"), seed=2, recording=False)
+    options = RunOptions("profiler_seam", tmp_path_factory.mktemp("live"), seed=2, recording=False)
     return run_profiler_live(scenario, options, lambda *_: None)
 
 

@@ -19,10 +19,11 @@ from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.systems.scenario.schema import load_scenario
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import Station
-from weldcal.tools.commands.demo import DemoOptions, known_camera
+from weldcal.tools.commands.demo import known_camera
 from weldcal.tools.commands.procedures import kind_of, run_procedure
+from weldcal.tools.outcomes.options import RunOptions
 
 # six landmarks and quick descents: half of the shipped scenario's time
 SHORT = "tablet: {rows: 2, across_mm: 60.0, down_mm: 60.0, turn_deg: 36.0, clearance_mm: 12.0, descent_mm_s: 25.0}"
@@ -43,7 +44,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Demo:
     shipped = (repository / "models" / "scenarios" / "tablet.yaml").read_text(encoding="utf-8")
     before, after = shipped[: shipped.index("tablet:\n")], shipped[shipped.index("calibration:") :]
     (folder / "short.yaml").write_text(f"{before}{SHORT}\n{after}")
-    options = DemoOptions(str(folder / "short.yaml"), folder / "out", seed=3, recording=False)
+    options = RunOptions(str(folder / "short.yaml"), folder / "out", seed=3, recording=False)
     result = run_procedure(options, lambda *_: None)
     return Demo(result.summary(), result.folder, result.cell.station)  # type: ignore[attr-defined]
 

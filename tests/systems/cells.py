@@ -13,7 +13,8 @@ from pydrake.systems.framework import Context
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.cell import Cell, make_cell
-from weldcal.systems.scenario.schema import Scenario, load_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 
 KNOWN_CAMERA = "X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"

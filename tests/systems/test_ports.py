@@ -76,7 +76,8 @@ from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
-from weldcal.systems.scenario.schema import VisualizationConfig, load_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.welding.servo.guards import SlewLimits

@@ -12,11 +12,13 @@ import pytest
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.loading import load_scenario, scenario_names
 from weldcal.systems.scenario.numbers import check_numbers
-from weldcal.systems.scenario.schema import PoseConfig, Scenario, check_scenario, load_scenario, scenario_names
+from weldcal.systems.scenario.schema import PoseConfig, Scenario
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.

@@ -13,7 +13,7 @@ from pydrake.systems.primitives import VectorLogSink
 from tests.systems.cells import EXACT_PLATE, Q_HOME, TOOL, Drive, plain_station, scenario, the_arm, weld_only_cell
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated import rendered_finger_camera, rendered_scanner
 from weldcal.systems.drivers.simulated import ur as simulated_ur
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera

@@ -112,10 +112,10 @@ def demo(
             raise typer.BadParameter("give the scenario once, by itself or with --scenario")
         scenario = name
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.commands.demo import DemoOptions
         from weldcal.tools.commands.procedures import run_procedure
+        from weldcal.tools.outcomes.options import RunOptions
 
-        options = DemoOptions(
+        options = RunOptions(
             scenario=scenario,
             out=out or fresh_folder("demo", scenario, seed),
             seed=seed,
@@ -196,12 +196,12 @@ def calibrate(
             if report.algorithm1 is not None:
                 rows["Algorithm 1"] = report.algorithm1.sentence
         else:
-            from weldcal.tools.commands.demo import DemoOptions
             from weldcal.tools.commands.procedures import calibrate_live
+            from weldcal.tools.outcomes.options import RunOptions
 
             assert scenario is not None
             folder = out or fresh_folder("calibrate", scenario, seed)
-            options = DemoOptions(
+            options = RunOptions(
                 scenario=scenario,
                 out=folder,
                 seed=seed,
@@ -254,10 +254,11 @@ def weld(
 ) -> None:
     """Follow a seam in a scenario, with the scanner's pose taken as the scenario's mounting says."""
     with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.commands.demo import DemoOptions, run_weld
+        from weldcal.tools.commands.demo import run_weld
+        from weldcal.tools.outcomes.options import RunOptions
 
         folder = out or fresh_folder("weld", scenario, seed)
-        options = DemoOptions(
+        options = RunOptions(
             scenario=scenario,
             out=folder,
             seed=seed,

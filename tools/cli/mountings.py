@@ -35,14 +35,15 @@ def live(
     folder = out or fresh_folder("hand-eye", Path(scenario).stem, seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("hand-eye live") as progress:
         from weldcal.models.errors import InputError
-        from weldcal.systems.scenario.schema import load_scenario
-        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.systems.jobs.discovery import job_of
+        from weldcal.systems.scenario.loading import load_scenario
         from weldcal.tools.commands.mounting_live import run_mounting_live
+        from weldcal.tools.outcomes.options import RunOptions
 
         loaded = load_scenario(scenario)
-        if loaded.mounting is None:
+        if job_of(loaded).key != "mounting":
             raise InputError(f"Scenario '{scenario}' has no mounting part: run it with weldcal calibrate --scenario.")
-        options = DemoOptions(scenario=scenario, out=folder, seed=seed, browser=record)
+        options = RunOptions(scenario=scenario, out=folder, seed=seed, recording=record)
         report = run_mounting_live(loaded, options, progress)
     if json:
         console.emit_json(report.summary())

@@ -34,11 +34,11 @@ def live(
     scenario = name or scenario
     folder = out or fresh_folder("profiler-live", scenario, seed)
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("profiler live") as progress:
-        from weldcal.systems.scenario.schema import load_scenario
-        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.systems.scenario.loading import load_scenario
         from weldcal.tools.commands.profiler.live import run_profiler_live, run_profiler_seeds
+        from weldcal.tools.outcomes.options import RunOptions
 
-        options = DemoOptions(scenario=scenario, out=folder, seed=seed, recording=record)
+        options = RunOptions(scenario=scenario, out=folder, seed=seed, recording=record)
         loaded = load_scenario(scenario)
         one = runs == 1
         summary = (

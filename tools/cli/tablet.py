@@ -145,11 +145,11 @@ def demo(
     from weldcal.tools.cli.options import finish, fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("tablet demo") as progress:
-        from weldcal.systems.scenario.schema import load_scenario
-        from weldcal.tools.commands.demo import DemoOptions
+        from weldcal.systems.scenario.loading import load_scenario
         from weldcal.tools.commands.tablet.demo import run_tablet_demo
+        from weldcal.tools.outcomes.options import RunOptions
 
-        options = DemoOptions(
+        options = RunOptions(
             scenario=scenario,
             out=out or fresh_folder("tablet", scenario, seed),
             seed=seed,

@@ -1,4 +1,4 @@
-"""Which procedure a scenario is, and who runs it: the job of calibration and weld, or one of the others by its own field."""
+"""Which command runs which job: by the key of the job that a scenario describes."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from weldcal.systems.scenario.schema import Scenario, load_scenario
-from weldcal.tools.commands.demo import DemoOptions, run_calibration_live, run_scenario
+from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.runner import Progress
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.any_job import run_any
+from weldcal.tools.commands.demo import run_calibration_live, run_scenario
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
-from weldcal.tools.console import Progress
+from weldcal.tools.outcomes.options import RunOptions
 
 
 class Outcome(Protocol):
@@ -25,38 +29,32 @@ class Outcome(Protocol):
         """The JSON object."""
 
 
-Runner = Callable[[Scenario, DemoOptions, Progress], Outcome]
-JOB = "job"
-PROCEDURES: dict[str, tuple[Callable[[Scenario], bool], Runner]] = {
-    "tablet": (lambda scenario: scenario.tablet is not None, run_tablet_demo),
-    "mounting": (lambda scenario: scenario.mounting is not None, run_mounting_live),
-    "profiler": (lambda scenario: scenario.profiler_job is not None, run_profiler_live),
+Runner = Callable[[Scenario, RunOptions, Progress], Outcome]
+RUNNERS: dict[str, Runner] = {
+    "": run_scenario,
+    "tablet": run_tablet_demo,
+    "mounting": run_mounting_live,
+    "profiler_job": run_profiler_live,
 }
 
 
 def kind_of(scenario: Scenario) -> str:
-    """Which of PROCEDURES a scenario is; without the field of any of them it is the main job."""
-    return next((kind for kind, (belongs, _) in PROCEDURES.items() if belongs(scenario)), JOB)
+    """The key of the scenario's job; empty for the weld job."""
+    return job_of(scenario).key
 
 
-def runner_of(scenario: Scenario) -> Runner:
-    """Who runs this scenario."""
-    kind = kind_of(scenario)
-    return run_scenario if kind == JOB else PROCEDURES[kind][1]
-
-
-def run_procedure(options: DemoOptions, progress: Progress) -> Outcome:
-    """The whole story of a scenario, whichever procedure it is.
+def run_procedure(options: RunOptions, progress: Progress) -> Outcome:
+    """Run a scenario's job, whichever it is; one that no command knows leaves its state and a recording.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be done; nothing has been written.
     """
     scenario = load_scenario(options.scenario)
-    return runner_of(scenario)(scenario, options, progress)
+    return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)
 
 
-def calibrate_live(options: DemoOptions, progress: Progress) -> dict[str, object]:
-    """The JSON object of `calibrate --scenario`: a mounting by its own procedure, else the calibration of the job alone."""
+def calibrate_live(options: RunOptions, progress: Progress) -> dict[str, object]:
+    """The JSON object of `calibrate --scenario`: a mounting by its own job, else the calibration of the weld job alone."""
     scenario = load_scenario(options.scenario)
     if kind_of(scenario) == "mounting":
         return run_mounting_live(scenario, options, progress).summary()

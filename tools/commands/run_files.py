@@ -10,12 +10,14 @@ from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
-from weldcal.systems.cell import Cell, feature_standard
-from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
+from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
-from weldcal.tools.commands.outcome import WeldOutcome, columns
+from weldcal.tools.outcomes.demo import error_summary
+from weldcal.tools.outcomes.weld import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
@@ -24,20 +26,12 @@ from weldcal.welding.servo.state import Phase
 PHASE_NAMES = [str(phase) for phase in Phase]
 
 
-def error_summary(values: np.ndarray) -> dict[str, float]:
-    """Median, mean and 95th percentile of the finite values, in their own unit."""
-    finite = values[np.isfinite(values)]
-    if finite.size == 0:
-        return {}
-    return {"median": float(np.median(finite)), "mean": float(finite.mean()), "p95": float(np.percentile(finite, 95))}
-
-
-def live_result(cell: Cell, status: CalibrationStatus, seed: int) -> CalibrationResult | None:
+def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> CalibrationResult | None:
     """The live calibration in the form that `weldcal calibrate` writes; None before there is an estimate."""
     estimate = status.estimate
     if estimate is None:
         return None
-    scanner = cell.scenario.scanner
+    scanner = cell.scenario.scanner_config()
     records = [_record(observation.id, estimate, k) for k, observation in enumerate(status.observations)]
     records += [PoseRecord(id=label, used=False, reason=reason) for label, reason in status.refused]
     return CalibrationResult(
@@ -50,7 +44,7 @@ def live_result(cell: Cell, status: CalibrationStatus, seed: int) -> Calibration
         warnings=estimate.warnings,
         robot=cell.scenario.arm,
         flange=cell.scenario.calibration.feature,
-        scanner=scanner.preset if isinstance(scanner, RenderedScanner) else "",
+        scanner="" if scanner is None else scanner.scanner().name,
         sigma_position_mm=1e3 * estimate.sigma_position_m,
         sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
@@ -70,7 +64,7 @@ def _record(id: str, estimate: CalibrationEstimate, k: int) -> PoseRecord:
     )
 
 
-def write_calibration(cell: Cell, status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
+def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
     """Write calibration.yaml and the forms that other tools read, where there is a calibration."""
     result = live_result(cell, status, seed)
     if result is None:
@@ -79,26 +73,26 @@ def write_calibration(cell: Cell, status: CalibrationStatus, seed: int, folder: 
     return save_result(result, folder)
 
 
-def write_scans(run: Run, status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:
+def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:
     """Write the calibration scans as a dataset folder that `weldcal calibrate` reads again; None where there are none.
 
     `robot` is what moved the feature, for the dataset's note.
     """
-    cell, scanner = run.cell, run.cell.scenario.scanner
+    cell, scanner = run.cell, run.cell.scenario.scanner_config()
     observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
-    if not observed or not isinstance(scanner, RenderedScanner):
+    if not observed or scanner is None:
         return None
     preset = scanner.scanner()
-    c, X_RF = cell.scenario.calibration, cell.X_FR.inverse()
+    c, X_RF = cell.scenario.calibration, cell.job.X_FR.inverse()
     guess = c.mounting_guess.pose()
     header = DatasetHeader(
         robot=cell.scenario.arm,
         flange=feature_standard(cell.scenario).designation,
-        scanner=scanner.preset,
+        scanner=preset.name,
         configuration="eye_on_base",
         note=f"rendered scans of a run; robot: {robot}",
         feature_in_flange=Feature(
-            _numbers(cell.X_FR.translation()), _numbers(cell.X_FR.rotation().ToQuaternion().wxyz())
+            _numbers(cell.job.X_FR.translation()), _numbers(cell.job.X_FR.rotation().ToQuaternion().wxyz())
         ),
         scanner_guess=ScannerGuess(
             _numbers(guess.translation()), _numbers(guess.rotation().ToQuaternion().wxyz()), 1e-3 * c.guess_radius_mm
@@ -119,9 +113,9 @@ def _numbers(values: np.ndarray) -> list[float]:
     return [float(v) for v in values]
 
 
-def weld_record(run: Run, weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
+def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
     """The weld as its log tells it: nothing in it is known from the simulation alone."""
-    log, cell, config = weld.log, run.cell, run.cell.servo_config
+    log, cell, config = weld.log, run.cell, run.cell.job.servo_config
     process = cell.scenario.welding.process.process()
     p_BW = log.p_BRobot + log.R_BT @ config.p_TW
     speed = speed_along(log.time, p_BW)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
-from weldcal.tools.commands.outcome import heat_input_kJ_mm, planned_seam
+from weldcal.tools.outcomes.demo import DemoResult
+from weldcal.tools.outcomes.weld import heat_input_kJ_mm
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
-
-if TYPE_CHECKING:
-    from weldcal.tools.commands.demo import DemoResult
 
 STORY = {
     "start": "get ready",
@@ -41,7 +38,7 @@ def demo_pictures(result: DemoResult) -> dict[str, bytes]:
         required = cell.scenario.calibration.required_error_mm * 1e-3
         pictures["convergence"] = plots_demo.convergence(status, required)
     if weld is not None:
-        trace = plots_demo.weld_trace(weld, cell.servo_config)
+        trace = plots_demo.weld_trace(weld, cell.job.servo_config)
         if len(trace.s) > 1:
             pictures["seam"] = plots_weld.paths(trace)
             pictures["along"] = plots_weld.along_the_weld(trace)
@@ -104,7 +101,7 @@ def _observations(result: DemoResult) -> list[tuple[str, ...]]:
 
 def _planned(result: DemoResult) -> list[tuple[str, str]]:
     """What the planner found in the scan, and how well it says that it knows the root."""
-    plan = planned_seam(result.run.cell, result.run.root)
+    plan = result.run.cell.job.planned_seam(result.run.root)
     if plan.seam is None:
         return []
     rows = [("planned", plan.words[:1].upper() + plan.words[1:])] if plan.words else []

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from weldcal.calibration.data.results import software_version
+from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, render
 
-if TYPE_CHECKING:
-    from weldcal.tools.commands.mounting_live import MountingReport
 
-
-def mounting_report(report: MountingReport, picture: bytes) -> str:
+def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     """The whole report as one self-contained HTML text."""
-    status, mounting, result = report.run.status, report.mounting, report.result
+    status, mounting, result = report.status, report.mounting, report.result
     aside = np.array([1e3 * k.error_m for k in status.kept_aside])
     unknowns, errors = [], report.truth_errors()
     for k, X in {} if result is None else result.poses.items():
@@ -58,7 +54,7 @@ def mounting_report(report: MountingReport, picture: bytes) -> str:
         n_aside=len(aside),
         expected_mm=1e3 * status.sigma_work_m,
         work_mm=report.work_error_mm(),
-        distance_mm=1e3 * report.run.cell.scene.scanner.optimum_m,
+        distance_mm=1e3 * report.job.scene.scanner.optimum_m,
         n_used=len(status.seen),
         n_scans=status.sequence,
         unobservable=() if result is None else result.unobservable,
@@ -81,7 +77,7 @@ def _spread(sigma: float, digits: int, certain: float) -> str:
 
 def _growth(report: MountingReport) -> bytes:
     """Expected error of a point at the work distance after every scan."""
-    n, sigma = np.array(report.run.status.history).T
+    n, sigma = np.array(report.status.history).T
     required = report.run.cell.scenario.calibration.required_error_mm
     figure = Figure(figsize=(8.2, 2.8), layout="constrained")
     axes = figure.subplots()

@@ -20,7 +20,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
-from weldcal.systems.jobs.mounting.cell import MountingRun
+from weldcal.tools.outcomes.mounting import MountingReport
 
 Array = NDArray[np.float64]
 
@@ -30,16 +30,18 @@ COLOURS = ("#d33d2f", "#2c9a45", "#2b5fc4")
 _PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.5}
 
 
-def station_picture(run: MountingRun) -> bytes:
+def station_picture(report: MountingReport) -> bytes | None:
     """PNG of the station at the last calibration pose: arms, scanner, circle, and the frames by their letters.
 
-    Seen from the side on which the frames lie farthest apart. Simulation only: it shows what truly is.
+    Seen from the side on which the frames lie farthest apart. It shows what truly is: None where nothing is simulated.
     """
-    cell = run.cell
-    pose = run.status.seen[-1].pose if run.status.seen else cell.plan[0]
-    frames = true_frames(run, pose.q, pose.q_2)
-    root = run.root.Clone()
+    run, cell = report.run, report.run.cell
     world = cell.station.world
+    if world is None:
+        return None
+    pose = report.status.seen[-1].pose if report.status.seen else report.job.plan[0]
+    frames = true_frames(report, pose.q, pose.q_2)
+    root = run.root.Clone()
     plant_context = world.plant.GetMyMutableContextFromRoot(root)
     world.plant.SetPositions(plant_context, world.arm, pose.q)
     if world.second is not None and pose.q_2 is not None:
@@ -60,9 +62,9 @@ def station_picture(run: MountingRun) -> bytes:
     return _annotated(np.array(image.data[:, :, :3]), frames, X_WV)
 
 
-def true_frames(run: MountingRun, q: Array, q_2: Array | None) -> dict[str, RigidTransform]:
+def true_frames(report: MountingReport, q: Array, q_2: Array | None) -> dict[str, RigidTransform]:
     """Letter -> pose in the base B of every frame in the mounting's sketch, as it truly is."""
-    scene = run.cell.scene.believing(run.cell.truth)
+    scene = report.job.scene.believing(report.job.truth)
     links = scene.frames(q)
     found = {"B": RigidTransform(), "F": links[FLANGE], "C": links[scene.link] @ scene.X_LC}
     if scene.link not in (BASE, FLANGE):

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.tools.commands.outcome import WeldOutcome
+from weldcal.tools.outcomes.weld import WeldOutcome
 from weldcal.tools.report.plots_weld import OURS, ROBOT, THEIRS, TRUTH, Array, WeldTrace, plain, svg
 from weldcal.welding.record.process import path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from weldcal.tools.commands.profiler.outcome import PathOutcome, PoseOutcome
+from weldcal.tools.outcomes.profiler import PathOutcome, PoseOutcome
 from weldcal.tools.report.pictures import OURS, svg
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import software_version
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
-from weldcal.tools.commands.profiler.outcome import LiveOutcome, PoseOutcome
+from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
 from weldcal.calibration.tablet.result import TabletResult
-from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit
+from weldcal.systems.jobs.tablet.job import AddedVisit
+from weldcal.systems.runner import Run
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, render
 
@@ -145,11 +146,11 @@ def calibration_report(
 
 
 def visit_report(
-    cell: TabletCell, visit: TabletVisit, found: Mapping[str, Any], result: TabletResult | None, shown: Shown | None,
+    run: Run[AddedVisit], found: Mapping[str, Any], result: TabletResult | None, shown: Shown | None,
     *, recording: bool,
 ) -> str:  # fmt: skip
     """The page of a visit in a scenario; `result` and `shown` None where it was held before its end."""
-    scenario, name = cell.scenario, str(found["scenario"])
+    scenario, job, name = run.cell.scenario, run.cell.job, str(found["scenario"])
     subtitle = f"{scenario.description.rstrip('.')}. " if scenario.description else ""
     robot = "Simulation" if found["robot"] == "simulated" else f"Rendered sensors; robot: {found['robot']}"
     provenance = [
@@ -159,10 +160,10 @@ def visit_report(
     common: dict[str, Any] = {
         "title": "A visit to the tablet",
         "subtitle": f"{subtitle}{robot}, seed {found['seed']}.",
-        "timing": _timing(visit),
+        "timing": _timing(run),
         "recording": recording,
     }
-    touched = ("Landmarks touched", str(found["n_touches"]), f"of {len(cell.plan.q_above)}", "plain", "by contact")
+    touched = ("Landmarks touched", str(found["n_touches"]), f"of {len(job.plan.q_above)}", "plain", "by contact")
     if result is None or shown is None:
         verdict = ("bad", "The visit was held", str(found.get("reason", "")))
         return render("tablet.html.j2", page=Page(verdict=verdict, cards=[touched], provenance=provenance, **common))
@@ -181,7 +182,7 @@ def visit_report(
             verdict=_verdict(result, f"Points nobody touched are met within {fixed(unseen['max'], 2)} mm."),
             cards=cards,
             notes=(*result.warnings, *result.unobservable),
-            truth=_truth(cell, found),
+            truth=_truth(job, found),
             arrows=miss_arrows(shown),
             header=header,
             rows=rows,
@@ -201,11 +202,11 @@ def _verdict(result: TabletResult, sentence: str) -> tuple[str, str, str]:
     return ("good", "Camera and pen are found", sentence)
 
 
-def _truth(cell: TabletCell, found: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    truth, drawn = cell.truth, cell.camera.nominal()
+def _truth(job: AddedVisit, found: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    truth, drawn = job.truth, job.camera.nominal()
     turn = np.degrees(abs((drawn.rotation().inverse() @ truth.X_FC.rotation()).ToAngleAxis().angle()))
     off = 1e3 * float(np.linalg.norm(drawn.translation() - truth.X_FC.translation()))
-    pen = 1e3 * float(np.linalg.norm(np.array(cell.tablet.pen.tip_m) - truth.p_FP))
+    pen = 1e3 * float(np.linalg.norm(np.array(job.tablet.pen.tip_m) - truth.p_FP))
     return [
         ("camera, place, mm off", fixed(off, 2), fixed(found["X_FC_error_mm"], 2)),
         ("camera, turn, deg off", fixed(float(turn), 3), fixed(found["X_FC_error_deg"], 3)),
@@ -240,14 +241,14 @@ def _files(result: TabletResult) -> list[tuple[str, str]]:
     return [("software", software_version()), *((f"SHA-256 of {n}", h) for n, h in result.data_sha256.items())]
 
 
-def _timing(visit: TabletVisit) -> list[tuple[str, str]]:
+def _timing(run: Run[AddedVisit]) -> list[tuple[str, str]]:
     """Simulated seconds per kind of phase."""
     says = {"to_start": "moves", "to_look": "moves", "to_above": "moves", "lift": "moves", "to_home": "moves"}
     says |= {"look": "look", "descend": "come down and touch"}
-    ends = [*(t for _, t in visit.phases[1:]), visit.seconds]
+    ends = [*(t for _, t, _ in run.phases[1:]), run.seconds]
     spent: dict[str, float] = {}
-    for (name, since), until in zip(visit.phases, ends, strict=True):
+    for (name, since, _), until in zip(run.phases, ends, strict=True):
         kind = says.get(name)
         if kind is not None:
             spent[kind] = spent.get(kind, 0.0) + until - since
-    return [*((kind, fixed(s, 1)) for kind, s in spent.items()), ("all", fixed(visit.seconds, 1))]
+    return [*((kind, fixed(s, 1)) for kind, s in spent.items()), ("all", fixed(run.seconds, 1))]

@@ -3,7 +3,7 @@
 import dataclasses as dc
 from concurrent.futures import Future
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -22,15 +22,19 @@ from pydrake.systems.sensors import CameraInfo, RgbdSensor
 from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
+from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.simulated.picture_worker import Draw, PictureWorker, Pixels
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Image, Message
 
 
 @dc.dataclass
-class RenderedFingerCamera:
+class RenderedFingerCamera(FingerCameraConfig):
     """`!RenderedFingerCamera`: the camera in the tool, looking at the tag."""
 
+    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("finger_camera",)
+    SIMULATED: ClassVar[bool] = True
     width: int = 400  # the window that is read out of a 640 x 480 sensor: the tag and as far as it can move
     height: int = 300
     focal_px: float = 450.0
@@ -148,7 +152,7 @@ class StreamingColourCamera(LeafSystem):
 
 def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None:
     """Mount a colour camera in the tool and stream it."""
-    world, tool = build.simulated_world(), build.tool
+    world, tool = build.require(SimulatedWorld), build.tool
     view = world.finger_view
     if tool is None or view is None or view.apart is None:
         return

@@ -1,7 +1,7 @@
 """A laser profiler in simulation: a fan of rays from the wrist, cast at the real geometry, then noise, rounding and lost returns."""
 
 import dataclasses as dc
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import open3d as o3d
@@ -14,23 +14,27 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
+from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.profiler.config import pose_of
-from weldcal.systems.messages import Message
+from weldcal.systems.messages import ProfileScan, TorchTouch
 
 Array = NDArray[np.float64]
 FORCE_N = 0.02  # from here on a touch is felt
 
 
 @dc.dataclass
-class RenderedProfiler:
+class RenderedProfiler(DriverConfig):
     """`!RenderedProfiler`: where the profiler sits on the flange as drawn, how far it is off, and how it measures.
 
     The numbers are of the straight-edge paper's profiler: 40 mm wide at 60 mm to 160 mm at 350 mm, rounded to 0.1 mm, and
     0.16 mm of noise, here shared between each sample and the whole profile.
     """
 
+    FOR: ClassVar[tuple[str, ...]] = ("profiler",)
+    SIMULATED: ClassVar[bool] = True
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.070, 0.0, 0.045])  # X_FS as drawn
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 90.0])
     mounting_translation_mm: float = 4.0  # the true pose differs by this much, drawn from the seed
@@ -84,24 +88,6 @@ class RenderedProfiler:
             share_missing=self.share_missing,
             share_spikes=self.share_spikes,
         )
-
-
-@dc.dataclass(frozen=True, eq=False)
-class ProfileScan(Message):
-    """One profile: points (n, 2) [x, z] m in S, NaN where nothing returned; the time it was taken; 0 before the first."""
-
-    sequence: int = 0
-    capture_time: float = -np.inf
-    points: Array = dc.field(default_factory=lambda: np.empty((0, 2)))
-
-
-@dc.dataclass(frozen=True, eq=False)
-class TorchTouch(Message):
-    """The newest touch: its number, when it began, and whether it lasts."""
-
-    sequence: int = 0
-    time: float = -np.inf
-    down: bool = False
 
 
 def last_step(now: float, step: float) -> float:
@@ -304,9 +290,9 @@ def drawn_pose(config: RenderedProfiler) -> RigidTransform:
 
 def ApplyDriverConfig(config: RenderedProfiler, build: StationBuild) -> None:
     """Put the profiler on the flange at its true pose, and feel the torch's touches."""
-    world = build.simulated_world()
-    fixture, pair = build.profiler, world.touch_pair
-    if fixture is None or pair is None:
+    world = build.require(SimulatedWorld)
+    fixture, pair = build.require(ProfilerFixture), world.touch_pair
+    if pair is None:
         raise RuntimeError("the profiler's fixture is not in the simulated world")
     plant, builder = world.plant, build.builder
     flange = plant.GetBodyByName("flange", world.arm).index()

@@ -1,7 +1,7 @@
 """A structured-light scanner in simulation: depth rendering at the real geometry, then the scanner's own noise."""
 
 import dataclasses as dc
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,18 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
+from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 
 
 @dc.dataclass
-class RenderedScanner:
+class RenderedScanner(ScannerConfig):
     """`!RenderedScanner`: where the simulated scanner truly stands, and what it is."""
 
+    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("scanner",)
+    SIMULATED: ClassVar[bool] = True
     preset: str = "phoxi_m"
     width: int | None = 824  # 0.5 Mpx; null: the scanner's full resolution
     height: int | None = 616
@@ -171,7 +174,7 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
 
     Returns the true pose of the scanner in the frame of what carries it: X_BC, X_FC or X_LC.
     """
-    world = build.simulated_world()
+    world = build.require(SimulatedWorld)
     preset = config.scanner()
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
     error = random_pose_error(

@@ -1,7 +1,7 @@
 """A depth camera on the wrist in simulation: takes one picture of the world as it really stands when it is asked."""
 
 import dataclasses as dc
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +11,22 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
+from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.picture_scene import add_picture_scene
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.jobs.tablet.messages import WristPicture
+from weldcal.systems.jobs.tablet.messages import TabletTruth, WristPicture
 
 RENDERER = "wrist"
 _NEAR_M, _FAR_M = 0.05, 2.0
 
 
 @dc.dataclass
-class RenderedWristCamera:
+class RenderedWristCamera(DriverConfig):
     """`!RenderedWristCamera`: a camera on the flange as drawn, by how much the real one differs, and its noise."""
 
+    FOR: ClassVar[tuple[str, ...]] = ("wrist_camera",)
+    SIMULATED: ClassVar[bool] = True
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.075, 0.0, 0.030])  # nominal X_FC
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 90.0])
     mounting_translation_mm: float = 4.0  # the true pose differs from the nominal one by this much, drawn from the seed
@@ -93,9 +97,7 @@ class WristCamera(LeafSystem):
 
 def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:
     """Hang the camera on the flange of the simulated arm where it truly is (known to `cheat.truth` alone)."""
-    world, builder = build.simulated_world(), build.builder
-    if build.visit is None:
-        raise RuntimeError("the wrist camera hangs where the fittings of a visit to the tablet say")
+    world, builder = build.require(SimulatedWorld), build.builder
     view = add_picture_scene(builder, world.plant, world.scene_graph, RENDERER, mount="flange")
     K = config.camera_matrix()
     core = RenderCameraCore(
@@ -107,7 +109,9 @@ def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:
     )
     flange = view.frames[world.plant.GetBodyByName("flange", world.arm).index()]
     depth = DepthRenderCamera(core, DepthRange(_NEAR_M, _FAR_M))
-    sensor = builder.AddSystem(RgbdSensor(flange, build.visit.truth.X_FC, ColorRenderCamera(core, False), depth))
+    sensor = builder.AddSystem(
+        RgbdSensor(flange, build.require(TabletTruth).X_FC, ColorRenderCamera(core, False), depth)
+    )
     sensor.set_name("wrist_rgbd")
     camera = builder.AddSystem(WristCamera(config, int(build.rng.integers(2**31))))
     camera.set_name("wrist_camera")

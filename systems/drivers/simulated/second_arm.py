@@ -1,9 +1,8 @@
-"""A second arm in the simulated world: another model in the one plant, where its base truly stands, with a driver of its own."""
+"""A second arm in the simulated world: another model in the one plant, where its base truly stands"""
 
 from __future__ import annotations
 
 import dataclasses as dc
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ from pydrake.multibody.tree import ModelInstanceIndex, PdControllerGains
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.arms.urdf import arm_urdf
-from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.mounting.config import SecondArm
 
 SECOND = "ur10e_2"
@@ -49,25 +47,3 @@ def add_second_arm(
     top, grey = RigidTransform([0.0, 0.0, -0.02]), np.array([0.36, 0.38, 0.40, 1.0])
     plant.RegisterVisualGeometry(plant.world_body(), placed.X_BD @ top, Box(0.5, 0.5, 0.04), "second_table", grey)
     return instance
-
-
-def apply_second_robot(config: Any, placed: PlacedArm, build: StationBuild, apply: Any) -> None:
-    """Let the driver that knows one arm drive the second: it is handed a world whose arm this is, and its ports are renamed."""
-    world = build.simulated_world()
-    assert world.second is not None
-    own = dc.replace(
-        build,
-        arm=placed.arm,
-        tool=None,
-        q_start=placed.q_start,
-        world=dc.replace(world, arm=world.second),
-        inputs={},
-        outputs={},
-    )
-    before = {id(s) for s in build.builder.GetSystems()}
-    apply(config, own)
-    for system in build.builder.GetSystems():
-        if id(system) not in before:
-            system.set_name(system.get_name().replace("ur10e", SECOND))
-    build.inputs |= {name.replace("ur10e", SECOND): port for name, port in own.inputs.items()}
-    build.outputs |= {name.replace("ur10e", SECOND): port for name, port in own.outputs.items()}

@@ -1,7 +1,7 @@
 """A tablet in simulation: its glass feels the pen by the contact force, and says where to a tenth of a pixel."""
 
 import dataclasses as dc
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -10,16 +10,21 @@ from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.systems.framework import Context, LeafSystem, State
 
+from weldcal.systems.drivers.config import DriverConfig
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.jobs.tablet.messages import TabletTouch
+from weldcal.systems.jobs.tablet.config import TabletConfig
+from weldcal.systems.jobs.tablet.messages import TabletTouch, TabletTruth
 
 GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two geometries that touch
 
 
 @dc.dataclass
-class SimulatedTablet:
+class SimulatedTablet(DriverConfig):
     """`!SimulatedTablet`: how far it lies from where it is thought to lie, and how it feels."""
 
+    FOR: ClassVar[tuple[str, ...]] = ("digitizer",)
+    SIMULATED: ClassVar[bool] = True
     placement_translation_mm: float = 4.0  # drawn from the seed
     placement_rotation_deg: float = 1.5
     touch_noise_px: float = 0.3
@@ -86,7 +91,7 @@ class TabletDigitizer(LeafSystem):
 
 def _geometry(plant: MultibodyPlant, body: str, build: StationBuild, name: str) -> GeometryId:
     """The collision geometry of that name on a body."""
-    inspector = build.simulated_world().scene_graph.model_inspector()
+    inspector = build.require(SimulatedWorld).scene_graph.model_inspector()
     found = plant.GetCollisionGeometriesForBody(plant.world_body() if not body else plant.GetBodyByName(body))
     (geometry,) = (g for g in found if inspector.GetName(g).endswith(name))
     return geometry
@@ -94,11 +99,9 @@ def _geometry(plant: MultibodyPlant, body: str, build: StationBuild, name: str) 
 
 def ApplyDriverConfig(config: SimulatedTablet, build: StationBuild) -> None:
     """Let the glass of the simulated world feel the pen."""
-    plant = build.simulated_world().plant
-    if build.visit is None:
-        raise RuntimeError("the tablet lies where the fittings of a visit to it say")
+    plant = build.require(SimulatedWorld).plant
     pair = {_geometry(plant, "", build, GLASS), _geometry(plant, "pen", build, NIB)}
-    px_per_m, X_BT = 1e3 * build.visit.tablet.px_per_mm, build.visit.truth.X_BT
+    px_per_m, X_BT = 1e3 * build.require(TabletConfig).px_per_mm, build.require(TabletTruth).X_BT
     tablet = build.builder.AddSystem(TabletDigitizer(config, px_per_m, pair, X_BT, int(build.rng.integers(2**31))))
     tablet.set_name("tablet")
     build.builder.Connect(plant.get_contact_results_output_port(), tablet.GetInputPort("contact_results"))

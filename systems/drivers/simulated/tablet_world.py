@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -33,16 +32,14 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
+from weldcal.systems.bodies.textured_board import textured_board
+from weldcal.systems.bodies.tool import DARK, STEEL
+from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet import GLASS, NIB, SimulatedTablet
-from weldcal.systems.drivers.simulated.world import DARK, STEEL
 from weldcal.systems.jobs.tablet.config import TabletConfig
 from weldcal.systems.jobs.tablet.messages import TabletTruth
-from weldcal.systems.textured_board import textured_board
-
-if TYPE_CHECKING:
-    from weldcal.systems.scenario.schema import Scenario
 
 _TEXELS_PER_MM = 8
 _PEN_MASS_KG = 0.02
@@ -68,15 +65,13 @@ class TabletFittings:
         return _add_rig(plant, arm, self.tablet, self.truth)
 
 
-def tablet_fittings(scenario: Scenario, rng: np.random.Generator) -> TabletFittings | None:
-    """How camera, pen and tablet really are, from the seed; None where the scenario has no tablet.
+def tablet_fittings(
+    tablet: TabletConfig, camera: DriverConfig, page: DriverConfig, rng: np.random.Generator
+) -> TabletFittings:
+    """How camera, pen and tablet really are, from the seed.
 
     What a device's driver does not simulate stands as drawn. The tablet lies flat but for its error in place and turn.
     """
-    tablet = scenario.tablet
-    if tablet is None:
-        return None
-    camera, page = scenario.wrist_camera, scenario.digitizer
     X_FC, X_BT = RigidTransform(), tablet.pose()
     if isinstance(camera, RenderedWristCamera):
         off = random_pose_error(rng, 1e-3 * camera.mounting_translation_mm, np.deg2rad(camera.mounting_rotation_deg))

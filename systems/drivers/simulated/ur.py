@@ -1,7 +1,7 @@
 """A UR10e in simulation: what a controller's speedj does, over the MultibodyPlant's implicit joint servos."""
 
 import dataclasses as dc
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -10,6 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import DriverConfig
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
 from weldcal.welding.vectors import within
@@ -21,8 +23,12 @@ READY = UrStatus()
 
 
 @dc.dataclass
-class SimulatedUr:
+class SimulatedUr(DriverConfig):
     """`!SimulatedUr`: the controller's speedj over the arm of the simulated world."""
+
+    FOR: ClassVar[tuple[str, ...]] = ("robot", "robot_2")
+    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("robot",)
+    SIMULATED: ClassVar[bool] = True
 
     control_period_s: float = 0.002  # 500 Hz, as the real controller
     following_error_rad: float = 0.05  # beyond this the controller stops the arm
@@ -135,7 +141,7 @@ def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
         raise InputError(
             f"robot.repeatability_mm must be from 0 to {_LARGEST_MM:g}, and it is {config.repeatability_mm:g}."
         )
-    world = build.simulated_world()
+    world = build.require(SimulatedWorld)
     # the others' random numbers stay what they are where the arm needs none
     seed = int(build.rng.integers(2**32)) if config.repeatability_mm else 0
     servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed))

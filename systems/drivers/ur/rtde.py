@@ -1,7 +1,7 @@
 """A real UR behind the station's ports: reads the link in an update event, sends in a publish event, computes nothing else."""
 
 import dataclasses as dc
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -10,6 +10,8 @@ from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSys
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import DriverConfig
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
@@ -22,8 +24,10 @@ N_OUTPUTS = 8
 
 
 @dc.dataclass
-class UrRtde:
+class UrRtde(DriverConfig):
     """`!UrRtde`: a Universal Robots e-Series arm, or its emulator, at an address."""
+
+    FOR: ClassVar[tuple[str, ...]] = ("robot",)
 
     host: str = ""
     rate_hz: float = 250.0  # of the worker's loop
@@ -174,8 +178,7 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
         raise RuntimeError("the robot was not prepared")
     arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, config.pace))
     arm.set_name("ur10e_link")
-    if build.world is not None:
-        world = build.world
+    if (world := build.find(SimulatedWorld)) is not None:
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
     build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
     if config.process_output is not None:

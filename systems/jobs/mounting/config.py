@@ -47,7 +47,7 @@ class MountingJob:
 
 
 def check_mounting(
-    configuration: str, job: MountingJob | None, mounted_on: str, *, simulated: bool, second_robot: bool, weld: bool
+    configuration: str, job: MountingJob | None, mounted_on: str, *, second_robot: bool, weld: bool
 ) -> None:
     """Refuse what does not belong together.
 
@@ -70,8 +70,6 @@ def check_mounting(
         return
     if weld:
         raise InputError("A mounting job calibrates only: write job: {weld: false}.")
-    if not simulated:
-        raise InputError("A mounting job moves simulated arms only, so far: write robot: !SimulatedUr {}.")
     two = configuration == "co_manipulation"
     if second_robot != two or (job.second_arm is not None) != two:
         raise InputError("co_manipulation, and it alone, has robot_2: !SimulatedUr {} and mounting.second_arm.")

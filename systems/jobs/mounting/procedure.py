@@ -14,8 +14,10 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.messages import JobCommand, UrStatus
+from weldcal.systems.motion.goals import stands_at
 
 Array = NDArray[np.float64]
+ENDS = ("done", "held")
 
 
 class MountingProcedure(LeafSystem):
@@ -30,6 +32,8 @@ class MountingProcedure(LeafSystem):
         - robot_status
         - robot_status_2
         - status
+        - hold
+        - position_measured
         output_ports:
         - job
         - job_2
@@ -37,8 +41,8 @@ class MountingProcedure(LeafSystem):
         - state
 
     One arm moves at a time: towards a pose the second one first, homewards the first one first; the way home is thus the way
-    from home backwards. The first `scans` poses of the plan are for the calibration (fewer where it is sure enough before),
-    `kept_aside` more for its verification.
+    from home backwards. An arm that stands elsewhere goes home first. `hold` (1) is a person's wish to stop. The first `scans`
+    poses of the plan are for the calibration (fewer where it is sure enough before), `kept_aside` more for its verification.
     """
 
     def __init__(
@@ -48,16 +52,19 @@ class MountingProcedure(LeafSystem):
         kept_aside: int,
         home: tuple[Array, Array | None],
         timeout_s: float = 60.0,
+        maximum_time_s: float = np.inf,
         period_s: float = 0.008,
     ) -> None:
         super().__init__()
         self._plan, self._scans, self._kept_aside = tuple(plan), scans, kept_aside
-        self._home, self._timeout_s = home, timeout_s
+        self._home, self._timeout_s, self._maximum_time_s = home, timeout_s, maximum_time_s
         self._settled = [self.DeclareVectorInputPort(n, 1) for n in ("settled_goal", "settled_goal_2")]
         self._robots = [
             self.DeclareAbstractInputPort(n, AbstractValue.Make(UrStatus())) for n in ("robot_status", "robot_status_2")
         ]
         self._status = self.DeclareAbstractInputPort("status", AbstractValue.Make(MountingStatus()))
+        self._hold = self.DeclareVectorInputPort("hold", 1)
+        self._position = self.DeclareVectorInputPort("position_measured", 6)
         self._state = self.DeclareAbstractState(AbstractValue.Make(MountingState()))
         ticket = {self.abstract_state_ticket(self._state)}
         for arm, name in enumerate(("job", "job_2")):
@@ -76,14 +83,23 @@ class MountingProcedure(LeafSystem):
 
     def _next(self, s: MountingState, context: Context) -> MountingState:
         now = context.get_time()
-        if s.phase in ("done", "held"):
+        if s.phase in ENDS:
             return s
         for port in self._robots[: 1 if self._home[1] is None else 2]:
             robot: UrStatus = port.Eval(context)
             if not robot.ready:
                 reason = robot.fault or "The robot does not obey velocity commands."
                 return replace(s, phase="held", since=now, reason=reason)
+        if self._hold.Eval(context)[0] > 0.5:
+            return replace(
+                s, phase="held", since=now, reason=f"A person held the job, on the way to {s.label or 'home'}."
+            )
+        if now > self._maximum_time_s:
+            reason = f"The job took longer than its {self._maximum_time_s:.0f} s; allow more with job.maximum_time_s."
+            return replace(s, phase="held", since=now, reason=reason)
         if s.phase == "start":
+            if not stands_at(self._position.Eval(context), self._home[0]):
+                return _go(s, self._homeward(), "", now)
             return self._visit(s, 0, now)
         if s.phase == "move":
             if int(self._settled[s.moving].Eval(context)[0]) == s.goal_id:
@@ -127,7 +143,17 @@ class MountingProcedure(LeafSystem):
     def _job(self, context: Context, output: Any, arm: int) -> None:
         s: MountingState = context.get_abstract_state(self._state).get_value()
         moving = s.phase == "move" and s.moving == arm
-        output.set_value(JobCommand(s.phase, "move" if moving else "hold", s.goal_id, s.q_goal if moving else None))
+        output.set_value(
+            JobCommand(
+                s.phase,
+                "move" if moving else "hold",
+                s.goal_id,
+                s.q_goal if moving else None,
+                finished=s.phase in ENDS,
+                held=s.phase == "held",
+                reason=s.reason or None,
+            )
+        )
 
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().trigger))

@@ -22,7 +22,7 @@ from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.profiler.config import edge_as_thought
-from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.messages import Message
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -83,16 +83,18 @@ class Goal(Message):
     path: JointPath | None = None
 
 
-def plan_edge(room: Room, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
+def plan_edge(planning: PlanningContext, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
     """Scans of the straightedge: those that make the profiler surest, and the held-out ones among the rest.
 
     Raises:
         InputError: too few poses can be taken.
     """
-    stage, job = room.job.edge, room.job
+    stage, job = planning.job.edge, planning.job
     point, direction = edge_as_thought(job)
-    state = EdgeState(room.X_FS.rotation().matrix(), np.array(room.X_FS.translation()), point, direction)
-    q, poses = _standing(room, sample_edge_poses(state, CANDIDATES, seed, room.field, stage.tilt_deg), "straightedge")
+    state = EdgeState(planning.X_FS.rotation().matrix(), np.array(planning.X_FS.translation()), point, direction)
+    q, poses = _standing(
+        planning, sample_edge_poses(state, CANDIDATES, seed, planning.field, stage.tilt_deg), "straightedge"
+    )
     first, rest = _split(poses, stage.scans + stage.held_out)
     plan = plan_edge_poses(
         state,
@@ -101,32 +103,34 @@ def plan_edge(room: Room, q_from: Array, seed: int, sigma_xz_m: Array) -> list[G
         stage.scans - FIRST,
         sigma_robot_m=1e-3 * job.robot_sigma_mm,
         sigma_xz_m=sigma_xz_m,
-        field=room.field,
+        field=planning.field,
     )
-    return _scans(room, q_from, q, first, rest, plan.chosen, stage.held_out)
+    return _scans(planning, q_from, q, first, rest, plan.chosen, stage.held_out)
 
 
-def plan_sphere(room: Room, q_from: Array, seed: int, sigmas: SphereSigmas) -> list[Goal]:
+def plan_sphere(planning: PlanningContext, q_from: Array, seed: int, sigmas: SphereSigmas) -> list[Goal]:
     """The same of the sphere; see plan_edge."""
-    stage = room.job.sphere
-    R, t = room.X_FS.rotation().matrix(), np.array(room.X_FS.translation())
-    candidates = sample_sphere_poses(R, t, room.center, room.radius_m, CANDIDATES, seed, room.field, stage.tilt_deg)
-    q, poses = _standing(room, candidates, "sphere")
+    stage = planning.job.sphere
+    R, t = planning.X_FS.rotation().matrix(), np.array(planning.X_FS.translation())
+    candidates = sample_sphere_poses(
+        R, t, planning.center, planning.radius_m, CANDIDATES, seed, planning.field, stage.tilt_deg
+    )
+    q, poses = _standing(planning, candidates, "sphere")
     first, rest = _split(poses, stage.scans + stage.held_out)
     plan = plan_sphere_poses(
-        R, t, room.center, room.radius_m, poses[first], poses[rest], stage.scans - FIRST, sigmas=sigmas, field=room.field
+        R, t, planning.center, planning.radius_m, poses[first], poses[rest], stage.scans - FIRST, sigmas=sigmas, field=planning.field
     )  # fmt: skip
-    return _scans(room, q_from, q, first, rest, plan.chosen, stage.held_out)
+    return _scans(planning, q_from, q, first, rest, plan.chosen, stage.held_out)
 
 
-def plan_touches(room: Room, q_from: Array, seed: int) -> list[Goal]:
+def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Goal]:
     """Above points spread over the sphere's upper part, the torch leaning and turned another way at each.
 
     Raises:
         InputError: too few of them can be reached.
     """
-    stage, rng = room.job.sphere, np.random.default_rng([seed, 5])
-    yaw = RollPitchYaw(forward_kinematics(room.arm, room.q_home).rotation()).yaw_angle()
+    stage, rng = planning.job.sphere, np.random.default_rng([seed, 5])
+    yaw = RollPitchYaw(forward_kinematics(planning.arm, planning.q_home).rotation()).yaw_angle()
     q, normals = [], []
     for k in range(20 * stage.touches):
         # Fibonacci's lattice: each new point falls into the largest gap of those before
@@ -137,10 +141,10 @@ def plan_touches(room: Room, q_from: Array, seed: int) -> list[Goal]:
         R = RollPitchYaw(np.pi + lean[0], lean[1], yaw + TURN_RAD * rng.uniform(-1.0, 1.0)).ToRotationMatrix()
         if float(-R.matrix()[:, 2] @ n) < np.cos(SIDE_RAD):
             continue
-        tip = room.center + (room.radius_m + 1e-3 * stage.gap_mm) * n
-        X = RigidTransform(R, tip - R.multiply(room.p_FTip))
-        found = room.joints(X, room.q_home)
-        if found is not None and room.gap(X) > 0.5e-3 * stage.gap_mm:
+        tip = planning.center + (planning.radius_m + 1e-3 * stage.gap_mm) * n
+        X = RigidTransform(R, tip - R.multiply(planning.p_FTip))
+        found = planning.joints(X, planning.q_home)
+        if found is not None and planning.gap(X) > 0.5e-3 * stage.gap_mm:
             q.append(found)
             normals.append(n)
         if len(q) == stage.touches:
@@ -149,26 +153,26 @@ def plan_touches(room: Room, q_from: Array, seed: int) -> list[Goal]:
         raise InputError("The arm cannot touch the sphere all around where it is thought to stand: move it nearer.")
     return [
         Goal("via" if k < 0 else "touch", at, None if k < 0 else -normals[k])
-        for at, k in room.route(q_from, np.array(q))
+        for at, k in planning.route(q_from, np.array(q))
     ]
 
 
-def plan_pass(room: Room, q_from: Array) -> list[Goal]:
+def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
     """The profiler along the seam of the drawing, square to the plate, its line across the groove."""
-    assert room.cad is not None
-    assert room.X_BP is not None
-    stage = room.job.seam
-    keep = _stretch(room, np.asarray(room.cad.arc_length_m))
-    seam = room.X_BP.multiply(np.asarray(room.cad.seam_P)[keep].T).T
-    tangents = room.X_BP.rotation().multiply(np.asarray(room.cad.tangents_P)[keep].T).T
-    up = room.X_BP.rotation().matrix()[:, 2]
-    top = seam + room.cad.depth_m * up + 1e-3 * stage.stand_off_mm * up
-    X_SF = room.X_FS.inverse()
+    assert planning.cad is not None
+    assert planning.X_BP is not None
+    stage = planning.job.seam
+    keep = _stretch(planning, np.asarray(planning.cad.arc_length_m))
+    seam = planning.X_BP.multiply(np.asarray(planning.cad.seam_P)[keep].T).T
+    tangents = planning.X_BP.rotation().multiply(np.asarray(planning.cad.tangents_P)[keep].T).T
+    up = planning.X_BP.rotation().matrix()[:, 2]
+    top = seam + planning.cad.depth_m * up + 1e-3 * stage.stand_off_mm * up
+    X_SF = planning.X_FS.inverse()
     flange = []
     for p, t in zip(top, tangents, strict=True):
         x = np.cross(t, up)
         flange.append(RigidTransform(RotationMatrix(np.column_stack([x, np.cross(-up, x), -up])), p) @ X_SF)
-    goals = _along(room, q_from, flange, top, 1e-3 * stage.pass_mm_s, "pass")
+    goals = _along(planning, q_from, flange, top, 1e-3 * stage.pass_mm_s, "pass")
     for _ in range(stage.passes - 1):
         assert goals[-1].path is not None
         back = goals[-1].path.backwards()
@@ -176,9 +180,9 @@ def plan_pass(room: Room, q_from: Array) -> list[Goal]:
     return goals
 
 
-def plan_torch(room: Room, q_from: Array, curve: SeamCurve) -> list[Goal]:
+def plan_torch(planning: PlanningContext, q_from: Array, curve: SeamCurve) -> list[Goal]:
     """The torch's tip along a seam that was found, upright, the profiler ahead of it."""
-    stage = room.job.seam
+    stage = planning.job.seam
     s = np.arange(0.0, curve.length, STATION_M)
     tips = curve.position(s) + 1e-3 * stage.above_root_mm * curve.up(s)
     flange = []
@@ -186,12 +190,12 @@ def plan_torch(room: Room, q_from: Array, curve: SeamCurve) -> list[Goal]:
         x = t - (t @ up) * up
         x /= np.linalg.norm(x)
         R = RotationMatrix(np.column_stack([x, np.cross(-up, x), -up]))
-        flange.append(RigidTransform(R, tip - R.multiply(room.p_FTip)))
-    return _along(room, q_from, flange, tips, 1e-3 * stage.torch_mm_s, "torch")
+        flange.append(RigidTransform(R, tip - R.multiply(planning.p_FTip)))
+    return _along(planning, q_from, flange, tips, 1e-3 * stage.torch_mm_s, "torch")
 
 
-def _standing(room: Room, candidates: FlangePoses, what: str) -> tuple[Array, FlangePoses]:
-    q, which = room.standing(candidates)
+def _standing(planning: PlanningContext, candidates: FlangePoses, what: str) -> tuple[Array, FlangePoses]:
+    q, which = planning.standing(candidates)
     if not len(q):
         raise InputError(f"The arm cannot take the profiler over the {what} where it is thought to stand: move it.")
     return q, candidates[which]
@@ -206,7 +210,7 @@ def _split(poses: FlangePoses, wanted: int) -> tuple[NDArray[np.intp], NDArray[n
 
 
 def _scans(
-    room: Room,
+    planning: PlanningContext,
     q_from: Array,
     q: Array,
     first: NDArray[np.intp],
@@ -216,15 +220,15 @@ def _scans(
 ) -> list[Goal]:
     taken = [*first, *rest[list(chosen)]]
     spare = [k for k in rest if k not in taken][:held_out]
-    way = room.route(q_from, q[taken])
+    way = planning.route(q_from, q[taken])
     goals = [Goal("via" if k < 0 else "scan", at) for at, k in way]
-    more = room.route(goals[-1].q, q[spare])
+    more = planning.route(goals[-1].q, q[spare])
     return goals + [Goal("via" if k < 0 else "held_out", at) for at, k in more]
 
 
-def _stretch(room: Room, s: Array) -> NDArray[np.bool_]:
+def _stretch(planning: PlanningContext, s: Array) -> NDArray[np.bool_]:
     """Which of the drawing's seam points are passed."""
-    stage = room.job.seam
+    stage = planning.job.seam
     begin, end = 1e-3 * stage.ends_mm, float(s[-1]) - 1e-3 * stage.ends_mm
     if stage.seam_length_mm is not None:
         end = min(end, begin + 1e-3 * stage.seam_length_mm)
@@ -233,15 +237,17 @@ def _stretch(room: Room, s: Array) -> NDArray[np.bool_]:
     return np.asarray((s >= begin) & (s <= end))
 
 
-def _along(room: Room, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str) -> list[Goal]:
+def _along(
+    planning: PlanningContext, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str
+) -> list[Goal]:
     """A goal above the beginning, then the path."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
     chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
     joints: list[Array] = []
-    q = room.q_home
+    q = planning.q_home
     for k in chosen:
-        found = room.joints(flange[k], q)
+        found = planning.joints(flange[k], q)
         if found is None:
             raise InputError("The arm cannot follow the seam where it is thought to lie: move the workpiece nearer.")
         if joints and float(np.abs(found - q).max()) > 0.5:
@@ -249,8 +255,8 @@ def _along(room: Room, q_from: Array, flange: list[RigidTransform], at: Array, s
         joints.append(found)
         q = found
     raised = RigidTransform([0.0, 0.0, 0.05]) @ flange[0]
-    above = room.joints(raised, joints[0])
+    above = planning.joints(raised, joints[0])
     ways = [] if above is None else [Goal("via", above)]
-    if above is not None and not room.clear_way(q_from, above):
-        ways = [Goal("via", room.q_home), *ways]
+    if above is not None and not planning.clear_way(q_from, above):
+        ways = [Goal("via", planning.q_home), *ways]
     return [*ways, Goal(kind, joints[0], path=JointPath(length[chosen], np.array(joints), speed))]

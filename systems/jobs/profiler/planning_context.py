@@ -24,7 +24,7 @@ STEP_RAD = 0.1  # along a move, between places that are looked at
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class PlanningContext:
     """Poses as drawn or, later, as calibrated: X_FS, the tip in F, the sphere's centre in B; the workpiece's drawing at X_BP."""
 
     arm: ArmModel
@@ -121,7 +121,7 @@ class Room:
             )
         return way
 
-    def known(self, **changes: object) -> Room:
+    def known(self, **changes: object) -> PlanningContext:
         """The same with what has been found out."""
         return replace(self, **changes)  # type: ignore[arg-type]
 

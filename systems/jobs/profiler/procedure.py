@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.drivers.simulated.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.jobs.profiler.estimates import (
     EdgeFound,
     SeamFound,
@@ -26,12 +26,13 @@ from weldcal.systems.jobs.profiler.estimates import (
     sphere_sigmas,
 )
 from weldcal.systems.jobs.profiler.plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
-from weldcal.systems.jobs.profiler.planning_context import Room
-from weldcal.systems.messages import JobCommand, Message, UrStatus
+from weldcal.systems.jobs.profiler.planning_context import PlanningContext
+from weldcal.systems.messages import JobCommand, Message, ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
+ENDS = ("done", "held")
 DWELL_S = 0.1  # at rest before a profile is taken
 FEEDBACK_PER_S = 8.0  # towards the path
 PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # what each stage does, in order
@@ -62,7 +63,7 @@ class ProfilerState(Message):
     torch_from_s: float = np.inf
     torch_until_s: float = np.inf
     reason: str = ""
-    room: Room | None = field(default=None)
+    planning: PlanningContext | None = field(default=None)
 
 
 class ProfilerProcedure(LeafSystem):
@@ -78,6 +79,7 @@ class ProfilerProcedure(LeafSystem):
         - robot_status
         - profile
         - touch
+        - hold
         output_ports:
         - job
         - creep
@@ -85,19 +87,22 @@ class ProfilerProcedure(LeafSystem):
         - state
 
     `job` drives the FlangeMover between goals (mode move), or says that `creep` (6) rad/s does (mode weld): the descent to a
-    touch, the profiler's pass, the torch's. `trigger` (1) is the number of the newest profile asked for.
+    touch, the profiler's pass, the torch's. `trigger` (1) is the number of the newest profile asked for; `hold` (1) is a person's wish to stop.
     """
 
-    def __init__(self, room: Room, profiler: RenderedProfiler, seed: int, period_s: float = 0.008) -> None:
+    def __init__(
+        self, planning: PlanningContext, profiler: RenderedProfiler, seed: int, period_s: float = 0.008
+    ) -> None:
         super().__init__()
-        self._room, self._profiler, self._seed = room, profiler, seed
+        self._planning, self._profiler, self._seed = planning, profiler, seed
         self._position = self.DeclareVectorInputPort("position", 6)
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._settled = self.DeclareVectorInputPort("settled_goal", 1)
         self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
         self._profile = self.DeclareAbstractInputPort("profile", AbstractValue.Make(ProfileScan()))
         self._touch = self.DeclareAbstractInputPort("touch", AbstractValue.Make(TorchTouch()))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(ProfilerState(room=room)))
+        self._hold = self.DeclareVectorInputPort("hold", 1)
+        self._state = self.DeclareAbstractState(AbstractValue.Make(ProfilerState(planning=planning)))
         out = self.DeclareDiscreteState(np.zeros(6))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
@@ -119,10 +124,10 @@ class ProfilerProcedure(LeafSystem):
 
     def _velocity(self, s: ProfilerState, q: Array, now: float) -> Array:
         """Straight along a touch's way, or along a path with feedback towards it."""
-        room = s.room or self._room
+        planning = s.planning or self._planning
         if s.phase == "descend" and s.goals[0].way is not None:
-            v = np.concatenate([np.zeros(3), 1e-3 * room.job.sphere.descent_mm_s * s.goals[0].way])
-            return np.asarray(np.linalg.solve(jacobian(room.arm, q, room.p_FTip), v))
+            v = np.concatenate([np.zeros(3), 1e-3 * planning.job.sphere.descent_mm_s * s.goals[0].way])
+            return np.asarray(np.linalg.solve(jacobian(planning.arm, q, planning.p_FTip), v))
         if s.phase == "run" and s.goals[0].path is not None:
             q_path, v_path, _ = s.goals[0].path.at(now - s.since)
             return np.asarray(v_path + FEEDBACK_PER_S * (q_path - q))
@@ -130,14 +135,20 @@ class ProfilerProcedure(LeafSystem):
 
     def _next(self, s: ProfilerState, q: Array, context: Context) -> ProfilerState:
         now = context.get_time()
-        if s.phase in ("done", "held"):
+        if s.phase in ENDS:
             return s
         status: UrStatus = self._status.Eval(context)
         if not status.ready:
             reason = status.fault or "The robot does not obey velocity commands."
             return replace(s, phase="held", since=now, reason=reason)
+        if self._hold.Eval(context)[0] > 0.5:
+            reason = f"A person held the job, in the step '{s.step or 'start'}'."
+            return replace(s, phase="held", since=now, reason=reason)
+        if now > self._planning.job.maximum_time_s:
+            reason = f"The job took longer than its {self._planning.job.maximum_time_s:.0f} s; allow more with maximum_time_s."
+            return replace(s, phase="held", since=now, reason=reason)
         if s.phase == "start":
-            steps = tuple(step for stage in self._room.job.stages for step in PLANS[stage])
+            steps = tuple(step for stage in self._planning.job.stages for step in PLANS[stage])
             return self._begin(replace(s, steps_left=steps), q, now)
         if s.phase == "move" and s.goal_id == int(self._settled.Eval(context)[0]):
             return self._arrived(s, q, now, context)
@@ -179,7 +190,7 @@ class ProfilerProcedure(LeafSystem):
 
     def _descending(self, s: ProfilerState, now: float, context: Context) -> ProfilerState:
         touch: TorchTouch = self._touch.Eval(context)
-        stage = self._room.job.sphere
+        stage = self._planning.job.sphere
         if touch.sequence > s.felt:
             history: PoseHistory = self._history.Eval(context)
             q = history.joints_at(touch.time)
@@ -197,7 +208,7 @@ class ProfilerProcedure(LeafSystem):
         assert path is not None
         if s.goals[0].kind == "pass":
             s = self._collected(s, context)
-            every = self._room.job.seam.every_mm / self._room.job.seam.pass_mm_s
+            every = self._planning.job.seam.every_mm / self._planning.job.seam.pass_mm_s
             due = s.before + int((now - s.since) / every) + 1
             if s.seen == s.sequence and s.sequence < due and now - s.since < path.duration:
                 s = replace(s, sequence=s.sequence + 1)
@@ -214,63 +225,63 @@ class ProfilerProcedure(LeafSystem):
 
     def _begin(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
         """Plan the next step and go to its first goal; home at the end."""
-        room = s.room or self._room
+        planning = s.planning or self._planning
         if not s.steps_left:
             if s.step == "home":
                 return replace(s, phase="done", since=now)
-            goals, step = [Goal("via", room.q_home)], "home"
+            goals, step = [Goal("via", planning.q_home)], "home"
             left: tuple[str, ...] = ()
             if s.step == "torch":
-                goals = [Goal("via", self._raised(room, q)), *goals]
+                goals = [Goal("via", self._raised(planning, q)), *goals]
         else:
             step, *rest = s.steps_left
             left = tuple(rest)
-            goals = self._planned(s, step, room, q)
+            goals = self._planned(s, step, planning, q)
         return replace(
             s, phase="move", since=now, goal_id=s.goal_id + 1, step=step, steps_left=left, goals=tuple(goals), taken=()
         )
 
-    def _planned(self, s: ProfilerState, step: str, room: Room, q: Array) -> list[Goal]:
+    def _planned(self, s: ProfilerState, step: str, planning: PlanningContext, q: Array) -> list[Goal]:
         if step == "edge":
-            return plan_edge(room, q, self._seed, feature_sigmas(self._profiler, 0.085))
+            return plan_edge(planning, q, self._seed, feature_sigmas(self._profiler, 0.085))
         if step == "sphere":
-            return plan_sphere(room, q, self._seed, sphere_sigmas(self._profiler, room.job))
+            return plan_sphere(planning, q, self._seed, sphere_sigmas(self._profiler, planning.job))
         if step == "touch":
-            return plan_touches(room, q, self._seed)
+            return plan_touches(planning, q, self._seed)
         if step == "pass":
-            return plan_pass(room, q)
+            return plan_pass(planning, q)
         assert s.seam is not None
-        return plan_torch(room, q, s.seam.curve)
+        return plan_torch(planning, q, s.seam.curve)
 
     @staticmethod
-    def _raised(room: Room, q: Array) -> Array:
-        up = room.joints(RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(room.arm, q), q)
-        return room.q_home if up is None else up
+    def _raised(planning: PlanningContext, q: Array) -> Array:
+        up = planning.joints(RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(planning.arm, q), q)
+        return planning.q_home if up is None else up
 
     def _concluded(self, s: ProfilerState) -> ProfilerState:
-        """What the step that ended tells, and the room as it is known now."""
-        room, p = s.room or self._room, self._profiler
+        """What the step that ended tells, and the planning as it is known now."""
+        planning, p = s.planning or self._planning, self._profiler
         if s.step == "edge":
-            found = find_edge(room.arm, p, room.job, s.taken)
-            return replace(s, edge=found, edge_scans=s.taken, room=room.known(X_FS=found.estimate.X_FS))
+            found = find_edge(planning.arm, p, planning.job, s.taken)
+            return replace(s, edge=found, edge_scans=s.taken, planning=planning.known(X_FS=found.estimate.X_FS))
         if s.step == "sphere":
-            first = find_sphere(room.arm, p, room.job, s.taken)
-            known = room.known(X_FS=first.estimate.X_FS, center=first.estimate.center)
-            return replace(s, sphere_scans=s.taken, sphere=first, room=known)
+            first = find_sphere(planning.arm, p, planning.job, s.taken)
+            known = planning.known(X_FS=first.estimate.X_FS, center=first.estimate.center)
+            return replace(s, sphere_scans=s.taken, sphere=first, planning=known)
         if s.step == "touch":
             assert s.sphere is not None
             before = s.sphere.estimate
-            sphere = find_sphere(room.arm, p, room.job, s.sphere_scans, s.touches, room.p_FTip, before)
+            sphere = find_sphere(planning.arm, p, planning.job, s.sphere_scans, s.touches, planning.p_FTip, before)
             e = sphere.estimate
             assert e.tip is not None
             X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
-            return replace(s, sphere=sphere, room=room.known(X_FS=X, center=e.center, p_FTip=e.tip))
+            return replace(s, sphere=sphere, planning=planning.known(X_FS=X, center=e.center, p_FTip=e.tip))
         if s.step == "pass":
             assert s.sphere is not None
-            assert room.X_BP is not None
-            assert room.cad is not None
-            drawn = SeamCurve.from_points(np.asarray(room.cad.seam_P)[::4]).transformed(room.X_BP)
-            seam = find_seam(room.arm, s.sphere.estimate, drawn, s.taken, 1e-3 * room.job.seam.every_mm)
+            assert planning.X_BP is not None
+            assert planning.cad is not None
+            drawn = SeamCurve.from_points(np.asarray(planning.cad.seam_P)[::4]).transformed(planning.X_BP)
+            seam = find_seam(planning.arm, s.sphere.estimate, drawn, s.taken, 1e-3 * planning.job.seam.every_mm)
             return replace(s, seam=seam, seam_scans=s.taken)
         return s
 
@@ -278,7 +289,19 @@ class ProfilerProcedure(LeafSystem):
         s: ProfilerState = context.get_abstract_state(self._state).get_value()
         mode = {"move": "move", "lift": "move", "descend": "weld", "run": "weld"}.get(s.phase, "hold")
         q_goal = s.goals[0].q if s.goals else None
-        output.set_value(JobCommand(s.phase, mode, s.goal_id, q_goal, s.sequence, s.step))
+        output.set_value(
+            JobCommand(
+                s.phase,
+                mode,
+                s.goal_id,
+                q_goal,
+                s.sequence,
+                s.step,
+                finished=s.phase in ENDS,
+                held=s.phase == "held",
+                reason=s.reason or None,
+            )
+        )
 
     def _creep(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value())

@@ -1,17 +1,14 @@
 """What a scenario says of a visit to the tablet: pen and tablet as drawn, and how the hand goes about it."""
 
 import dataclasses as dc
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.no_device import NoDevice
-
-if TYPE_CHECKING:
-    from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.scenario.schema import Scenario
 
 MOST_LANDMARKS = 100
 STEEPEST_DEG = 45.0  # of a pen that still touches with its tip and not with its side
@@ -63,13 +60,13 @@ class TabletConfig:
         )
 
 
-def check_tablet(scenario: "Scenario") -> None:
+def check_tablet(scenario: Scenario) -> None:
     """Refuse a visit to the tablet that no cell could make; a scenario without one passes.
 
     Raises:
         InputError: one sentence that says what to change.
     """
-    tablet = scenario.tablet
+    tablet = scenario.part(TabletConfig)
     if tablet is None:
         if scenario.tool == "pen":
             raise InputError("A pen touches a tablet: write tablet: {} in the scenario, or another tool.")

@@ -14,13 +14,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus
-
-AT_HOME_RAD = 0.01  # an arm that stands this near to home begins the job from where it is
-
-
-def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
-    """Whether each joint (6,) rad is where it should be."""
-    return bool(np.max(np.abs(q - q_home)) <= AT_HOME_RAD)
+from weldcal.systems.motion.goals import stands_at
 
 
 @dc.dataclass(frozen=True)

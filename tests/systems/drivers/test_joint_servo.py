@@ -10,7 +10,7 @@ from tests.systems.cells import Q_HOME, Drive, the_arm
 from weldcal.calibration.geometry.rigid import rotation_vector
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.no_device import NoDevice
+from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.scenario.schema import Scenario

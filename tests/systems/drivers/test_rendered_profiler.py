@@ -24,7 +24,7 @@ from weldcal.systems.drivers.simulated.rendered_profiler import RayFan, Rendered
 from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.jobs.profiler.robot_error import RobotError
 from weldcal.systems.messages import JobCommand
-from weldcal.systems.scenario.schema import load_scenario
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 
 CLEAN = RenderedProfiler(noise_mm=0.0, jitter_mm=0.0, quantum_mm=0.0, share_missing=0.0, share_spikes=0.0, samples=4000)

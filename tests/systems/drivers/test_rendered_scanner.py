@@ -37,7 +37,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import (
 from weldcal.systems.drivers.simulated.world import SCANNER_RENDERER
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
-from weldcal.systems.scenario.schema import load_scenario
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
 
 DISTANCE_M = 0.7

@@ -9,7 +9,7 @@ import pytest
 from pydrake.math import RollPitchYaw
 
 from weldcal.models.errors import InputError
-from weldcal.systems.scenario.schema import load_scenario
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.welding.record.process import EFFICIENCY, ProcessLogError, WeldProcess, speed_along, torch_angles
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.commands.outcome import new_ticks
+from weldcal.tools.outcomes.weld import new_ticks
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.weld_log import (
     COLUMNS,

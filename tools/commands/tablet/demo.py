@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import time
-import webbrowser
-from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
 from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit, make_tablet_cell
-from weldcal.systems.scenario.schema import Scenario, check_scenario
-from weldcal.tools.commands.demo import DemoOptions
-from weldcal.tools.commands.robots import chosen_robot
+from weldcal.systems.jobs.tablet.job import AddedVisit
+from weldcal.systems.runner import Progress, Run
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.run import run_job
 from weldcal.tools.commands.tablet.calibrate import TabletCalibration, TabletInputs, calibrate_tablet
 from weldcal.tools.commands.tablet.files import write_visit
-from weldcal.tools.commands.tablet.run import run_visit
-from weldcal.tools.console import Progress
+from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import visit_report
 
@@ -37,9 +32,8 @@ UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
 class TabletDemo:
     """What a visit came to; `found` are the figures of its JSON object."""
 
-    options: DemoOptions
-    cell: TabletCell
-    visit: TabletVisit
+    options: RunOptions
+    run: Run[AddedVisit]
     robot: str
     found: dict[str, object] = field(default_factory=dict)
     calibration: TabletCalibration | None = None
@@ -52,65 +46,44 @@ class TabletDemo:
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet demo`."""
         said: dict[str, object] = {
-            "state": "done" if self.visit.done else "held",
+            "state": "held" if self.run.held else "done",
             "scenario": self.options.scenario,
             "seed": self.options.seed,
             "robot": self.robot,
         }
-        if self.visit.reason:
-            said["reason"] = self.visit.reason
-        seconds = {
-            "simulated_seconds": self.visit.seconds,
-            "wall_seconds": self.visit.wall_seconds,
-            "real_time_factor": self.visit.seconds / max(self.visit.wall_seconds, 1e-9),
-        }
-        return {**said, "n_touches": len(self.visit.state.touches), **self.found, **seconds}
+        if self.run.reason:
+            said["reason"] = self.run.reason
+        touches = len(self.run.cell.job.state(self.run.root).touches)
+        return {**said, "n_touches": touches, **self.found, **self.run.timing()}
 
 
-def run_tablet_demo(scenario: Scenario, options: DemoOptions, progress: Progress) -> TabletDemo:
+def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress) -> TabletDemo:
     """Run the visit, write its files, the calibration from them and a report.
 
     Raises:
         InputError, RobotRefused: the scenario or the options cannot be done; nothing has been written or moved.
         LandmarksNotFound: the picture does not show the page. A visit that was held is a result too.
     """
-    if options.speed_factor is not None:
-        scenario.job.speed_factor = options.speed_factor
-        check_scenario(scenario)
-    progress("build the cell", 0.0)
-    meshcat = None
-    with chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot:
-        if options.recording or options.browser:
-            meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
-        cell = make_tablet_cell(scenario, options.seed, meshcat, robot.prepared)
-        with closing(cell.station):
-            if meshcat is not None:
-                set_the_scene(meshcat, cell)
-                if options.browser:
-                    webbrowser.open(meshcat.web_url())
-                    time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
-            visit = run_visit(cell, progress, meshcat, options.realtime)
+    finished = run_job(scenario, options, progress)
+    run = finished.run
     progress("calibrate and write", 0.96)
     options.out.mkdir(parents=True, exist_ok=True)
-    demo = TabletDemo(options, cell, visit, robot.title)
-    if visit.done:
-        calibration, found = calibrate_visit(cell, visit, options)
-        demo = TabletDemo(options, cell, visit, robot.title, found, calibration)
-    if meshcat is not None:
-        write_atomic(options.out / "recording.html", meshcat.StaticHtml())
+    demo = TabletDemo(options, run, finished.robot)
+    if not run.held:
+        calibration, found = calibrate_visit(run, options)
+        demo = TabletDemo(options, run, finished.robot, found, calibration)
+    finished.write_recording(options.out)
     done = demo.calibration
     result, shown = (None, None) if done is None else (done.result, done.shown)
-    page = visit_report(cell, visit, demo.summary(), result, shown, recording=meshcat is not None)
+    page = visit_report(run, demo.summary(), result, shown, recording=finished.meshcat is not None)
     write_atomic(options.out / "report.html", page)
     return demo
 
 
-def calibrate_visit(
-    cell: TabletCell, visit: TabletVisit, options: DemoOptions
-) -> tuple[TabletCalibration, dict[str, object]]:
+def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCalibration, dict[str, object]]:
     """Write the visit's files, calibrate from them as `weldcal tablet calibrate` does, and hold it against the truth."""
-    folder, tablet = options.out, cell.tablet
-    write_visit(cell, visit, folder)
+    folder, tablet = options.out, run.cell.job.tablet
+    write_visit(run, folder)
     done = calibrate_tablet(
         TabletInputs(
             folder / "touches.csv",
@@ -123,23 +96,24 @@ def calibrate_visit(
     )
     if not isinstance(done, TabletCalibration) or done.wrist is None:
         raise RuntimeError("the files of a visit hold full poses")
-    uv = find_landmarks(visit.picture.grey, tablet.columns, tablet.rows)
+    uv = find_landmarks(run.cell.job.picture(run.root).grey, tablet.columns, tablet.rows)
     told, summary = ("leave_one_out_mm", "parameters", "X_FC", "p_FP_mm", "unobservable", "warnings"), done.summary()
-    compared = {**compare(cell, visit, done.wrist, options.seed), **depth_error(cell, visit, uv)}
+    compared = {**compare(run, done.wrist, options.seed), **depth_error(run, uv)}
     return done, {**compared, **{key: summary[key] for key in told}}
 
 
-def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> dict[str, object]:
+def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]:
     """The fit against the truth that only the simulation knows: camera, pen, and touches of points never seen before.
 
     An unseen touch: the camera sees a point of the tablet from where the picture was taken, the hand is sent to where the
     fit puts the pen on it, in any turn and leaning no more than the visit's touches did; what counts is where the true pen then
     is, in the tablet's plane.
     """
-    lean = min(MOST_LEAN_RAD, float(np.deg2rad(cell.tablet.tilt_deg)))
-    truth, rng = cell.truth, np.random.default_rng([seed, 1])
-    X_BF = forward_kinematics(cell.station.arm, visit.state.q_look)
-    points = rng.uniform([0.0, 0.0], cell.tablet.landmarks_m().max(axis=0), (UNSEEN, 2))
+    job = run.cell.job
+    lean = min(MOST_LEAN_RAD, float(np.deg2rad(job.tablet.tilt_deg)))
+    truth, rng = job.truth, np.random.default_rng([seed, 1])
+    X_BF = forward_kinematics(run.cell.station.arm, job.state(run.root).q_look)
+    points = rng.uniform([0.0, 0.0], job.tablet.landmarks_m().max(axis=0), (UNSEEN, 2))
     R_T = truth.X_BT.rotation().matrix()[:, :2]
     misses = []
     for p in points:
@@ -159,26 +133,17 @@ def compare(cell: TabletCell, visit: TabletVisit, fit: WristFit, seed: int) -> d
     }
 
 
-def depth_error(cell: TabletCell, visit: TabletVisit, uv: Array) -> dict[str, object]:
+def depth_error(run: Run[AddedVisit], uv: Array) -> dict[str, object]:
     """Depth of the landmarks off the truth, scale apart: by the tablet's plane, and by each landmark's own pixel (rms)."""
-    K, truth = cell.camera.camera_matrix(), cell.truth
-    X_CT = (forward_kinematics(cell.station.arm, visit.state.q_look) @ truth.X_FC).inverse() @ truth.X_BT
-    page = cell.tablet.landmarks_m()
-    true = cell.camera.depth_scale * X_CT.multiply(np.c_[page, np.zeros(len(page))].T)[2]
-    by_plane = plane_depth(visit.picture.depth_m, uv, K[[0, 1], [0, 1]], K[:2, 2])
+    job = run.cell.job
+    K, truth, depth_m = job.camera.camera_matrix(), job.truth, job.picture(run.root).depth_m
+    X_CT = (forward_kinematics(run.cell.station.arm, job.state(run.root).q_look) @ truth.X_FC).inverse() @ truth.X_BT
+    page = job.tablet.landmarks_m()
+    true = job.camera.depth_scale * X_CT.multiply(np.c_[page, np.zeros(len(page))].T)[2]
+    by_plane = plane_depth(depth_m, uv, K[[0, 1], [0, 1]], K[:2, 2])
     u, v = np.round(uv).astype(int).T
-    by_pixel = visit.picture.depth_m[v, u]
+    by_pixel = depth_m[v, u]
     return {
         "depth_by_plane_mm": 1e3 * float(np.sqrt(((by_plane - true) ** 2).mean())),
         "depth_by_pixel_mm": 1e3 * float(np.sqrt(((by_pixel - true) ** 2).mean())),
     }
-
-
-def set_the_scene(meshcat: Meshcat, cell: TabletCell) -> None:
-    """A calm background and a viewer who stands in front of the tablet."""
-    meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
-    meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
-    meshcat.SetProperty("/Grid", "visible", False)
-    meshcat.SetProperty("/Axes", "visible", False)
-    middle = cell.tablet.pose().multiply(np.r_[0.5 * cell.tablet.landmarks_m().max(axis=0), 0.0])
-    meshcat.SetCameraPose(middle + np.array([0.55, -0.35, 0.45]), middle + np.array([0.0, 0.0, 0.08]))

@@ -12,13 +12,15 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.jobs.tablet.cell import TabletCell, TabletVisit
+from weldcal.systems.jobs.tablet.job import AddedVisit
+from weldcal.systems.runner import Run
 from weldcal.tools.report.render import write_atomic
 
 
-def write_visit(cell: TabletCell, visit: TabletVisit, folder: Path) -> None:
+def write_visit(run: Run[AddedVisit], folder: Path) -> None:
     """Write the four files, each whole or not at all."""
-    tablet, state, arm = cell.tablet, visit.state, cell.station.arm
+    job, arm = run.cell.job, run.cell.station.arm
+    tablet, state = job.tablet, job.state(run.root)
     shown = 1e3 * tablet.px_per_mm * tablet.landmarks_m()
     touches = [
         {
@@ -35,12 +37,12 @@ def write_visit(cell: TabletCell, visit: TabletVisit, folder: Path) -> None:
     ]
     poses = [_pose_row(str(t.landmark), forward_kinematics(arm, t.q)) for t in state.touches]
     poses.append(_pose_row("camera", forward_kinematics(arm, state.q_look)))
-    K = cell.camera.camera_matrix()
+    K = job.camera.camera_matrix()
     intrinsics = {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
     write_atomic(folder / "touches.csv", _csv(touches))
     write_atomic(folder / "poses.csv", _csv(poses))
     write_atomic(folder / "camera.yaml", yaml_dump(intrinsics))
-    write_atomic(folder / "picture.png", cv2.imencode(".png", visit.picture.grey)[1].tobytes())
+    write_atomic(folder / "picture.png", cv2.imencode(".png", job.picture(run.root).grey)[1].tobytes())
 
 
 def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.commands.demo import DemoOptions, run_demo
+from weldcal.tools.commands.demo import run_demo
+from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
 
 COLUMNS = (
@@ -28,7 +29,7 @@ def run_seeds(scenario: str, out: Path, seeds: range, progress: Progress = no_pr
     rows: list[dict[str, object]] = []
     for k, seed in enumerate(seeds):
         folder = out / f"seed{seed:02d}"
-        options = replace(DemoOptions(scenario, folder, seed), recording=False)
+        options = replace(RunOptions(scenario, folder, seed), recording=False)
         rows.append(run_demo(options, lambda stage, share, k=k: progress(stage, (k + share) / len(seeds))).summary())  # type: ignore[misc]
         write_atomic(out / "seeds.csv", _table(rows))
     worst = {

@@ -6,8 +6,9 @@ from itertools import pairwise
 from pathlib import Path
 
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.systems.scenario.schema import load_scenario
-from weldcal.tools.commands.demo import DemoOptions, run_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.outcomes.options import RunOptions
 
 SEAM_MM = 100.0
 
@@ -19,7 +20,7 @@ def run_cell_benchmark(out: Path, seed: int = 0, progress: Progress = no_progres
     """
     scenario = load_scenario("s_groove")
     scenario.welding.seam_length_mm = SEAM_MM
-    options = DemoOptions("s_groove", out, seed, recording=False)
+    options = RunOptions("s_groove", out, seed, recording=False)
     result = run_scenario(scenario, options, progress)
     run = result.run
     camera = scenario.finger_camera

@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
-from weldcal.systems.cell import make_cell
+from weldcal.systems.cell import build_cell
 from weldcal.systems.runner import Progress, no_progress, run_cell
-from weldcal.systems.scenario.schema import Scenario, scenario_names
-from weldcal.tools.commands.demo import DemoOptions, DemoResult, known_camera, measure
-from weldcal.tools.commands.outcome import FeltSeam, felt_seam
+from weldcal.systems.scenario.loading import scenario_names
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.demo import known_camera, measure
 from weldcal.tools.console import plain
+from weldcal.tools.outcomes.demo import DemoResult
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.servo.laws import get_law
 
@@ -146,9 +149,9 @@ def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progres
     scenario.welding.seam_length_mm = options.seam_mm
     scenario.welding.law = options.law
     watch = PhaseCpu(progress)
-    run = run_cell(make_cell(scenario, seed), watch.progress)
+    run = run_cell(build_cell(scenario, seed), watch.progress)
     watch.progress("", 1.0)
-    result = measure(run, DemoOptions(name, options.folder, seed, recording=False))
+    result = measure(run, RunOptions(name, options.folder, seed, recording=False))
     lasted = sum(b[1] - a[1] for a, b in zip(run.phases, run.phases[1:], strict=False) if a[0] == "weld")
     cpu = watch.seconds.get("weld", np.nan) / lasted if lasted else np.nan
     return figures(result, name, options.law, seed, cpu)

@@ -13,7 +13,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import exp_rotation, skew
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
-from weldcal.tools.commands.outcome import calibration_error
+from weldcal.tools.outcomes.weld import calibration_error
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.systems.cell import make_cell, work_point
+from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.runner import Progress, no_progress, run_cell
-from weldcal.systems.scenario.schema import Scenario, check_scenario, load_scenario
-from weldcal.tools.commands.outcome import calibration_error, calibration_status
+from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.studies.flange.live_redraw import Redrawn, Station, bound_covariance, joined, joints_of, redraw
 
@@ -63,10 +66,10 @@ def study_live(
         seed = first + k
         progress(f"calibration {k + 1} of {seeds}", k / seeds)
         scenario = live_scenario(repeatability_mm, scans)
-        cell = make_cell(scenario, seed)
+        cell = build_cell(scenario, seed)
         with closing(cell.station):
             run = run_cell(cell)
-        status, truth = calibration_status(cell, run.root), cell.station.truth.X_BC
+        status, truth = cell.job.calibration_status(run.root), cell.station.truth.X_BC
         if status.estimate is None or truth is None or run.held:
             raise RuntimeError(f"The calibration of seed {seed} came to no end: {run.reason}")
         work = work_point(scenario)

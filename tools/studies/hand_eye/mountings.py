@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.scenario.schema import load_scenario, scenario_names
-from weldcal.tools.commands.demo import DemoOptions
-from weldcal.tools.commands.mounting_live import MountingReport, run_mounting_live
+from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.scenario.loading import load_scenario, scenario_names
+from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.console import Progress
+from weldcal.tools.outcomes.mounting import MountingReport
+from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
 
 HEADER = (
@@ -30,16 +32,16 @@ def run_mountings(
     Raises:
         InputError: a scenario that is not a mounting job.
     """
-    chosen = names or tuple(n for n in scenario_names() if load_scenario(n).mounting is not None)
+    chosen = names or tuple(n for n in scenario_names() if job_of(load_scenario(n)).key == "mounting")
     rows, table = [], HEADER
     for k, name in enumerate(chosen):
-        if load_scenario(name).mounting is None:
+        if job_of(load_scenario(name)).key != "mounting":
             raise InputError(f"Scenario '{name}' has no mounting part; choose one that has.")
         reports: list[MountingReport] = []
         failed: list[str] = []
         for i, seed in enumerate(seeds):
             progress(f"{name}, seed {seed}", (k + i / len(seeds)) / len(chosen))
-            options = DemoOptions(scenario=name, out=folder / name / f"seed{seed}", seed=seed)
+            options = RunOptions(scenario=name, out=folder / name / f"seed{seed}", seed=seed, recording=False)
             try:
                 report = run_mounting_live(load_scenario(name), options, lambda *_: None)
             except WeldcalError as error:
@@ -73,15 +75,15 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
     if not reports:
         return {"scenario": name, "runs": 0, "failed": failed}
     work = np.array([r.work_error_mm() or np.nan for r in reports])
-    aside = np.array([1e3 * k.error_m for r in reports for k in r.run.status.kept_aside])
+    aside = np.array([1e3 * k.error_m for r in reports for k in r.status.kept_aside])
     errors = [e for r in reports for e in r.truth_errors().values()]
     return {
         "scenario": name,
         "runs": len(reports),
         "failed": failed,
-        "scans": float(np.mean([len(r.run.status.seen) for r in reports])),
-        "refused": sum(len(r.run.status.refused) for r in reports),
-        "expected_mm": float(np.median([1e3 * r.run.status.sigma_work_m for r in reports])),
+        "scans": float(np.mean([len(r.status.seen) for r in reports])),
+        "refused": sum(len(r.status.refused) for r in reports),
+        "expected_mm": float(np.median([1e3 * r.status.sigma_work_m for r in reports])),
         "work_median_mm": float(np.median(work)),
         "work_worst_mm": float(work.max()),
         "aside_median_mm": float(np.median(aside)),

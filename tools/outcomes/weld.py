@@ -10,9 +10,10 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
-from weldcal.systems.cell import TORCH_ABOVE_ROOT_M, Cell
-from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY, ServoReport
-from weldcal.systems.messages import CalibrationStatus, PlannedSeam
+from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.welding.record.process import (
     PathError,
     SpeedStatistics,
@@ -84,30 +85,7 @@ def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: 
     )
 
 
-def calibration_status(cell: Cell, root: Context) -> CalibrationStatus:
-    """The calibrator's status in a run's context."""
-    return cell.calibrator.status(cell.calibrator.GetMyContextFromRoot(root))
-
-
-def planned_seam(cell: Cell, root: Context) -> PlannedSeam:
-    """The seam planner's newest plan, empty in a cell that does not weld."""
-    if not cell.diagram.HasSubsystemNamed("seam_planner"):
-        return PlannedSeam()
-    planner = cell.diagram.GetSubsystemByName("seam_planner")
-    plan: PlannedSeam = planner.GetOutputPort("planned_seam").Eval(planner.GetMyContextFromRoot(root))
-    return plan
-
-
-def servo_report(cell: Cell, root: Context) -> ServoReport:
-    """The servo's newest report."""
-    if not cell.diagram.HasSubsystemNamed("welding_servo"):
-        return ServoReport()
-    servo = cell.diagram.GetSubsystemByName("welding_servo")
-    report: ServoReport = servo.GetOutputPort("servo_report").Eval(servo.GetMyContextFromRoot(root))
-    return report
-
-
-def true_seam(cell: Cell) -> SeamCurve | None:
+def true_seam(cell: Cell[WeldJob]) -> SeamCurve | None:
     """Where the torch should have run: above the real groove's root, in B."""
     truth = cell.station.truth
     if truth.workpiece is None or truth.X_BP is None:
@@ -118,9 +96,9 @@ def true_seam(cell: Cell) -> SeamCurve | None:
     return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
 
 
-def felt_seam(cell: Cell, root: Context) -> FeltSeam | None:
+def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
     """The points that the tip felt and the servo kept, against the truth; None where it felt nothing."""
-    state, seam = servo_report(cell, root).state, true_seam(cell)
+    state, seam = cell.job.servo_report(root).state, true_seam(cell)
     if state is None or seam is None or len(state.refined) < 10:
         return None
     assert cell.station.cad is not None
@@ -132,7 +110,7 @@ def felt_seam(cell: Cell, root: Context) -> FeltSeam | None:
     return FeltSeam(found.s, found.lateral, found.height)
 
 
-def weld_log(cell: Cell, root: Context) -> WeldLog | None:
+def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
     """The rows of the run in which the servo was at work, or None."""
     if not cell.logs:
         return None
@@ -177,12 +155,12 @@ def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
     return np.column_stack([table[f"{name}_{axis}"] for axis in axes])
 
 
-def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
+def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     """Measure the weld against the truth; None where nothing was welded."""
     log, seam = weld_log(cell, root), true_seam(cell)
     if log is None or seam is None:
         return None
-    plan = planned_seam(cell, root).seam
+    plan = cell.job.planned_seam(root).seam
     plan_error = None
     if plan is not None:
         seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m) - cell.station.tool.seat_sink_m  # type: ignore[union-attr]
@@ -191,7 +169,7 @@ def weld_outcome(cell: Cell, root: Context) -> WeldOutcome | None:
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
         return WeldOutcome(log, seam, plan, None, None, plan_error)
-    speed = speed_statistics(log.time, log.p_BTorch, log.torch_on, cell.servo_config.weld_speed_m_s)
+    speed = speed_statistics(log.time, log.p_BTorch, log.torch_on, cell.job.servo_config.weld_speed_m_s)
     return WeldOutcome(log, seam, plan, path_error(log.p_BTorch[log.torch_on], seam), speed, plan_error)
 
 

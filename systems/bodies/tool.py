@@ -1,0 +1,177 @@
+"""The bodies of flange and welding tool in a plant, as they are seen and as they touch."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from pydrake.common import MemoryFile
+from pydrake.geometry import (
+    AddCompliantHydroelasticProperties,
+    AddContactMaterial,
+    Box,
+    Cylinder,
+    GeometryInstance,
+    IllustrationProperties,
+    InMemoryMesh,
+    Mesh,
+    PerceptionProperties,
+    ProximityProperties,
+    Shape,
+    Sphere,
+)
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    RigidBody,
+    SpatialInertia,
+    UnitInertia,
+)
+
+from weldcal.models.flanges import flange_mesh, get_flange
+from weldcal.models.mesh import TriMesh
+from weldcal.models.tool import WeldingTool
+from weldcal.systems.bodies.textured_board import textured_board
+from weldcal.welding.servo.deformation import TagModel, tag_cells
+
+STEEL = (0.62, 0.64, 0.67, 1.0)
+DARK = (0.16, 0.18, 0.21, 1.0)
+COPPER = (0.80, 0.45, 0.20, 1.0)
+SOFT = (0.18, 0.42, 0.62, 1.0)
+TABLE = (0.36, 0.38, 0.40, 1.0)
+CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of it
+# A pixel of a camera gathers light over its area through a lens; a renderer looks at one point of each. What lens and pixel
+# blur, in texels, is put into the print, or edges would lie a tenth of a pixel off wherever they run along the pixels.
+BLUR_TEXELS = 1.2
+TIP_FRICTION = 0.2  # soft tip on steel
+# The contact model's ball is a polyhedron inside the ball it is asked for, with this share of its volume (at a resolution of half
+# the radius). It is asked for one as much larger, or the tip would sink by what the corners were cut off.
+CONTACT_MESH_VOLUME = 0.9114
+
+
+def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
+    """A Drake Mesh of a TriMesh, kept in memory."""
+    return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents=mesh.to_obj(), extension=".obj", filename_hint=name)))
+
+
+def show(
+    plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]
+) -> None:
+    """Give a body something to see, in Meshcat and in the rendered images alike."""
+    plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
+
+
+def add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> None:
+    """The ISO 9409-1 flange: its face in the flange frame's plane, its back inside the wrist."""
+    body = plant.GetBodyByName("flange", arm)
+    shape = mesh_shape(flange_mesh(get_flange(flange), thickness_m=0.012), "flange.obj")
+    show(plant, body, RigidTransform(), shape, "iso_flange", STEEL)
+
+
+def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: TagModel) -> None:
+    """The tag with a white margin of one cell, in the marker frame (x right, y up, z out of the print)."""
+    cells = cv2.copyMakeBorder(255 * tag_cells(tag).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=255)
+    sharp = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
+    print_ = np.asarray(cv2.GaussianBlur(sharp, (0, 0), BLUR_TEXELS), dtype=np.uint8)
+    size = tag.size_m * cells.shape[0] / (cells.shape[0] - 2)
+    geometry = GeometryInstance(X, textured_board("tag", size, size, print_), "tag_print")
+    geometry.set_perception_properties(PerceptionProperties())
+    geometry.set_illustration_properties(IllustrationProperties())
+    plant.RegisterVisualGeometry(body, geometry)
+
+
+def add_tool(
+    plant: MultibodyPlant, arm: ModelInstanceIndex, tool: WeldingTool, contact_hint_m: float
+) -> tuple[ModelInstanceIndex, tuple[PrismaticJoint, ...]]:
+    """Plate, ring, camera, torch (welded to the flange) and the soft tip on three sprung prismatic joints."""
+    instance = plant.AddModelInstance("tool")
+    flange_frame = plant.GetFrameByName("flange", arm)
+    inertia = SpatialInertia(
+        tool.mass_kg,
+        np.array([0.03, 0.0, 0.05]),
+        UnitInertia.SolidBox(0.25, 0.08, 0.12).ShiftFromCenterOfMass(np.array([-0.03, 0.0, -0.05])),
+    )
+    plate = plant.AddRigidBody("tool_plate", instance, inertia)
+    plant.WeldFrames(flange_frame, plate.body_frame())
+    t, r = tool.plate_thickness_m, tool.ring_offset_m
+    ring = flange_mesh(get_flange("tool-ring-63"), thickness_m=tool.ring_height_m)
+    show(plant, plate, RigidTransform([0.0, 0.0, t / 2]), Cylinder(0.0375, t), "mount", DARK)
+    show(plant, plate, RigidTransform([r / 2, 0.0, t / 2]), Box(r, 0.064, t), "bar", DARK)
+    show(plant, plate, RigidTransform([r, 0.0, t / 2]), Cylinder(0.0375, t), "ring_base", DARK)
+    show(plant, plate, tool.X_FR, mesh_shape(ring, "ring.obj"), "flange_like_ring", STEEL)
+    camera_z = tool.X_FK.translation()[2]
+    show(
+        plant,
+        plate,
+        RigidTransform([0.0, 0.0, t + (camera_z - 0.006 - t) / 2]),
+        Box(0.026, 0.026, camera_z - 0.006 - t),
+        "camera",
+        DARK,
+    )
+    for side in (-1.0, 1.0):  # the frame that carries the soft metamaterial, outside the camera's view
+        show(
+            plant,
+            plate,
+            RigidTransform([0.0, side * 0.034, (t + tool.tag_reach_m) / 2]),
+            Box(0.012, 0.004, tool.tag_reach_m - t),
+            f"post{side:+.0f}",
+            DARK,
+        )
+    p_FW = tool.X_FT @ tool.p_TW
+    length = p_FW[2] - 0.012 - t
+    show(
+        plant,
+        plate,
+        RigidTransform([p_FW[0] / 2 - 0.01, 0.0, t / 2 + t]),
+        Box(-p_FW[0] + 0.02, 0.03, t),
+        "torch_arm",
+        DARK,
+    )
+    show(plant, plate, RigidTransform([p_FW[0], 0.0, t + length / 2]), Cylinder(0.009, length), "torch_body", COPPER)
+    show(plant, plate, RigidTransform([p_FW[0], 0.0, p_FW[2] - 0.006]), Cylinder(0.0006, 0.012), "torch_wire", STEEL)
+
+    # Three prismatic joints in series carry the tip; the springs are implicit PD, stable at 2 ms with a mass of grams.
+    parent = plant.AddFrame(_fixed_offset(plant, "tip_rest", plate, tool.X_FT))
+    small = SpatialInertia(tool.tip_mass_kg / 3, np.zeros(3), UnitInertia.SolidSphere(0.01))
+    joints: list[PrismaticJoint] = []
+    body = plate
+    for axis, name in enumerate("xyz"):
+        body = plant.AddRigidBody(f"tip_{name}", instance, small)
+        direction = np.eye(3)[axis]
+        joint = plant.AddJoint(PrismaticJoint(f"tip_{name}", parent, body.body_frame(), direction, -0.012, 0.012, 0.0))
+        actuator = plant.AddJointActuator(f"tip_{name}", joint)
+        stiffness = tool.axial_stiffness_N_per_m if name == "z" else tool.lateral_stiffness_N_per_m
+        actuator.set_controller_gains(PdControllerGains(p=stiffness, d=tool.damping_N_s_per_m))
+        joints.append(joint)
+        parent = body.body_frame()
+
+    radius, reach = tool.tip_radius_m, tool.tip_reach_m - tool.tag_reach_m
+    show(plant, body, RigidTransform(), Sphere(radius), "tip", SOFT)
+    show(plant, body, RigidTransform([0.0, 0.0, reach / 2 - 0.003]), Cylinder(0.0022, reach - 0.006), "finger", SOFT)
+    show(plant, body, RigidTransform([0.0, 0.0, reach - 0.0015]), Cylinder(0.026, 0.002), "membrane", SOFT)
+    tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
+    X_TM = RigidTransform([0.0, 0.0, reach])
+    show(
+        plant,
+        body,
+        X_TM @ RigidTransform([0.0, 0.0, -0.0003]),
+        Box(0.016, 0.016, 0.0005),
+        "tag_white",
+        (1.0, 1.0, 1.0, 1.0),
+    )
+    _print_tag(plant, body, X_TM, tag)
+    contact = ProximityProperties()
+    AddContactMaterial(dissipation=1.0, friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=contact)
+    AddCompliantHydroelasticProperties(
+        resolution_hint=contact_hint_m, hydroelastic_modulus=tool.tip_modulus_Pa, properties=contact
+    )
+    rounded = Sphere(radius * CONTACT_MESH_VOLUME ** (-1.0 / 3.0))
+    plant.RegisterCollisionGeometry(body, RigidTransform(), rounded, "tip_contact", contact)
+    return instance, tuple(joints)
+
+
+def _fixed_offset(plant: MultibodyPlant, name: str, body: RigidBody, X: RigidTransform) -> FixedOffsetFrame:
+    return FixedOffsetFrame(name, body.body_frame(), X, body.model_instance())

@@ -1,0 +1,94 @@
+"""Finds the drivers: modules of weldcal.systems.drivers, and what installed packages offer in the entry-point group."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+from functools import cache
+from importlib.metadata import entry_points
+from types import ModuleType
+from typing import get_type_hints
+
+import weldcal.systems.drivers as drivers
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import DriverConfig, NoDevice
+
+ENTRY_POINTS = "weldcal.drivers"
+LEVELS = 2  # drivers/<backend>/<device>.py; deeper modules serve a driver and are none
+
+
+@cache
+def plugins() -> tuple[ModuleType, ...]:
+    """The modules that installed packages offer in the group weldcal.drivers.
+
+    Raises:
+        InputError: one of them cannot be imported; the sentence names its package.
+    """
+    found = []
+    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
+        try:
+            loaded = point.load()
+        except Exception as error:  # whatever a stranger's module raises while it is imported
+            package = "an installed package" if point.dist is None else f"the package {point.dist.name}"
+            raise InputError(
+                f"The driver '{point.name}' of {package} cannot be imported: {error}. Update or uninstall that package."
+            ) from error
+        found.append(loaded if isinstance(loaded, ModuleType) else inspect.getmodule(loaded))
+    return tuple(module for module in found if module is not None)
+
+
+@cache
+def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
+    """The configuration classes that a device may have, its default first.
+
+    Raises:
+        InputError: two drivers have the same name.
+    """
+    found: dict[str, type[DriverConfig]] = {}
+    for module in (*_own_modules(), *plugins()):
+        for config in _configs_of(module):
+            if device not in config.FOR:
+                continue
+            if found.setdefault(config.__name__, config) is not config:
+                raise InputError(
+                    f"Two drivers are called {config.__name__}, in {found[config.__name__].__module__} and in "
+                    f"{config.__module__}: uninstall the package of one of them."
+                )
+    default = next((c for c in found.values() if device in c.DEFAULT_FOR), NoDevice)
+    return (default, *sorted((c for c in found.values() if c is not default), key=lambda c: c.__name__))
+
+
+def default_config(device: str) -> DriverConfig:
+    """What a device is where a scenario does not name it."""
+    return driver_configs(device)[0]()
+
+
+@cache
+def _own_modules() -> tuple[ModuleType, ...]:
+    names = [
+        info.name
+        for info in pkgutil.walk_packages(drivers.__path__, drivers.__name__ + ".", onerror=lambda name: None)
+        if not info.ispkg and info.name.removeprefix(drivers.__name__).count(".") <= LEVELS
+    ]
+    return tuple(importlib.import_module(name) for name in sorted(names))
+
+
+def _configs_of(module: ModuleType) -> list[type[DriverConfig]]:
+    """The configuration classes that a module defines itself, with the types of their fields as objects."""
+    found: list[type[DriverConfig]] = []
+    for member in vars(module).values():
+        if not (inspect.isclass(member) and issubclass(member, DriverConfig) and member.__module__ == module.__name__):
+            continue
+        if member.FOR and hasattr(member, "__dataclass_fields__"):
+            _resolve_types(member)
+            found.append(member)
+    return found
+
+
+def _resolve_types(config: type[DriverConfig]) -> None:
+    """Drake's YAML loader reads the types of fields, which are text in a module that postpones annotations."""
+    types = get_type_hints(config)
+    for field in config.__dataclass_fields__.values():  # type: ignore[attr-defined]
+        if isinstance(field.type, str):
+            field.type = types[field.name]

@@ -1,0 +1,23 @@
+"""What a job puts into the simulated world, as it truly is; drawn from the run's seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from weldcal.models.base_circles import BaseCircle
+from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
+from weldcal.systems.drivers.simulated.second_arm import PlacedArm
+from weldcal.systems.drivers.simulated.world import Fittings
+
+
+@dataclass(frozen=True, eq=False)
+class Furnishing:
+    """Bodies for `build_world`, and `parts` that drivers find by their type (see StationBuild)."""
+
+    fittings: Sequence[Fittings] = ()
+    second: PlacedArm | None = None
+    foot: BaseCircle | None = None
+    profiler: ProfilerFixture | None = None
+    time_step_s: float = 0.002  # of the plant: as fine as what is touched asks for
+    parts: Sequence[object] = ()

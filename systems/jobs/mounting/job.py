@@ -1,0 +1,205 @@
+"""The mounting job: a scanner in any mounting calibrates itself by the robot's own flange or base circle, with one arm or two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.planning.mounting_poses import MountingPlan, MountingPose, plan_mounting_poses
+from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
+from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
+from weldcal.models.base_circles import base_circle
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.simulated.furnishing import Furnishing
+from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated.second_arm import place_second_arm
+from weldcal.systems.jobs.job import AddedJob, Job, Phases
+from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
+from weldcal.systems.jobs.mounting.config import MountingJob, check_mounting
+from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
+from weldcal.systems.jobs.mounting.procedure import MountingProcedure
+from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+from weldcal.systems.wiring import Wiring
+
+SPARE = 8  # poses beyond those that are visited: the next best one is named among them
+FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
+"""Configurations that look at the circle of the base mounting; the others look at a flange."""
+
+
+@dataclass(frozen=True, eq=False)
+class MountingPlanned:
+    """What is believed before the first scan, the circle to look for, and the poses to visit."""
+
+    scene: MountingScene
+    standard: FlangeStandard
+    poses: tuple[MountingPose, ...]
+
+
+@dataclass(eq=False)
+class AddedMounting(AddedJob):
+    """The systems of the job; `truth` (X, and Y or Z as far as they are sought) is for reports and tests only."""
+
+    scene: MountingScene
+    plan: tuple[MountingPose, ...]
+    scans: int
+    procedure: MountingProcedure
+    calibrator: MountingCalibrator
+    truth: dict[str, RigidTransform]
+    ports: JobPorts
+    maximum_time_s: float
+
+    def status(self, root: Context) -> MountingStatus:
+        """What the calibration has come to."""
+        status: MountingStatus = self.calibrator.GetOutputPort("status").Eval(
+            self.calibrator.GetMyContextFromRoot(root)
+        )
+        return status
+
+    def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
+        """See AddedJob."""
+        state: MountingState = self.state(root)
+        return state.label or "go home", 0.05 + 0.85 * min((state.visit + 1) / max(self.scans, 1), 1.0)
+
+
+class Mounting(Job[MountingPlanned]):
+    """The job of a scenario with a `mounting` part."""
+
+    key = "mounting"
+    config = MountingJob
+
+    def check(self, scenario: Scenario) -> None:
+        """See Job."""
+        scanner = scenario.scanner_config()
+        check_mounting(
+            scenario.calibration.configuration,
+            scenario.part(MountingJob),
+            "base" if scanner is None else scanner.mounted_on,
+            second_robot=not isinstance(scenario.robot_2, NoDevice),
+            weld=scenario.job.weld,
+        )
+
+    def furnish(
+        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+    ) -> Furnishing:
+        """See Job: the ring of the base mounting, and the second arm where it truly stands."""
+        job, second = scenario.part(MountingJob), None
+        config = None if job is None else job.second_arm
+        if config is not None:
+            off = random_pose_error(
+                rng, 1e-3 * config.placement_translation_mm, np.deg2rad(config.placement_rotation_deg)
+            )
+            second = place_second_arm(config, off)
+        return Furnishing(second=second, foot=base_circle(scenario.arm), time_step_s=0.004)  # nothing is touched
+
+    def plan(self, scenario: Scenario, station: Station, seed: int) -> MountingPlanned:
+        """See Job."""
+        scene, standard = mounting_scene(scenario, station.arm)
+        return MountingPlanned(scene, standard, plan_mounting(scenario, scene, seed))
+
+    def add(self, wiring: Wiring, spine: Spine, plan: MountingPlanned) -> AddedMounting:
+        """See Job."""
+        scenario, c, scene = wiring.scenario, wiring.scenario.calibration, plan.scene
+        maximum_time_s = scenario.job.maximum_time_s / scenario.job.speed_factor
+        home = (scene.q_home, scene.q_home_2)
+        procedure = wiring.add(
+            "mounting_procedure",
+            MountingProcedure(plan.poses, c.maximum_scans, c.verification_scans, home, maximum_time_s=maximum_time_s),
+        )
+        fit = MountingFitConfig(
+            plan.standard,
+            c.guess_radius_mm * 1e-3,
+            c.configuration in FOOT,
+            c.minimum_scans,
+            c.required_error_mm * 1e-3,
+        )
+        calibrator = wiring.add("mounting_calibrator", MountingCalibrator(scene, fit, plan.poses))
+        state = procedure.GetOutputPort("state")
+        wiring.connect(calibrator, scan=wiring.out("scanner.scan"), state=state)
+        wiring.connect(
+            procedure,
+            status=calibrator.GetOutputPort("status"),
+            hold=spine.hold,
+            position_measured=spine.arm.position,
+        )
+        wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
+        for arm, suffix in zip(spine.arms, ("", "_2"), strict=False):
+            wiring.connect(calibrator, **{f"history{suffix}": arm.history})
+            wiring.connect(
+                procedure, **{f"settled_goal{suffix}": arm.settled_goal, f"robot_status{suffix}": arm.status}
+            )
+        commands = tuple(procedure.GetOutputPort(name) for name in ("job", "job_2"))[: len(spine.arms)]
+        return AddedMounting(
+            scene,
+            plan.poses,
+            c.maximum_scans + c.verification_scans,
+            procedure,
+            calibrator,
+            true_poses(scene, wiring.station),
+            JobPorts(commands, state),
+            maximum_time_s,
+        )
+
+
+def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
+    """What is believed before the first scan, from the drawing and the tape measure; and the circle to look for."""
+    job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
+    if job is None or scanner is None:
+        raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")
+    carrier = scanner.mounted_on
+    link = {"base": 0, "flange": FLANGE}.get(carrier, 1 + LINKS.index(carrier) if carrier in LINKS else 0)
+    circle = base_circle(scenario.arm) if c.configuration in FOOT else None
+    standard = get_flange(scenario.flange) if circle is None else circle.standard
+    second = job.second_arm
+    scene = MountingScene(
+        configuration=c.configuration,
+        arm=arm,
+        link=link,
+        X_LC=c.mounting_guess.pose(),
+        X_HR=RigidTransform() if circle is None else circle.X_BR,
+        radius_m=0.5 * standard.outer_m,
+        scanner=scanner.scanner(),
+        q_home=np.deg2rad(scenario.home_deg),
+        target_known=job.target_known,
+        arm_2=None if second is None else load_arm(second.arm),
+        X_BD=None if second is None else second.pose(),
+        q_home_2=None if second is None else np.deg2rad(second.home_deg),
+    )
+    return scene, standard
+
+
+def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[MountingPose, ...]:
+    """Poses of the calibration, those kept aside, and spare ones; nothing has moved. Raises UnreachableScanner."""
+    c, job = scenario.calibration, scenario.part(MountingJob)
+    assert job is not None
+    visited = c.maximum_scans + c.verification_scans
+    plan = MountingPlan(
+        seed=seed,
+        theta_max_rad=np.deg2rad(c.theta_max_deg),
+        spread_rad=np.deg2rad(job.spread_deg),
+        max_travel_rad=np.deg2rad(job.travel_deg),
+        table_z_m=c.table_z_m,
+        margin_m=c.clearance_m,
+        candidates=visited + SPARE,
+    )
+    return plan_mounting_poses(scene, c.maximum_scans, c.verification_scans, plan)
+
+
+def true_poses(scene: MountingScene, station: Station) -> dict[str, RigidTransform]:
+    """The unknowns as they are: in simulation the circle sits exactly where the drawing says."""
+    found = {} if station.truth.X_LC is None else {"X": station.truth.X_LC}
+    if station.truth.X_BD is not None:
+        found["Y"] = station.truth.X_BD
+    if not scene.target_known:
+        found["Z" if scene.two else "Y"] = scene.X_HR
+    return found
+
+
+JOB = Mounting()

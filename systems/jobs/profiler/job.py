@@ -1,0 +1,128 @@
+"""The profiler job: a laser profiler calibrated by an edge and by a sphere with touches, a seam measured, the torch taken after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces import Workpiece
+from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.simulated.furnishing import Furnishing
+from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
+from weldcal.systems.jobs.job import AddedJob, Job, Phases
+from weldcal.systems.jobs.profiler.config import ProfilerJob, check_profiler_job
+from weldcal.systems.jobs.profiler.planning_context import PlanningContext
+from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure, ProfilerState
+from weldcal.systems.jobs.profiler.robot_error import RobotError
+from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+from weldcal.systems.wiring import Wiring
+
+
+@dataclass(eq=False)
+class AddedProfilerJob(AddedJob):
+    """The systems of the job."""
+
+    job: ProfilerJob
+    procedure: ProfilerProcedure
+    ports: JobPorts
+    maximum_time_s: float
+
+    def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
+        """See AddedJob."""
+        state: ProfilerState = self.state(root)
+        steps = sum(len(PLANS[stage]) for stage in self.job.stages)
+        return state.step or "get ready", 0.05 + 0.9 * (steps - len(state.steps_left)) / max(steps + 1, 1)
+
+
+class Profiler(Job[PlanningContext]):
+    """The job of a scenario with a `profiler_job` part."""
+
+    key = "profiler_job"
+    config = ProfilerJob
+    move_speed, move_acceleration = 1.2, 5.0  # most moves are short
+
+    def check(self, scenario: Scenario) -> None:
+        """See Job."""
+        if isinstance(scenario.profiler, RenderedProfiler):
+            scenario.profiler.preset()
+        check_profiler_job(
+            scenario.part(ProfilerJob),
+            has_profiler=not isinstance(scenario.profiler, NoDevice),
+            has_groove=scenario.workpiece is not None,
+            tool=scenario.tool,
+        )
+
+    def furnish(
+        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+    ) -> Furnishing:
+        """See Job: what the profiler looks at and what its torch touches."""
+        p, job = scenario.profiler, scenario.part(ProfilerJob)
+        if not isinstance(p, RenderedProfiler) or job is None:
+            return Furnishing()
+        error = 1e-3 * p.mounting_translation_mm, float(np.deg2rad(p.mounting_rotation_deg))
+        table_z_m = scenario.calibration.table_z_m
+        fixture = draw_fixture(drawn_pose(p), *error, job, rng, table_z_m, part, X_BP)
+        return Furnishing(profiler=fixture, time_step_s=fixture.time_step_s, parts=(fixture, fixture.truth))
+
+    def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
+        """See Job: a simulated arm is never quite where its controller says; a real one has errors of its own."""
+        job = scenario.part(ProfilerJob)
+        assert job is not None
+        return RobotError(arm, 1e-3 * job.robot_sigma_mm, seed) if scenario.robot.SIMULATED else None
+
+    def plan(self, scenario: Scenario, station: Station, seed: int) -> PlanningContext:
+        """See Job: what the procedure is told before it begins."""
+        return planning_context(scenario, station)
+
+    def add(self, wiring: Wiring, spine: Spine, plan: PlanningContext) -> AddedProfilerJob:
+        """See Job."""
+        profiler = wiring.scenario.profiler
+        assert isinstance(profiler, RenderedProfiler)
+        procedure = wiring.add("profiler_procedure", ProfilerProcedure(plan, profiler, wiring.seed))
+        wiring.connect(
+            procedure,
+            position=spine.arm.position,
+            history=spine.arm.history,
+            settled_goal=spine.arm.settled_goal,
+            robot_status=spine.arm.status,
+            profile=wiring.out("profiler.profile"),
+            touch=wiring.out("torch.touch"),
+            hold=spine.hold,
+        )
+        wiring.feed("profiler.trigger", procedure.GetOutputPort("trigger"))
+        ports = JobPorts(
+            (procedure.GetOutputPort("job"),),
+            procedure.GetOutputPort("state"),
+            velocity=procedure.GetOutputPort("creep"),
+            logged={"torch": wiring.out("cheat.torch")},
+        )
+        return AddedProfilerJob(plan.job, procedure, ports, plan.job.maximum_time_s)
+
+
+def planning_context(scenario: Scenario, station: Station) -> PlanningContext:
+    """What the procedure is told before it begins: drawings only."""
+    job, profiler, spec = scenario.part(ProfilerJob), scenario.profiler, scenario.workpiece
+    if job is None or not isinstance(profiler, RenderedProfiler):
+        raise InputError("This scenario has no profiler: write profiler: !RenderedProfiler {} and profiler_job: {}.")
+    return PlanningContext(
+        arm=station.arm,
+        job=job,
+        q_home=np.deg2rad(scenario.home_deg),
+        X_FS=drawn_pose(profiler),
+        p_FTip=np.array(job.torch.tip_m),
+        center=np.array(job.ball.xyz_m),
+        cad=station.cad,
+        X_BP=None if spec is None else spec.pose_guess.pose(),
+        table_z_m=scenario.calibration.table_z_m,
+    )
+
+
+JOB = Profiler()

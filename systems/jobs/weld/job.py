@@ -1,0 +1,248 @@
+"""The weld job: calibrate, verify, scan the workpiece, plan the seam, follow it; or its calibration alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, OutputPort
+
+from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.systems.drivers.config import FingerCameraConfig
+from weldcal.systems.jobs.job import AddedJob, Job, Phases
+from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
+from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner
+from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
+from weldcal.systems.jobs.weld.iterative_calibrator import IterativeCalibrator
+from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
+from weldcal.systems.jobs.weld.sequencer import JobSequencer
+from weldcal.systems.jobs.weld.settings import (
+    calibrator_config,
+    feature_on_flange,
+    feature_standard,
+    job_plan,
+    plan_poses,
+    servo_config,
+)
+from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
+from weldcal.systems.messages import CalibrationStatus, PlannedSeam
+from weldcal.systems.motion.singularity_guard import SingularityGuard
+from weldcal.systems.motion.spine import JobPorts, Spine
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+from weldcal.systems.viewer.cell_visualizer import add_visualizer
+from weldcal.systems.wiring import Wiring
+from weldcal.welding.servo.state import ServoConfig
+
+# How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
+SHARES = {
+    "start": 0.0,
+    "move_home": 0.0,
+    "move_to_pose": 0.05,
+    "move_to_verify": 0.28,
+    "scan_verify": 0.30,
+    "park": 0.31,
+    "scan_workpiece": 0.33,
+    "approach_above": 0.34,
+    "approach": 0.36,
+    "weld": 0.38,
+    "retract": 0.96,
+    "home": 0.97,
+    "done": 0.98,
+    "held": 0.98,
+}
+WHOLE_SEAM_M = 0.3  # what the progress bar takes a seam for whose length is not limited
+
+
+@dataclass(frozen=True, eq=False)
+class WeldingPorts:
+    """Where the rest of the job finds its welding half; `logged` holds vector ports by their name in the log."""
+
+    seam: OutputPort
+    report: OutputPort
+    velocity: OutputPort | None = None
+    torch_wanted: OutputPort | None = None
+    margin: OutputPort | None = None
+    logged: dict[str, OutputPort] = field(default_factory=dict)
+
+
+@dataclass(eq=False)
+class WeldJob(AddedJob):
+    """The systems of the job and what they were built from."""
+
+    scenario: Scenario
+    poses: tuple[PlannedPose, ...]
+    X_FR: RigidTransform
+    servo_config: ServoConfig
+    sequencer: JobSequencer
+    calibrator: IterativeCalibrator
+    welding: WeldingPorts
+    ports: JobPorts
+    maximum_time_s: float
+
+    def calibration_status(self, root: Context) -> CalibrationStatus:
+        """The calibrator's status in a context of the whole Diagram."""
+        return self.calibrator.status(self.calibrator.GetMyContextFromRoot(root))
+
+    def planned_seam(self, root: Context) -> PlannedSeam:
+        """The seam planner's newest plan, empty in a job that does not weld."""
+        plan: PlannedSeam = self.welding.seam.Eval(self.welding.seam.get_system().GetMyContextFromRoot(root))
+        return plan
+
+    def servo_report(self, root: Context) -> ServoReport:
+        """The servo's newest report."""
+        report: ServoReport = self.welding.report.Eval(self.welding.report.get_system().GetMyContextFromRoot(root))
+        return report
+
+    def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
+        """See AddedJob."""
+        phase = self.command(root).phase
+        share = SHARES.get(phase, 0.05)
+        if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
+            scans = sum(1 for name, _, _ in phases if name == "scan_pose")
+            share = min(0.02 + 0.03 * scans, 0.27)
+        if phase == "weld":
+            begun = next((t for name, t, _ in phases if name == "weld"), root.get_time())
+            seam_mm = self.scenario.welding.seam_length_mm
+            length = WHOLE_SEAM_M if seam_mm is None else seam_mm * 1e-3
+            expected = (length + 0.06) / self.servo_config.weld_speed_m_s + 5.0
+            share += 0.58 * min(float(root.get_time() - begun) / expected, 1.0)
+        return phase.replace("_", " "), share
+
+
+class Weld(Job[tuple[PlannedPose, ...]]):
+    """The job of a scenario that names no other."""
+
+    def check(self, scenario: Scenario) -> None:
+        """See Job; the scenario's own checks are this job's."""
+
+    def plan(self, scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
+        """See Job: every calibration and verification pose."""
+        return plan_poses(scenario, station, seed) if scenario.job.calibrate else ()
+
+    def add(self, wiring: Wiring, spine: Spine, plan: tuple[PlannedPose, ...]) -> WeldJob:
+        """See Job."""
+        station, scenario, c = wiring.station, wiring.scenario, wiring.scenario.calibration
+        config = servo_config(scenario, station)
+        X_FR, standard = feature_on_flange(scenario, station), feature_standard(scenario)
+        X_BC_guess = c.mounting_guess.pose()
+        times = job_plan(scenario)
+        sequencer = wiring.add("job_sequencer", JobSequencer(times))
+        command, history = sequencer.GetOutputPort("job"), spine.arm.history
+        estimator = wiring.add(
+            "flange_estimator", FlangeEstimator(station.arm, X_FR, standard, X_BC_guess, c.guess_radius_mm * 1e-3)
+        )
+        calibrator = wiring.add(
+            "iterative_calibrator", IterativeCalibrator(station.arm, X_FR, standard, calibrator_config(scenario))
+        )
+        status = calibrator.GetOutputPort("calibration_status")
+        chooser = wiring.add("calibration_pose_planner", CalibrationPosePlanner(plan))
+        wiring.connect(
+            estimator, scan=wiring.out("scanner.scan"), job=command, history=history, calibration_status=status
+        )
+        wiring.connect(calibrator, flange_estimate=estimator.GetOutputPort("flange_estimate"), history=history)
+        wiring.connect(chooser, calibration_status=status)
+        welding = _add_welding(wiring, spine, config, sequencer, status)
+        wiring.feed("scanner.trigger", sequencer.GetOutputPort("scan_trigger"))
+        wiring.connect(
+            sequencer,
+            robot_status=spine.arm.status,
+            settled_goal=spine.arm.settled_goal,
+            position_measured=spine.arm.position,
+            next_pose=chooser.GetOutputPort("next_pose"),
+            calibration_status=status,
+            planned_seam=welding.seam,
+            servo_report=welding.report,
+            hold=spine.hold,
+            arm_stopped=spine.switch.GetOutputPort("arm_stopped"),
+        )
+        state = sequencer.GetOutputPort("job_state")
+        if wiring.meshcat is not None:
+            shown = {
+                "job_state": state,
+                "calibration_status": status,
+                "flange_estimate": estimator.GetOutputPort("flange_estimate"),
+                "scan": wiring.out("scanner.scan"),
+                "planned_seam": welding.seam,
+                "servo_report": welding.report,
+            }
+            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, config.weld_speed_m_s, shown)
+        logged = dict(welding.logged)
+        if logged:
+            logged["torch_on"] = spine.switch.GetOutputPort("process_on")
+        ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged)
+        return WeldJob(scenario, plan, X_FR, config, sequencer, calibrator, welding, ports, times.maximum_time_s)
+
+
+def _add_welding(
+    wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
+) -> WeldingPorts:
+    """Seam planner, deformation estimator, servo and guard; constants stand in for them in a cell without a tool."""
+    station, scenario = wiring.station, wiring.scenario
+    tool, spec = station.tool, scenario.workpiece
+    if (
+        tool is None
+        or spec is None
+        or station.cad is None
+        or not isinstance(scenario.finger_camera, FingerCameraConfig)
+    ):
+        return WeldingPorts(
+            seam=wiring.constant("no_seam", PlannedSeam()),
+            report=wiring.constant("no_servo", ServoReport()),
+        )
+    out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
+    position, welding = spine.arm.position, scenario.welding
+    kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
+    planner = wiring.add(
+        "seam_planner",
+        kind(
+            station.arm,
+            tool,
+            station.cad,
+            spec.pose_guess.pose(),
+            config,
+            np.deg2rad(scenario.home_deg),
+            welding.clearance_mm * 1e-3,
+            None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
+            None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
+            scenario.planning.planning_method(),
+        ),
+    )
+    wiring.connect(planner, scan=out("scanner.scan"), job=command, calibration_status=status)
+    finger = wiring.add(
+        "deformation_estimator", ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera())
+    )
+    wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history)
+    wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
+    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config))
+    wiring.connect(
+        servo,
+        planned_seam=planner.GetOutputPort("planned_seam"),
+        deformation=finger.GetOutputPort("deformation"),
+        position_measured=position,
+        sample_time=out("ur10e.sample_time"),
+        job=command,
+    )
+    guard = wiring.add("singularity_guard", SingularityGuard(station.arm, tool.X_FT))
+    wiring.connect(guard, V_BT=servo.GetOutputPort("V_BT"), position_measured=position)
+    logged = {
+        "telemetry": servo.GetOutputPort("telemetry"),
+        "margin": guard.GetOutputPort("margin"),
+        "deflection": finger.GetOutputPort("deflection"),
+        "position": position,
+    }
+    for name, truth in (("tip_and_deflection", "cheat.contact"), ("torch", "cheat.torch")):
+        if station.diagram.HasOutputPort(truth):
+            logged[name] = out(truth)
+    return WeldingPorts(
+        seam=planner.GetOutputPort("planned_seam"),
+        report=servo.GetOutputPort("servo_report"),
+        velocity=guard.GetOutputPort("velocity"),
+        torch_wanted=servo.GetOutputPort("torch_on"),
+        margin=guard.GetOutputPort("margin"),
+        logged=logged,
+    )
+
+
+JOB = Weld()

@@ -1,0 +1,126 @@
+"""The numbers of the weld job, from scenario and station: what is looked at, where from, when it ends, how the servo moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
+from weldcal.systems.jobs.weld.sequencer import JobPlan
+from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
+from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
+
+SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two against refused scans
+ZERO_FRAMES = 10  # of the tag while the tip hangs free: a third of a second before it comes down
+TORCH_ABOVE_ROOT_M = 0.002  # where the wire point runs: this far above the root of the groove
+
+
+def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
+    """X_FR of the feature that the scanner looks at."""
+    if scenario.calibration.feature == "flange" or station.tool is None:
+        return RigidTransform()
+    return station.tool.X_FR
+
+
+def feature_standard(scenario: Scenario) -> FlangeStandard:
+    """Dimensions of that feature."""
+    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange)
+
+
+def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
+    """The servo's numbers from scenario and tool."""
+    tool, welding = station.tool, scenario.welding
+    if tool is None or station.cad is None:
+        return ServoConfig()
+    seat = station.cad.tip_height(tool.tip_radius_m) - tool.seat_sink_m
+    geometry = ToolGeometry(
+        torch_offset_m=tool.chord_m,
+        torch_height_m=tool.torch_height_m,
+        tip_drop_m=station.cad.depth_m + tool.tip_radius_m - seat,
+        torch_clearance_m=TORCH_ABOVE_ROOT_M - seat,
+        side_offset_m=-tool.seat_side_m,
+    )
+    return ServoConfig(
+        tool=geometry,
+        touch=TouchConfig(zero_frames=ZERO_FRAMES),
+        weld_speed_m_s=welding.speed_mm_s * 1e-3,
+        delta_d_m=welding.deflection_mm * 1e-3,
+        axial_d_m=welding.axial_deflection_mm * 1e-3,
+        law=welding.law,
+    )
+
+
+def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
+    """Every calibration and verification pose, best first, checked for reach, sight and clearance before anything moves.
+
+    Raises:
+        UnreachableScanner: no such set of poses exists for the scanner where the scenario says it stands.
+    """
+    c, tool = scenario.calibration, station.tool
+    scanner = scenario.scanner_config()
+    if scanner is None:
+        raise InputError("A calibration needs a scanner: write scanner: !RenderedScanner {} in the scenario.")
+    preset = scanner.scanner()
+    config = PlannerConfig(
+        seed=seed,
+        theta_max_rad=np.deg2rad(c.theta_max_deg),
+        table_z_m=c.table_z_m,
+        margin_m=c.clearance_m,
+        feature_radius_m=0.5 * feature_standard(scenario).outer_m,
+        work_point_B=tuple(work_point(scenario)),
+    )
+    poses = plan_calibration_poses(
+        station.arm,
+        feature_on_flange(scenario, station),
+        c.mounting_guess.pose(),
+        preset,
+        c.maximum_scans + c.verification_scans + SPARE_POSES,
+        q_start=np.deg2rad(scenario.home_deg),
+        config=config,
+        tool=() if tool is None else tool.capsules(),
+    )
+    return clear_poses(scenario, station, poses, station_bodies(station))
+
+
+def work_point(scenario: Scenario) -> np.ndarray:
+    """p_BWork (3,) m: where the calibration's error counts."""
+    if scenario.workpiece is not None:
+        return np.array(scenario.workpiece.pose_guess.pose().translation())
+    return np.array(scenario.calibration.work_point_m)
+
+
+def job_plan(scenario: Scenario) -> JobPlan:
+    """The job's numbers in SI units; slower moves may take longer."""
+    c, job = scenario.calibration, scenario.job
+    slower = 1.0 / job.speed_factor
+    return JobPlan(
+        calibrate=job.calibrate,
+        weld=job.weld,
+        q_home=np.deg2rad(scenario.home_deg),
+        maximum_scans=c.maximum_scans,
+        verification_scans=c.verification_scans,
+        verification_limit_m=c.verification_limit_mm * 1e-3,
+        required_error_m=c.required_error_mm * 1e-3,
+        move_timeout_s=MOVE_TIMEOUT_S * slower,
+        maximum_time_s=job.maximum_time_s * slower,
+    )
+
+
+def calibrator_config(scenario: Scenario) -> CalibratorConfig:
+    """When the calibration may stop."""
+    c = scenario.calibration
+    return CalibratorConfig(
+        required_error_m=c.required_error_mm * 1e-3,
+        minimum_scans=c.minimum_scans,
+        maximum_scans=c.maximum_scans,
+        p_BWork=work_point(scenario),
+        cost=c.cost,
+        work_radius_m=c.work_radius_mm * 1e-3,
+        cost_axes=tuple(c.cost_axes),
+    )

@@ -1,0 +1,78 @@
+"""Reads scenarios: the ones that ship with weldcal by name, a user's own by path; unknown keys are errors."""
+
+from __future__ import annotations
+
+import dataclasses as dc
+import re
+from functools import cache, partial, reduce
+from operator import or_
+from pathlib import Path
+from typing import Any
+
+from pydrake.common.yaml import yaml_load_typed
+
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import DEVICES
+from weldcal.systems.drivers.discovery import default_config, driver_configs
+from weldcal.systems.jobs.discovery import jobs
+from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.schema import Scenario
+
+SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
+
+
+def scenario_names() -> list[str]:
+    """Names of the scenarios that ship with weldcal."""
+    return sorted(path.stem for path in SCENARIO_FOLDER.glob("*.yaml"))
+
+
+@cache
+def scenario_class() -> type[Scenario]:
+    """The schema with a union of all installed drivers for each device, and an optional key for each job of its own.
+
+    Raises:
+        InputError: an installed driver cannot be used.
+    """
+    fields: list[tuple[str, Any, Any]] = []
+    for device in DEVICES:
+        union = reduce(or_, driver_configs(device))
+        fields.append((device, union, dc.field(default_factory=partial(default_config, device))))
+    fields += [(job.key, job.config | None, None) for job in jobs() if job.key and job.config is not None]
+    return dc.make_dataclass("Scenario", fields, bases=(Scenario,))
+
+
+def load_scenario(name: str, overrides: str = "") -> Scenario:
+    """Load a scenario by name or path; `overrides` is a second YAML text merged on top.
+
+    Raises:
+        InputError: unknown name, unknown key, wrong type; the sentence says which.
+    """
+    path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
+    if not path.is_file():
+        raise InputError(
+            f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file."
+        )
+    schema = scenario_class()
+    scenario = schema()
+    for label, text in ((str(path.name), path.read_text(encoding="utf-8")), ("the overrides", overrides)):
+        if not text.strip():
+            continue
+        try:
+            scenario = yaml_load_typed(schema=schema, data=text, defaults=scenario)
+        except Exception as error:  # Drake's loader raises several kinds, and not every text names the key
+            what = " ".join(str(error).split())
+            raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+    check_scenario(scenario)
+    return scenario
+
+
+def _part_at_fault(text: str) -> str:
+    """Which top-level part of a YAML text does not load by itself, as words for a sentence; empty where that is not clear."""
+    schema = scenario_class()
+    parts = re.split(r"^(?=\w+ *:)", text, flags=re.MULTILINE)
+    for part in filter(str.strip, parts):
+        try:
+            yaml_load_typed(schema=schema, data=part, defaults=schema())
+        except Exception:  # the same loader as above: any failure names this part
+            return f" at '{part.split(':')[0].strip()}'"
+    return ""

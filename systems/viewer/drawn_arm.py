@@ -1,0 +1,56 @@
+"""The arm of a station without a simulated world: kinematics only, drawn where it is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydrake.geometry import Box, SceneGraph
+from pydrake.math import RigidTransform
+from pydrake.multibody.parsing import Parser
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arms.urdf import arm_urdf
+from weldcal.models.tool import WeldingTool
+from weldcal.systems.bodies.tool import TABLE, add_flange, add_tool, show
+
+
+def add_drawn_arm(
+    builder: DiagramBuilder,
+    arm: ArmModel,
+    tool: WeldingTool | None,
+    flange: str,
+    table_z_m: float,
+    position_measured: OutputPort,
+) -> SceneGraph:
+    """Add a scene in which the arm, its tool (tip at rest) and the table stand; frame: the world is the robot base B.
+
+    `position_measured` (6) rad moves it. No dynamics, no contact, nothing that a sensor could look at.
+    """
+    scene_graph = builder.AddSystem(SceneGraph())
+    scene_graph.set_name("scene_graph")
+    plant = MultibodyPlant(time_step=0.0)
+    plant.RegisterAsSourceForSceneGraph(scene_graph)
+    (instance,) = Parser(plant).AddModelsFromString(arm_urdf(arm), "urdf")
+    plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
+    add_flange(plant, instance, flange)
+    if tool is not None:
+        add_tool(plant, instance, tool, tool.tip_radius_m / 2)
+    table = RigidTransform([0.45, 0.0, table_z_m - 0.02])
+    show(plant, plant.world_body(), table, Box(1.5, 1.2, 0.04), "table", TABLE)
+    plant.Finalize()
+    poses = builder.AddSystem(MultibodyPositionToGeometryPose(plant))
+    poses.set_name("drawn_poses")
+    rest = plant.num_positions() - len(arm.joint_names)
+    if rest:
+        joints = builder.AddSystem(Multiplexer([len(arm.joint_names), rest]))
+        still = builder.AddSystem(ConstantVectorSource(np.zeros(rest)))
+        builder.Connect(position_measured, joints.get_input_port(0))
+        builder.Connect(still.get_output_port(), joints.get_input_port(1))
+        position_measured = joints.get_output_port()
+    builder.Connect(position_measured, poses.get_input_port())
+    source = plant.get_source_id()
+    builder.Connect(poses.get_output_port(), scene_graph.get_source_pose_port(source))
+    return scene_graph

@@ -1,0 +1,55 @@
+"""The builder of a cell with what each of its parts needs, and short ways to add and connect systems."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+
+AnySystem = TypeVar("AnySystem", bound=LeafSystem)
+
+
+@dataclass(frozen=True, eq=False)
+class Wiring:
+    """A cell while it is built; `meshcat` where somebody watches, `seed` for what is random."""
+
+    builder: DiagramBuilder
+    station: Station
+    scenario: Scenario
+    seed: int = 0
+    meshcat: Meshcat | None = None
+
+    def add(self, name: str, system: AnySystem) -> AnySystem:
+        """Add a system under its name."""
+        system.set_name(name)
+        self.builder.AddSystem(system)
+        return system
+
+    def connect(self, system: LeafSystem, **sources: OutputPort) -> None:
+        """Connect each source to the system's input port of that name."""
+        for port, source in sources.items():
+            self.builder.Connect(source, system.GetInputPort(port))
+
+    def out(self, name: str) -> OutputPort:
+        """An output port of the station."""
+        return self.station.diagram.GetOutputPort(name)
+
+    def feed(self, name: str, source: OutputPort) -> None:
+        """Connect a source to an input port of the station."""
+        self.builder.Connect(source, self.station.diagram.GetInputPort(name))
+
+    def constant(self, name: str, value: object) -> OutputPort:
+        """A port that always shows this message."""
+        return self.add(name, ConstantValueSource(AbstractValue.Make(value))).get_output_port()
+
+    def zeros(self, name: str, size: int) -> OutputPort:
+        """A vector port of zeros."""
+        return self.add(name, ConstantVectorSource(np.zeros(size))).get_output_port()

@@ -1,0 +1,108 @@
+"""What a run of the weld job came to: its state, its calibration and weld, and the JSON object of `demo` and `weld`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.next_scan import next_scan
+from weldcal.systems.jobs.weld.settings import work_point
+from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.runner import Run
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
+
+
+@dataclass(frozen=True, eq=False)
+class DemoResult:
+    """What a run came to; figures against the truth exist in simulation only."""
+
+    options: RunOptions
+    run: Run[WeldJob]
+    status: CalibrationStatus
+    calibration: CalibrationError | None
+    weld: WeldOutcome | None
+    robot: str = "simulated"
+
+    @property
+    def folder(self) -> Path:
+        """Where everything was written."""
+        return self.options.out
+
+    @property
+    def state(self) -> str:
+        """`done`, or `held` with a reason."""
+        return "held" if self.run.held else "done"
+
+    @property
+    def n_scans(self) -> int:
+        """Scans of the feature that were taken, verification included."""
+        return self.status.sequence
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `demo` and `weld`."""
+        found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
+        found["robot"] = self.robot
+        if self.run.reason:
+            found["reason"] = self.run.reason
+        if self.calibration is not None:
+            found["X_BC_error_mm"] = 1e3 * self.calibration.translation_m
+            found["X_BC_error_deg"] = float(np.degrees(self.calibration.rotation_rad))
+            found["X_BC_error_at_work_mm"] = 1e3 * self.calibration.at_work_m
+        if self.status.estimate is not None:
+            found["X_BC"] = self.status.estimate.X_BC.GetAsMatrix4().tolist()
+            found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
+            found["held_out_mm"] = error_summary(1e3 * self.status.estimate.held_out.position_m)
+            found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
+        found["n_scans"] = self.n_scans
+        found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]
+        if self.weld is not None and self.weld.error is not None and self.weld.speed is not None:
+            distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
+            found["torch_mean_mm"], found["torch_max_mm"] = float(distance.mean()), float(distance.max())
+            found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
+            found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
+            found["torch_speed_cv"] = self.weld.speed.cv
+            found["welded_mm"] = 1e3 * self.weld.speed.welded_m
+            heat = heat_input_kJ_mm(self.weld, self.run.cell.scenario.welding.process.process())
+            found["heat_input_kJ_mm"] = None if heat is None else float(heat.mean())
+        if self.weld is not None:
+            if self.weld.plan_error is not None:
+                found["plan_mean_mm"] = 1e3 * self.weld.plan_error.mean_m
+                found["plan_max_mm"] = 1e3 * self.weld.plan_error.max_m
+            plan = self.run.cell.job.planned_seam(self.run.root)
+            if np.isfinite(plan.sigma_m):
+                found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
+            found["plan_words"] = plan.words
+            found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
+        found |= self.run.timing()
+        return found
+
+    def calibration_summary(self) -> dict[str, object]:
+        """The JSON object of a live `calibrate`: the keys of the offline one beside those of the run."""
+        found, estimate = self.summary(), self.status.estimate
+        found["seconds"] = self.run.wall_seconds
+        if estimate is not None:
+            ids = [o.id for o in self.status.observations]
+            found |= {
+                "n_used": int(estimate.inliers.sum()),
+                "covariance": estimate.covariance.tolist(),
+                "scanner_correction": None,
+                "tilt_deg": error_summary(np.degrees(estimate.held_out.tilt_rad)),
+                "outliers": [id for id, used in zip(ids, estimate.inliers, strict=True) if not used],
+                "warnings": list(estimate.warnings),
+                "unobservable": list(estimate.unobservable),
+            }
+        advice = next_scan(self.status, self.run.cell.job.poses, work_point(self.run.cell.scenario))
+        found["next_pose"] = None if advice is None else advice.sentence()
+        return found
+
+
+def error_summary(values: np.ndarray) -> dict[str, float]:
+    """Median, mean and 95th percentile of the finite values, in their own unit."""
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return {}
+    return {"median": float(np.median(finite)), "mean": float(finite.mean()), "p95": float(np.percentile(finite, 95))}

@@ -1,0 +1,155 @@
+"""What a live calibration in any mounting came to, against the truth where a simulation knows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.calibration.hand_eye.mountings import Mounting
+from weldcal.calibration.hand_eye.solve import HandEyeResult, pose_difference
+from weldcal.calibration.planning.mounting_poses import work_point
+from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
+from weldcal.systems.jobs.mounting.messages import MountingStatus
+from weldcal.systems.runner import Run
+from weldcal.tools.commands.hand_eye import HandEyeReport
+
+
+@dataclass(frozen=True)
+class TruthError:
+    """How far an unknown pose is from what only the simulation knows: mm, deg, squared error in units of its covariance, and
+    the bound on it that holds the truth with 99.7 %."""
+
+    mm: float
+    deg: float
+    nees: float
+    bound: float
+
+
+@dataclass(frozen=True, eq=False)
+class MountingReport:
+    """What a live calibration came to, and where it was written."""
+
+    run: Run[AddedMounting]
+    result: HandEyeResult | None
+    folder: Path
+    seconds: float
+    robot: str = "simulated"
+
+    @property
+    def job(self) -> AddedMounting:
+        """The job that ran."""
+        return self.run.cell.job
+
+    @property
+    def status(self) -> MountingStatus:
+        """What the calibration came to in the run."""
+        return self.job.status(self.run.root)
+
+    @property
+    def mounting(self) -> Mounting:
+        """The configuration."""
+        return self.job.scene.mounting
+
+    @property
+    def state(self) -> str:
+        """`done`, or `held` with a reason."""
+        return "done" if not self.run.held and self.result is not None else "held"
+
+    @property
+    def reason(self) -> str:
+        """Why it is held; empty where it is done."""
+        if self.state == "done":
+            return ""
+        return self.run.reason or self.status.message
+
+    def truth_errors(self) -> dict[str, TruthError]:
+        """Symbol (X_FC ...) -> error against the truth."""
+        out = {}
+        for letter, X in self.job.truth.items():
+            if self.result is None or letter not in self.result.poses:
+                continue
+            e = pose_difference(self.result.poses[letter], X)
+            out[self.mounting.unknowns[letter].symbol] = TruthError(
+                1e3 * float(np.linalg.norm(e[3:])),
+                float(np.degrees(np.linalg.norm(e[:3]))),
+                self.result.normalised_error(letter, X),
+                self.result.region(0.997),
+            )
+        return out
+
+    def work_error_mm(self) -> float | None:
+        """True error of a point at the scanner's best distance, mm."""
+        truth = self.job.truth.get("X")
+        if self.result is None or truth is None:
+            return None
+        p = work_point(self.job.scene)
+        return 1e3 * float(np.linalg.norm(self.result.X @ p - truth @ p))
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object: the keys of hand-eye, beside those of the run."""
+        status, result = self.status, self.result
+        out: dict[str, object] = {"state": self.state, "configuration": self.mounting.name, "robot": self.robot}
+        if self.reason:
+            out["reason"] = self.reason
+        out |= {
+            "n_scans": status.sequence,
+            "n_used": len(status.seen),
+            "refused": [{"id": id, "reason": why} for id, why in status.refused],
+        }
+        if result is not None:
+            for k, X in result.poses.items():
+                out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": result.covariance[k]}
+            out |= {
+                "held_out_deg": result.held_out.rms_deg,
+                "held_out_mm": 1e3 * result.held_out.rms_translation,
+                "kept_aside_mm": [1e3 * k.error_m for k in status.kept_aside],
+                "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.kept_aside],
+                "expected_error_mm": 1e3 * status.sigma_work_m,
+                "work_error_mm": self.work_error_mm(),
+                "truth": {s: vars(e) for s, e in self.truth_errors().items()},
+                "inliers": result.inliers,
+                "unobservable": list(result.unobservable),
+                "warnings": list(result.warnings),
+                "method": result.method,
+                "next_pose": None if status.next_best is None else status.next_best.sentence(),
+            }
+        return out | self.run.timing() | {"seconds": self.seconds}
+
+    def given(self) -> tuple[str, ...]:
+        """What was not sought: where the circle sits, and which link carries the scanner."""
+        scene, scenario = self.job.scene, self.run.cell.scenario
+        out = []
+        for letter in scene.known:
+            u = self.mounting.unknowns[letter]
+            circle = (
+                "the circle of the base mounting" if scenario.calibration.configuration in FOOT else "the flange itself"
+            )
+            out.append(f"{u.symbol} is known: the target M is {circle}, where the robot's drawing puts it.")
+        if "arm" in scene.configuration and (scanner := scenario.scanner_config()) is not None:
+            out.append(f"The arm link L is the {scanner.mounted_on.replace('_', ' ')}.")
+        return tuple(out)
+
+    def text(self) -> str:
+        """What a person reads: the direction in words, the sketch, numbers, and what was never seen."""
+        status = self.status
+        if self.result is None:
+            return f"{self.mounting.name}: {self.state}. {self.reason}"
+        lines = [HandEyeReport(self.result, self.mounting, (), None, (), self.seconds).text(), ""]
+        lines += [f"given        {sentence}" for sentence in self.given()]
+        aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.kept_aside)
+        if aside:
+            lines.append(f"kept aside   {aside} mm at poses the calibration never saw")
+        lines.append(
+            f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma) of a point at the scanner's best distance"
+        )
+        for symbol, e in self.truth_errors().items():
+            lines.append(
+                f"truth        {symbol} is off by {e.mm:.3f} mm, {e.deg:.4f} deg (simulation; squared error in units of its "
+                f"covariance {e.nees:.1f}, 99.7 % of the time below {e.bound:.1f})"
+            )
+        lines += [f"refused      {id}: {why}" for id, why in status.refused]
+        if status.next_best is not None:
+            lines += ["", f"next best pose: {status.next_best.sentence()}"]
+        return "\n".join(lines)

@@ -1,0 +1,211 @@
+"""A live run of the profiler's cell against the truth that only its simulation knows: poses in sigmas of their prediction, seam, torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.stats import chi2
+
+from weldcal.calibration.profiler.result import ProfilerEstimate
+from weldcal.systems.jobs.profiler.estimates import pose_sigmas
+from weldcal.systems.jobs.profiler.job import AddedProfilerJob
+from weldcal.systems.jobs.profiler.procedure import ProfilerState
+from weldcal.systems.runner import Run
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.welding.record.process import path_error
+from weldcal.welding.seam.curve import SeamCurve
+
+Array = NDArray[np.float64]
+JOINT_3_SIGMA = float(chi2.ppf(chi2.cdf(9.0, 1), 6))  # 20.06
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOutcome:
+    """X_FS against the truth: error, its prediction, each of six parts in its sigma, and e^T C^-1 e of all six."""
+
+    error_mm: float
+    error_deg: float
+    sigma_mm: float
+    sigma_deg: float
+    parts: Array
+    nees: float
+
+    @property
+    def within_3_sigma(self) -> bool:
+        """Whether all six together are as likely as 3 sigma of one: 99.73 %."""
+        return self.nees <= JOINT_3_SIGMA
+
+    @property
+    def largest(self) -> float:
+        """Of the six parts, in sigmas."""
+        return float(np.abs(self.parts).max())
+
+
+@dataclass(frozen=True, eq=False)
+class PathOutcome:
+    """Something along the seam: where (n,) m, and beside and above (n,) m the line that it should be on."""
+
+    s: Array
+    lateral: Array
+    height: Array
+
+    @property
+    def distance_mm(self) -> Array:
+        """From the line (n,)."""
+        return np.asarray(1e3 * np.hypot(self.lateral, self.height))
+
+
+@dataclass(frozen=True, eq=False)
+class LiveOutcome:
+    """All that a run came to; None for what the scenario has not."""
+
+    edge: PoseOutcome | None
+    sphere: PoseOutcome | None
+    tip_mm: float | None
+    center_mm: float | None
+    points: PathOutcome | None
+    curve: PathOutcome | None
+    torch: PathOutcome | None
+
+
+def pose_outcome(estimate: ProfilerEstimate, X_FS: RigidTransform) -> PoseOutcome:
+    """An estimate against the true X_FS."""
+    R = X_FS.rotation() @ RotationMatrix.ProjectToRotationMatrix(estimate.rotation).inverse()
+    error = RigidTransform(R, X_FS.translation() - estimate.translation)
+    parts, nees = pose_sigmas(error, estimate.covariance)
+    return PoseOutcome(
+        error_mm=1e3 * float(np.linalg.norm(error.translation())),
+        error_deg=float(np.degrees(abs(R.ToAngleAxis().angle()))),
+        sigma_mm=1e3 * float(np.sqrt(np.trace(estimate.covariance[3:, 3:]))),
+        sigma_deg=float(np.degrees(np.sqrt(np.trace(estimate.covariance[:3, :3])))),
+        parts=parts,
+        nees=nees,
+    )
+
+
+def true_torch(run: Run[AddedProfilerJob]) -> Array:
+    """Where the torch truly was while it followed the seam (n, 3) m."""
+    state: ProfilerState = run.cell.job.state(run.root)
+    log = run.cell.logs["torch"].FindLog(run.root)
+    t = log.sample_times()
+    return np.array(log.data().T[(t >= state.torch_from_s) & (t <= state.torch_until_s)])
+
+
+def live_outcome(run: Run[AddedProfilerJob]) -> LiveOutcome:
+    """The run against the truth of its station."""
+    cell, s = run.cell, run.cell.job.state(run.root)
+    truth, torch_B = cell.station.truth, true_torch(run)
+    profiler = truth.profiler
+    if profiler is None:
+        raise RuntimeError("this station has no profiler")
+    touched = s.sphere if s.sphere is not None and s.sphere.estimate.tip is not None else None
+    tip = center = None
+    if touched is not None and touched.estimate.tip is not None:
+        tip = 1e3 * float(np.linalg.norm(touched.estimate.tip - profiler.p_FTip))
+        center = 1e3 * float(np.linalg.norm(touched.estimate.center - profiler.center))
+    points = curve = torch = None
+    job = cell.job.job
+    if s.seam is not None and truth.workpiece is not None and truth.X_BP is not None:
+        part, X = truth.workpiece, truth.X_BP
+        up = X.rotation().matrix()[:, 2].copy()
+        true = SeamCurve.from_points(X.multiply(np.asarray(part.seam_P).T).T, up)
+        points = _off(s.seam.points_B, true)
+        curve = _off(s.seam.curve.position(np.linspace(0.0, s.seam.curve.length, 300)), true)
+        if len(torch_B):
+            torch = _off(torch_B, true.raised(1e-3 * job.seam.above_root_mm))
+    return LiveOutcome(
+        edge=None if s.edge is None else pose_outcome(s.edge.estimate, profiler.X_FS),
+        sphere=None if touched is None else pose_outcome(touched.estimate, profiler.X_FS),
+        tip_mm=tip,
+        center_mm=center,
+        points=points,
+        curve=curve,
+        torch=torch,
+    )
+
+
+def _off(p: Array, line: SeamCurve) -> PathOutcome:
+    error = path_error(p, line)
+    return PathOutcome(error.s, error.lateral, error.height)
+
+
+WITHIN_MM = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class ProfilerLive:
+    """What one run came to."""
+
+    options: RunOptions
+    run: Run[AddedProfilerJob]
+    outcome: LiveOutcome
+    robot: str = "simulated"
+
+    @property
+    def folder(self) -> Path:
+        """Where everything was written."""
+        return self.options.out
+
+    @property
+    def state(self) -> ProfilerState:
+        """Where the job ended, with all that it found."""
+        found: ProfilerState = self.run.cell.job.state(self.run.root)
+        return found
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object of `profiler live`, and of `demo` for such a scenario."""
+        s, o = self.state, self.outcome
+        done = not self.run.held
+        found: dict[str, object] = {"state": "done" if done else "held", "scenario": self.options.scenario}
+        found |= {"seed": self.options.seed, "robot": self.robot}
+        if not done:
+            found["reason"] = self.run.reason
+        if s.edge is not None and o.edge is not None:
+            found["edge"] = _pose(o.edge) | {
+                "scans": len(s.edge_scans),
+                "without_feature": s.edge.lost,
+                "outliers": int((~s.edge.estimate.inliers).sum()),
+                "reduced_chi2": s.edge.estimate.reduced_chi2,
+                "held_out_mm": float(s.edge.held_out_mm.mean()) if s.edge.held_out_mm.size else None,
+            }
+        if s.sphere is not None and o.sphere is not None:
+            found["sphere"] = _pose(o.sphere) | {
+                "scans": len(s.sphere_scans),
+                "without_feature": s.sphere.lost,
+                "touches": len(s.touches),
+                "model": s.sphere.model,
+                "reduced_chi2": s.sphere.estimate.reduced_chi2,
+                "held_out_mm": float(s.sphere.held_out_mm.mean()) if s.sphere.held_out_mm.size else None,
+                "tip_error_mm": o.tip_mm,
+                "centre_error_mm": o.center_mm,
+            }
+        if s.seam is not None and o.curve is not None:
+            found["seam"] = {"profiles": len(s.seam_scans), "without_groove": s.seam.lost, **_path("curve", o.curve)}
+        if o.torch is not None:
+            found |= _path("torch", o.torch)
+            found["torch_within_mm"] = WITHIN_MM
+            found["torch_is_within"] = bool(o.torch.distance_mm.max() <= WITHIN_MM)
+        poses = [p for p in (o.edge, o.sphere) if p is not None]
+        if poses:
+            found["largest_sigmas"] = max(p.largest for p in poses)
+            found["poses_within_3_sigma"] = all(p.within_3_sigma for p in poses)
+        return found | self.run.timing()
+
+
+def _pose(p: PoseOutcome) -> dict[str, object]:
+    return {
+        "error_mm": p.error_mm,
+        "error_deg": p.error_deg,
+        "sigma_mm": p.sigma_mm,
+        "sigma_deg": p.sigma_deg,
+        "sigmas": [float(v) for v in p.parts],
+        "nees": p.nees,
+    }
+
+
+def _path(name: str, p: PathOutcome) -> dict[str, object]:
+    return {f"{name}_mean_mm": float(p.distance_mm.mean()), f"{name}_max_mm": float(p.distance_mm.max())}
