@@ -16,8 +16,9 @@ from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.cell import job_plan, make_cell
+from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.jobs.weld.settings import job_plan
 from weldcal.systems.motion.clear_moves import clear_poses
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
@@ -108,7 +109,7 @@ def test_the_torch_burns_only_while_the_servo_tracks_or_finishes(short_job: Demo
 
 def test_the_weld_log_says_what_was_done(short_job: DemoResult) -> None:
     assert short_job.weld is not None
-    record, config = load_weld_log(short_job.folder), short_job.run.cell.servo_config
+    record, config = load_weld_log(short_job.folder), short_job.run.cell.job.servo_config
     assert np.diff(record["time_s"]) == pytest.approx(np.full(len(record) - 1, config.period_s)), "a row per servo tick"
     assert (record.torch_on == short_job.weld.log.torch_on).all()
     # The wire point from measured joints against the body in the plant, which shows the step before: 2 ms at 8 mm/s.
@@ -225,10 +226,10 @@ def test_an_unreachable_scanner_is_refused_before_anything_is_written(tmp_path: 
 
 def test_planned_poses_are_what_the_issue_asks_of_them() -> None:
     """Facing the scanner within theta_max, inside the working distance, and not in one plane."""
-    cell = make_cell(load_scenario("s_groove"), seed=1)
+    cell = build_cell(load_scenario("s_groove"), seed=1)
     X_BC = cell.scenario.calibration.mounting_guess.pose()
     centres = []
-    for pose in cell.poses:
+    for pose in cell.job.poses:
         assert isinstance(pose, PlannedPose)
         X_CR = X_BC.InvertAndCompose(pose.X_BR)
         sight = X_CR.translation() / np.linalg.norm(X_CR.translation())
@@ -241,13 +242,13 @@ def test_planned_poses_are_what_the_issue_asks_of_them() -> None:
 
 
 def test_a_pose_behind_the_table_is_left_out_and_too_few_are_refused() -> None:
-    cell = make_cell(load_scenario("calibrate_only"), seed=1)
+    cell = build_cell(load_scenario("calibrate_only"), seed=1)
     arm, bodies = cell.station.arm, arm_bodies(cell.station.arm)
-    first, *rest = cell.poses
+    first, *rest = cell.job.poses
     through_the_table = replace(first, q=first.q + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0]))
     assert path_clearance(arm, bodies, first.q, through_the_table.q)[0] < 0.0
     kept = clear_poses(cell.scenario, cell.station, [first, through_the_table, *rest], bodies)
-    assert kept == cell.poses
+    assert kept == cell.job.poses
     with pytest.raises(UnreachableScanner, match="Only 1 of 12 calibration poses"):
         clear_poses(cell.scenario, cell.station, [first, through_the_table], bodies)
 
@@ -261,7 +262,7 @@ def test_an_arm_that_stands_elsewhere_goes_home_and_then_does_its_job(tmp_path: 
     scenario = load_scenario("straight_groove", f"{TOLD}\nwelding: {{seam_length_mm: 5.0}}")
     scenario.job.weld = False
     home = np.deg2rad(scenario.home_deg)
-    cell = make_cell(scenario, robot=standing(home + np.array([0.3, 0.1, -0.2, 0.0, 0.1, 0.5])))
+    cell = build_cell(scenario, robot=standing(home + np.array([0.3, 0.1, -0.2, 0.0, 0.1, 0.5])))
     finished = run_cell(cell)
     assert [name for name, _, _ in finished.phases] == ["start", "move_home", "park", "done"]
     assert not finished.held
@@ -271,7 +272,7 @@ def test_an_arm_without_a_free_way_home_is_refused_before_it_moves() -> None:
     scenario = load_scenario("straight_groove", TOLD)
     robot = standing(np.deg2rad(scenario.home_deg) + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0]))
     with pytest.raises(InputError, match=r"^The arm stands at \[190, -51, .*move it by hand near home_deg") as refusal:
-        make_cell(scenario, robot=robot)
+        build_cell(scenario, robot=robot)
     assert str(refusal.value).count(". ") == 0, "one sentence"
 
 
@@ -281,7 +282,7 @@ def test_a_speed_factor_slows_the_moves_and_not_the_weld() -> None:
         scenario = load_scenario("straight_groove", f"{TOLD}\nwelding: {{seam_length_mm: 5.0}}")
         scenario.job.weld, scenario.job.speed_factor = False, factor
         q = np.deg2rad(scenario.home_deg) + np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.5])
-        phases = run_cell(make_cell(scenario, robot=standing(q))).phases
+        phases = run_cell(build_cell(scenario, robot=standing(q))).phases
         durations[factor] = phases[2][1] - phases[1][1]
     assert 1.3 < durations[0.5] / durations[1.0] < 2.0  # the dwell and the settling are not slower
     plan = job_plan(scenario)
@@ -301,7 +302,7 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
             raise KeyboardInterrupt
 
     home = np.deg2rad(scenario.home_deg)
-    found = run_cell(make_cell(scenario, robot=PreparedRobot(load_arm("ur10e"), home, Line())), interrupt)
+    found = run_cell(build_cell(scenario, robot=PreparedRobot(load_arm("ur10e"), home, Line())), interrupt)
     assert closed
     assert found.held
     assert found.reason == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
@@ -324,7 +325,7 @@ def test_an_error_in_the_run_lets_go_of_the_robot() -> None:
     scenario = load_scenario("straight_groove", TOLD)
     home = np.deg2rad(scenario.home_deg)
     with pytest.raises(ValueError, match="broken"):
-        run_cell(make_cell(scenario, robot=PreparedRobot(load_arm("ur10e"), home, Line())), fail)
+        run_cell(build_cell(scenario, robot=PreparedRobot(load_arm("ur10e"), home, Line())), fail)
     assert closed
 
 

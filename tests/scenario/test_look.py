@@ -10,7 +10,7 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
 from tests.browser import Browser, colours
-from weldcal.systems.cell import Cell, make_cell
+from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.motion.operator_panel import HOLD_BUTTON
 from weldcal.systems.scenario.loading import load_scenario
 
@@ -19,7 +19,7 @@ from weldcal.systems.scenario.loading import load_scenario
 def live() -> Iterator[tuple[Meshcat, Cell, Simulator]]:
     """A cell that has just begun to move, shown on this machine only."""
     meshcat = Meshcat(MeshcatParams(host="localhost"))
-    cell = make_cell(load_scenario("s_groove"), seed=0, meshcat=meshcat)
+    cell = build_cell(load_scenario("s_groove"), seed=0, meshcat=meshcat)
     simulator = Simulator(cell.diagram)
     simulator.AdvanceTo(0.4)
     return meshcat, cell, simulator
@@ -42,9 +42,9 @@ def test_a_click_holds_the_job_for_good(live: tuple[Meshcat, Cell, Simulator], b
     )
     for _ in range(100):  # the click travels over a socket: give it simulated time until it has arrived
         simulator.AdvanceTo(simulator.get_context().get_time() + 0.1)
-        if cell.sequencer.job_state(cell.sequencer.GetMyContextFromRoot(simulator.get_context())).command.held:
+        if cell.job.sequencer.job_state(cell.job.sequencer.GetMyContextFromRoot(simulator.get_context())).command.held:
             break
-    command = cell.sequencer.job_state(cell.sequencer.GetMyContextFromRoot(simulator.get_context())).command
+    command = cell.job.sequencer.job_state(cell.job.sequencer.GetMyContextFromRoot(simulator.get_context())).command
     assert command.held
     assert "person" in str(command.reason)
     simulator.AdvanceTo(simulator.get_context().get_time() + 1.0)

@@ -15,17 +15,18 @@ from typer.testing import CliRunner
 from weldcal.calibration.profiler.record import load_record
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated.rendered_profiler import ProfileScan, RenderedProfiler, TorchTouch, drawn_pose
+from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler, drawn_pose
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
-from weldcal.systems.messages import UrStatus
+from weldcal.systems.messages import ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.procedures import runner_of
-from weldcal.tools.commands.profiler.live import ProfilerLive, run_profiler_live
+from weldcal.tools.commands.procedures import RUNNERS, kind_of
+from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.profiler import ProfilerLive
 
 # fewer scans and touches than shipped, and the first 60 mm of the seam
 SHORT = """
@@ -39,13 +40,13 @@ profiler_job:
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> ProfilerLive:
     scenario = load_scenario("profiler_seam", SHORT)
-    assert runner_of(scenario) is run_profiler_live
+    assert RUNNERS[kind_of(scenario)] is run_profiler_live
     options = RunOptions("profiler_seam", tmp_path_factory.mktemp("live"), seed=2, recording=False)
     return run_profiler_live(scenario, options, lambda *_: None)
 
 
 def test_all_stages_are_done_and_nothing_is_lost(live: ProfilerLive) -> None:
-    s = live.run.state
+    s = live.state
     assert (s.phase, s.reason) == ("done", "")
     assert (len(s.edge_scans), len(s.sphere_scans), len(s.touches)) == (10, 8, 6)
     assert len(s.seam_scans) >= 28
@@ -59,9 +60,9 @@ def test_both_poses_lie_within_three_sigma_of_their_prediction(live: ProfilerLiv
 
 
 def test_touches_are_where_tip_and_sphere_met(live: ProfilerLive) -> None:
-    truth, arm = live.cell.station.truth.profiler, live.cell.station.arm
+    truth, arm = live.run.cell.station.truth.profiler, live.run.cell.station.arm
     assert truth is not None
-    tips = [forward_kinematics(arm, q).multiply(truth.p_FTip) for q in live.run.state.touches]
+    tips = [forward_kinematics(arm, q).multiply(truth.p_FTip) for q in live.state.touches]
     off = np.linalg.norm(np.array(tips) - truth.center, axis=1) - truth.radius_m
     # the robot's error of 0.06 mm, and up to a tick of 4 ms at 10 mm/s deep
     assert abs(off.mean() + 0.02e-3) < 4 * 0.06e-3 / np.sqrt(6)
@@ -78,13 +79,13 @@ def test_the_torch_runs_where_the_groove_truly_is(live: ProfilerLive) -> None:
 def test_what_was_measured_is_written_as_the_commands_read_it(live: ProfilerLive, tmp_path: Path) -> None:
     names = {path.name for path in live.folder.iterdir()}
     assert {"edge.npz", "sphere.npz", "seam.npz", "seam.csv", "report.html", "edge", "sphere"} <= names
-    e = live.run.state.edge
+    e = live.state.edge
     assert e is not None
     np.testing.assert_allclose(load_record(live.folder / "edge").translation, e.estimate.translation, atol=1e-12)
     words = ["profiler", "seam", str(live.folder / "seam.npz"), "--calibration", str(live.folder / "sphere")]
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "seam"), "--json"])
     assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout.strip().splitlines()[-1])["found"] == len(live.run.state.seam_scans)
+    assert json.loads(result.stdout.strip().splitlines()[-1])["found"] == len(live.state.seam_scans)
 
 
 @dataclass(eq=False)
@@ -117,8 +118,9 @@ def alone() -> Alone:
     job.edge.scans, job.edge.held_out = 8, 1
     q = np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
     config = RenderedProfiler()
-    room = Room(load_arm("ur10e"), job, q, drawn_pose(config), np.array(job.torch.tip_m), np.array(job.ball.xyz_m))
-    procedure = ProfilerProcedure(room, config, 0)
+    tip, ball = np.array(job.torch.tip_m), np.array(job.ball.xyz_m)
+    planning = PlanningContext(load_arm("ur10e"), job, q, drawn_pose(config), tip, ball)
+    procedure = ProfilerProcedure(planning, config, 0)
     made = Alone(Simulator(procedure), procedure)
     made.tell(
         position=q,
@@ -127,6 +129,7 @@ def alone() -> Alone:
         robot_status=AbstractValue.Make(UrStatus()),
         profile=AbstractValue.Make(ProfileScan()),
         touch=AbstractValue.Make(TorchTouch()),
+        hold=[0.0],
     )
     return made
 
@@ -148,6 +151,14 @@ def test_a_stopped_robot_holds_it_with_its_own_words(alone: Alone) -> None:
     alone.run(0.04)
     assert (alone.state.phase, alone.state.reason) == ("held", "It stopped.")
     assert not alone.procedure.GetOutputPort("creep").Eval(alone.simulator.get_context()).any()
+
+
+def test_a_person_holds_it(alone: Alone) -> None:
+    alone.run(0.1)
+    alone.tell(hold=[1.0])
+    alone.run(0.04)
+    assert alone.state.phase == "held"
+    assert alone.state.reason.startswith("A person held the job")
 
 
 @pytest.mark.parametrize(

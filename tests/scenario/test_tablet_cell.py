@@ -13,16 +13,17 @@ from pydrake.systems.analysis import Simulator
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.cell import make_cell
-from weldcal.systems.jobs.tablet.cell import make_tablet_cell, plan_tablet
+from weldcal.systems.cell import build_cell
 from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.planning import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletPlan, TabletProcedure, TabletState
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import Station
-from weldcal.tools.commands.demo import known_camera
+from weldcal.tools.commands.demo import known_camera, run_scenario
 from weldcal.tools.commands.procedures import kind_of, run_procedure
+from weldcal.tools.commands.tablet.demo import run_tablet_demo
 from weldcal.tools.outcomes.options import RunOptions
 
 # six landmarks and quick descents: half of the shipped scenario's time
@@ -46,7 +47,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory, repository: Path) -> Demo:
     (folder / "short.yaml").write_text(f"{before}{SHORT}\n{after}")
     options = RunOptions(str(folder / "short.yaml"), folder / "out", seed=3, recording=False)
     result = run_procedure(options, lambda *_: None)
-    return Demo(result.summary(), result.folder, result.cell.station)  # type: ignore[attr-defined]
+    return Demo(result.summary(), result.folder, result.run.cell.station)  # type: ignore[attr-defined]
 
 
 def test_every_landmark_is_touched(demo: Demo) -> None:
@@ -194,7 +195,7 @@ UNDER_THE_TABLE = "calibration: {table_z_m: 0.2}"
 )
 def test_a_visit_that_cannot_be_made_is_refused_before_anything_moves(overrides: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        make_tablet_cell(load_scenario("tablet", overrides))
+        build_cell(load_scenario("tablet", overrides))
 
 
 @pytest.mark.parametrize(
@@ -223,10 +224,10 @@ def test_a_scenario_that_makes_no_sense_says_what_to_change(overrides: str, said
 
 def test_each_procedure_is_told_to_use_its_own_command() -> None:
     assert kind_of(load_scenario("tablet")) == "tablet"
-    assert kind_of(load_scenario("s_groove")) == "job"
-    with pytest.raises(InputError, match="weldcal tablet demo"):
-        make_cell(load_scenario("tablet"))
+    assert kind_of(load_scenario("s_groove")) == ""
+    with pytest.raises(InputError, match="run it with weldcal demo"):
+        run_scenario(load_scenario("tablet"), RunOptions("tablet", Path("never")))
     with pytest.raises(InputError, match="weldcal tablet demo"):
         known_camera("tablet")
     with pytest.raises(InputError, match="has no tablet"):
-        make_tablet_cell(load_scenario("straight_groove"))
+        run_tablet_demo(load_scenario("straight_groove"), RunOptions("straight_groove", Path("never")), lambda *_: None)

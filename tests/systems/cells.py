@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.cell import Cell, make_cell
+from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
@@ -54,7 +54,7 @@ def plain_station() -> Station:
 @lru_cache(maxsize=1)
 def weld_only_cell() -> Cell:
     """The whole cell of the S groove with a known camera."""
-    return make_cell(scenario(), 0)
+    return build_cell(scenario(), 0)
 
 
 class Drive:

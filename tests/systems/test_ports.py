@@ -32,9 +32,7 @@ from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFin
 from weldcal.systems.drivers.simulated.rendered_profiler import (
     CheatTorch,
     ProfilerSensor,
-    ProfileScan,
     RenderedProfiler,
-    TorchTouch,
     TouchSensor,
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
@@ -43,15 +41,15 @@ from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigi
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
-from weldcal.systems.jobs.mounting.cell import mounting_scene
+from weldcal.systems.jobs.mounting.job import mounting_scene
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.jobs.profiler.config import ProfilerJob
-from weldcal.systems.jobs.profiler.planning_context import Room
+from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.jobs.profiler.procedure import ProfilerProcedure, ProfilerState
 from weldcal.systems.jobs.profiler.robot_error import RobotError
-from weldcal.systems.jobs.tablet.cell import plan_tablet
 from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
+from weldcal.systems.jobs.tablet.planning import plan_tablet
 from weldcal.systems.jobs.tablet.procedure import TabletProcedure, TabletState
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator, Deformation
 from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner, NextPose
@@ -66,7 +64,9 @@ from weldcal.systems.messages import (
     Image,
     JobCommand,
     PlannedSeam,
+    ProfileScan,
     Scan,
+    TorchTouch,
     UrStatus,
 )
 from weldcal.systems.motion.command_arbiter import CommandArbiter
@@ -94,10 +94,10 @@ def profiler_fixture() -> ProfilerFixture:
     return draw_fixture(X, 0.0, 0.0, ProfilerJob(), np.random.default_rng(0), 0.0, None, None)
 
 
-def profiler_room() -> Room:
+def profiler_planning() -> PlanningContext:
     """What a procedure without a seam is told."""
     job = ProfilerJob(stages=["edge"])
-    return Room(the_arm(), job, Q_HOME, X, np.array(job.torch.tip_m), np.array(job.ball.xyz_m))
+    return PlanningContext(the_arm(), job, Q_HOME, X, np.array(job.torch.tip_m), np.array(job.ball.xyz_m))
 
 
 MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
@@ -143,7 +143,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     TouchSensor: lambda: TouchSensor(TouchPair(GeometryId.get_new_id(), GeometryId.get_new_id()), 0.004),
     CheatTorch: lambda: CheatTorch(profiler_fixture(), BodyIndex(7)),
     RobotError: lambda: RobotError(the_arm(), 6e-5, 0),
-    ProfilerProcedure: lambda: ProfilerProcedure(profiler_room(), RenderedProfiler(), 0),
+    ProfilerProcedure: lambda: ProfilerProcedure(profiler_planning(), RenderedProfiler(), 0),
     TabletDigitizer: lambda: TabletDigitizer(
         SimulatedTablet(), 5256.0, {GeometryId.get_new_id(), GeometryId.get_new_id()}, X, 0
     ),
@@ -162,6 +162,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "robot_status": UrStatus,
         "profile": ProfileScan,
         "touch": TorchTouch,
+        "hold": 1,
         "job": JobCommand,
         "creep": 6,
         "trigger": 1,
@@ -186,6 +187,8 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "robot_status": UrStatus,
         "robot_status_2": UrStatus,
         "status": MountingStatus,
+        "hold": 1,
+        "position_measured": 6,
         "job": JobCommand,
         "job_2": JobCommand,
         "trigger": 1,

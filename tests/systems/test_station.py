@@ -21,7 +21,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Image, JobCommand, Scan
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.loading import scenario_class
 from weldcal.systems.station import Station, apply_driver_config, make_station
 
 INPUTS = {"ur10e.velocity_command", "scanner.trigger", "finger_camera.streaming"}
@@ -89,7 +89,7 @@ def test_a_driver_may_say_which_arm_there_is_and_where_it_stands(monkeypatch: py
     monkeypatch.setattr(
         simulated_ur, "PrepareRobot", lambda *arguments: asked.append(arguments) or robot, raising=False
     )
-    bare = Scenario(scanner=NoDevice(), finger_camera=NoDevice(), home_deg=np.rad2deg(Q_HOME).tolist())
+    bare = scenario_class()(scanner=NoDevice(), finger_camera=NoDevice(), home_deg=np.rad2deg(Q_HOME).tolist())
     station = make_station(bare, 0)
     assert [type(a) for a in asked[0]] == [SimulatedUr, type(the_arm())]
     assert (station.arm, station.q_start is robot.q_start, station.pace) == (robot.arm, True, 0.5)
@@ -137,7 +137,7 @@ def test_the_seed_draws_the_same_world_wherever_the_arm_stands() -> None:
 
 def test_a_simulated_driver_without_a_world_says_so() -> None:
     build = StationBuild(DiagramBuilder(), the_arm(), TOOL, Q_HOME, np.random.default_rng(0))
-    with pytest.raises(RuntimeError, match="needs a simulated world"):
+    with pytest.raises(RuntimeError, match="needs a SimulatedWorld in the station"):
         apply_driver_config(SimulatedUr(), build)
 
 

@@ -30,7 +30,7 @@ def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progres
         InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
     """
     start = time.monotonic()
-    finished = run_job(scenario, options, progress)
+    finished = run_job(scenario, options, progress, "mounting")
     run, job = finished.run, finished.cell.job
     progress("write", 0.9)
     status, result = job.status(run.root), None

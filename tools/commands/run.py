@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 
+from weldcal.models.errors import InputError
 from weldcal.systems.cell import Cell, build_cell
+from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.runner import Progress, Run, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -43,12 +45,17 @@ class FinishedRun:
             write_atomic(folder / "recording.html", self.meshcat.StaticHtml())
 
 
-def run_job(scenario: Scenario, options: RunOptions, progress: Progress) -> FinishedRun:
-    """Build the cell and run its job to the end.
+def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: str | None = None) -> FinishedRun:
+    """Build the cell and run its job to the end; `key` is that of the job that the scenario must describe, None: any.
 
     Raises:
-        InputError, UnreachableScanner, RobotRefused: see chosen_robot and build_cell; nothing has been written or moved.
+        InputError: it is another job. UnreachableScanner, RobotRefused: see chosen_robot and build_cell; nothing has been written or moved.
     """
+    found = job_of(scenario).key
+    if key and found != key:
+        raise InputError(f"This scenario has no {key} part: write {key}: {{}} in it, or run it with weldcal demo.")
+    if key is not None and found != key:
+        raise InputError(f"This scenario has a {found} part, so there is no weld in it: run it with weldcal demo.")
     if options.speed_factor is not None:
         scenario.job.speed_factor = options.speed_factor
         check_scenario(scenario)

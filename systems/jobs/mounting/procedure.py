@@ -57,7 +57,7 @@ class MountingProcedure(LeafSystem):
     ) -> None:
         super().__init__()
         self._plan, self._scans, self._kept_aside = tuple(plan), scans, kept_aside
-        self._home, self._timeout_s, self._maximum_time_s = home, timeout_s, maximum_time_s
+        self.home, self._timeout_s, self._maximum_time_s = home, timeout_s, maximum_time_s
         self._settled = [self.DeclareVectorInputPort(n, 1) for n in ("settled_goal", "settled_goal_2")]
         self._robots = [
             self.DeclareAbstractInputPort(n, AbstractValue.Make(UrStatus())) for n in ("robot_status", "robot_status_2")
@@ -85,7 +85,7 @@ class MountingProcedure(LeafSystem):
         now = context.get_time()
         if s.phase in ENDS:
             return s
-        for port in self._robots[: 1 if self._home[1] is None else 2]:
+        for port in self._robots[: 1 if self.home[1] is None else 2]:
             robot: UrStatus = port.Eval(context)
             if not robot.ready:
                 reason = robot.fault or "The robot does not obey velocity commands."
@@ -98,7 +98,7 @@ class MountingProcedure(LeafSystem):
             reason = f"The job took longer than its {self._maximum_time_s:.0f} s; allow more with job.maximum_time_s."
             return replace(s, phase="held", since=now, reason=reason)
         if s.phase == "start":
-            if not stands_at(self._position.Eval(context), self._home[0]):
+            if not stands_at(self._position.Eval(context), self.home[0]):
                 return _go(s, self._homeward(), "", now)
             return self._visit(s, 0, now)
         if s.phase == "move":
@@ -137,8 +137,8 @@ class MountingProcedure(LeafSystem):
         return _go(replace(s, visit=k, purpose="verify" if aside else "calibrate"), route, label, now)
 
     def _homeward(self) -> tuple[tuple[int, Array], ...]:
-        first = ((0, self._home[0]),)
-        return first if self._home[1] is None else (*first, (1, self._home[1]))
+        first = ((0, self.home[0]),)
+        return first if self.home[1] is None else (*first, (1, self.home[1]))
 
     def _job(self, context: Context, output: Any, arm: int) -> None:
         s: MountingState = context.get_abstract_state(self._state).get_value()

@@ -13,7 +13,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.loading import scenario_class
 from weldcal.systems.station import make_station
 
 TICK_S = 0.002
@@ -23,7 +23,7 @@ SPEEDS = "ur10e.velocity_command"
 @pytest.fixture
 def drive() -> Drive:
     """The arm with its welding tool and nothing else."""
-    scenario = Scenario(scanner=NoDevice(), finger_camera=NoDevice(), home_deg=np.rad2deg(Q_HOME).tolist())
+    scenario = scenario_class()(scanner=NoDevice(), finger_camera=NoDevice(), home_deg=np.rad2deg(Q_HOME).tolist())
     return Drive(make_station(scenario, 0))
 
 
@@ -179,5 +179,5 @@ def test_an_arm_that_repeats_to_five_hundredths_stands_so_far_from_where_it_says
 def test_an_arm_that_misses_by_centimetres_is_refused() -> None:
     with pytest.raises(InputError, match=r"robot\.repeatability_mm must be from 0 to 1, and it is 30"):
         make_station(
-            Scenario(robot=SimulatedUr(repeatability_mm=30.0), scanner=NoDevice(), finger_camera=NoDevice()), 0
+            scenario_class()(robot=SimulatedUr(repeatability_mm=30.0), scanner=NoDevice(), finger_camera=NoDevice()), 0
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,7 @@ from weldcal.systems.drivers.simulated.rendered_scanner import (
     darkness,
     random_pose_error,
 )
-from weldcal.systems.drivers.simulated.world import SCANNER_RENDERER
+from weldcal.systems.drivers.simulated.world import SCANNER_RENDERER, SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 from weldcal.systems.scenario.loading import load_scenario
@@ -46,14 +45,6 @@ X_BC = RigidTransform(RollPitchYaw(np.pi, 0.0, 0.0), [0.0, 0.0, DISTANCE_M])
 X_BPlate = RigidTransform(
     RollPitchYaw(0.35, 0.30, 0.20), np.zeros(3)
 )  # tilted by 26 degrees, its edges askew in the image
-
-
-@dataclass
-class _OnlyAScene:
-    """As much of a simulated world as the scanner's driver touches."""
-
-    scene_graph: SceneGraph
-    scanner_view: PictureScene
 
 
 def a_scene(builder: DiagramBuilder) -> SceneGraph:
@@ -75,8 +66,8 @@ def scan_of_the_plate(width: int = 824, height: int = 616) -> Scan:
     config = RenderedScanner("ideal", width, height, [0.0, 0.0, DISTANCE_M], [180.0, 0.0, 0.0], 0.0, 0.0, 0.0)
     scene = a_scene(builder)
     still: Any = None  # nobody moves in it
-    world: Any = _OnlyAScene(scene, PictureScene(scene, SCANNER_RENDERER, {}, still))
-    build = StationBuild(builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), world)
+    world = SimulatedWorld(still, scene, still, None, (), PictureScene(scene, SCANNER_RENDERER, {}, still), None)
+    build = StationBuild(builder, the_arm(), WeldingTool(), Q_HOME, np.random.default_rng(0), parts=(world,))
     assert ApplyDriverConfig(config, build).IsNearlyEqualTo(X_BC, 1e-12)
     builder.ExportInput(build.inputs["scanner.trigger"], "trigger")
     builder.ExportOutput(build.outputs["scanner.scan"], "scan")

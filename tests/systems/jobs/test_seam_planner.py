@@ -11,8 +11,8 @@ from pydrake.systems.analysis import Simulator
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces import make_workpiece
-from weldcal.systems.cell import servo_config
 from weldcal.systems.jobs.weld.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
+from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.seam.curve import SeamCurve

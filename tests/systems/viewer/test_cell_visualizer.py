@@ -18,7 +18,7 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
 from weldcal.models.workpieces import make_workpiece
-from weldcal.systems.cell import Cell, make_cell
+from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, PlannedSeam, Scan
@@ -39,7 +39,7 @@ def meshcat() -> Meshcat:
 @pytest.fixture(scope="module")
 def recorded(meshcat: Meshcat) -> Cell:
     """The S groove's cell after its first 0.3 s, recorded."""
-    cell = make_cell(scenario(), 0, meshcat)
+    cell = build_cell(scenario(), 0, meshcat)
     meshcat.StartRecording(frames_per_second=10.0, set_visualizations_while_recording=False)
     simulator = Simulator(cell.diagram)
     simulator.AdvanceTo(0.3)

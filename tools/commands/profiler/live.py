@@ -32,7 +32,7 @@ def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progres
     Raises:
         InputError, RobotRefused: see run_job; nothing has been written or moved. A run that was held is a result too.
     """
-    finished = run_job(scenario, options, progress)
+    finished = run_job(scenario, options, progress, "profiler_job")
     progress("measure and write", 0.97)
     live = ProfilerLive(options, finished.run, live_outcome(finished.run), finished.robot)
     write_live(live, finished)

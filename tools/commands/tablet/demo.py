@@ -64,7 +64,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
         InputError, RobotRefused: the scenario or the options cannot be done; nothing has been written or moved.
         LandmarksNotFound: the picture does not show the page. A visit that was held is a result too.
     """
-    finished = run_job(scenario, options, progress)
+    finished = run_job(scenario, options, progress, "tablet")
     run = finished.run
     progress("calibrate and write", 0.96)
     options.out.mkdir(parents=True, exist_ok=True)
