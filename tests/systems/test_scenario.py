@@ -238,7 +238,10 @@ def test_one_of_everything_sets_every_option_and_none_is_lost(everything: Scenar
 
 
 def test_one_of_everything_survives_being_written_and_read_again(everything: Scenario) -> None:
-    assert yaml_load_typed(schema=scenario_class(), data=yaml_dump_typed(everything, schema=scenario_class())) == everything
+    assert (
+        yaml_load_typed(schema=scenario_class(), data=yaml_dump_typed(everything, schema=scenario_class()))
+        == everything
+    )
 
 
 def test_a_scenario_is_one_procedure(everything: Scenario) -> None:
