@@ -16,7 +16,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.eye_on_base.scanner_model import correction_from_document
+from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.geometry.rigid import rotation_vector
 from weldcal.models.errors import InputError
 

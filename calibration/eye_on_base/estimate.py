@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.geometry.rigid import skew
 
 Array = NDArray[np.float64]

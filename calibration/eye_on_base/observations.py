@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
@@ -74,6 +75,15 @@ def see_flanges(
         clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
     return Sightings(tuple(observations), fits, patterns, clouds, tuple(refused))
+
+
+def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
+    """An observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
+    return replace(
+        o,
+        p_CR=correction.points(o.p_CR),
+        n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C),
+    )
 
 
 def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, seed: int, *, whole: bool) -> FlangeFit:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.scanner_model import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation

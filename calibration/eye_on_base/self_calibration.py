@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import (
     CIRCLE_OWN,
     CorrectionEstimate,
     from_holes,
     from_motion,
 )
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -196,7 +197,7 @@ def apply_self_calibration(
     scanner = self_calibrate(good, patterns, rigid.held_out.position_m[rigid.inliers], seed=seed)
     if scanner.found is None or scanner.accepted is None:
         return scanner, observations, rigid
-    corrected = [scanner.accepted.observation(o) for o in observations]
+    corrected = [corrected_observation(scanner.accepted, o) for o in observations]
     found = scanner.found
     assert found.X_BC is not None
     estimate = replace(
@@ -223,7 +224,7 @@ def held_out_errors(
             X, correction = calibrate_corrected(rest, patterns, seed=seed, order=order, start=start)
         except InputError:
             continue
-        seen = [correction.observation(o)]
+        seen = [corrected_observation(correction, o)]
         errors[i], tilts[i] = float(position_errors(X, seen)[0]), float(tilt_errors(X, seen)[0])
     return errors, tilts
 

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Cost, algorithm1_start, algorithm1_step, translation_cost
@@ -69,7 +70,7 @@ def k_fold(
                 )
             except InputError:
                 continue
-            errors[r, test] = position_errors(X, [correction.observation(observations[i]) for i in test])
+            errors[r, test] = position_errors(X, [corrected_observation(correction, observations[i]) for i in test])
     return errors
 
 

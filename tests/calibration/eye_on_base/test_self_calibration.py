@@ -9,8 +9,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.stats import chi2
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import with_scanner
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.self_calibration import (
     SelfCalibration,
     apply_self_calibration,

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.stats import binom, chi2
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import CoplanarPoses
 from weldcal.calibration.eye_on_base.estimate import with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -110,12 +109,6 @@ class ScannerCorrection:
             ..., 0
         ]
         return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
-
-    def observation(self, o: Observation) -> Observation:
-        """The sighting as a scanner without this error would have made it."""
-        return replace(
-            o, p_CR=self.points(o.p_CR), n_C=None if o.n_C is None else self.normals(np.asarray(o.p_CR), o.n_C)
-        )
 
     def document(self) -> dict[str, Any]:
         """As calibration.yaml and the JSON object hold it; bends only where there are any."""
