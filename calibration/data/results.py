@@ -17,7 +17,7 @@ from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import correction_from_document
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]

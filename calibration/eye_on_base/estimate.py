@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import skew
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -15,7 +15,7 @@ from weldcal.calibration.eye_on_base.solve import USUAL_SPREAD_M, USUAL_TILT_RAD
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.planning.observability import unobservable_sentences
 
 Array = NDArray[np.float64]

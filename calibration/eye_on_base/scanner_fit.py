@@ -15,7 +15,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 
 Array = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ def from_motion(
         information = J.T @ (w[:, None] * J) + np.diag(prior**2)
         unknown = np.concatenate([np.zeros(6), change])
         step = -np.linalg.solve(information, J.T @ (w * e) + prior**2 * unknown)
-        dR = exp_rotation(step[:3]).matrix()
+        dR = exp_rotation(step[:3])
         R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:6]
         change = change + step[6:]
         if k in (2, 4, 6, 8):  # robust spreads of what the unknowns leave, each kind by its own redundancy

@@ -15,7 +15,8 @@ from scipy.stats import f as f_distribution
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
+from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets, fit_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 
 __all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
@@ -290,7 +291,7 @@ def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0, iterati
         g = g + np.einsum("nki,n,nk->i", J_n, w_n, e_n)
         N = N_p + N_n
         step = -np.linalg.lstsq(N, g, rcond=1e-12)[0]
-        dR = exp_rotation(step[:3]).matrix()
+        dR = exp_rotation(step[:3])
         R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:]
         R = RotationMatrix.ProjectToRotationMatrix(R).matrix()
         # Helmert's simplified estimator: each group's weighted square sum over its own redundancy

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from weldcal.calibration.flange.rays import RayModel
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -52,39 +54,6 @@ def plane_axes(normal: Array) -> tuple[Array, Array]:
     length = (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]) ** 0.5
     a, b, c = e[0] / length, e[1] / length, e[2] / length
     return np.array([a, b, c]), np.array([y * c - z * b, z * a - x * c, x * b - y * a])
-
-
-class RayModel:
-    """Viewing rays of an organised cloud as a smooth function of the pixel: x/z and y/z are quadratics in (u, v).
-
-    Exact for a pinhole scanner, whose noise moves a point along its ray; the quadratic absorbs a lens locally.
-    """
-
-    def __init__(self, points: Array, valid: Mask) -> None:
-        v, u = np.nonzero(valid)
-        p = points[v, u]
-        stride = max(1, len(u) // 1500)
-        self._origin = np.array([u.mean(), v.mean()])
-        self._scale = max(float(np.ptp(u)), float(np.ptp(v)), 1.0)
-        basis = self._basis(u[::stride], v[::stride])
-        ray = p[::stride, :2] / p[::stride, 2:]
-        self._coefficients = np.linalg.lstsq(basis, ray, rcond=None)[0]
-
-    def _basis(self, u: Array | NDArray[np.intp], v: Array | NDArray[np.intp]) -> Array:
-        a, b = (u - self._origin[0]) / self._scale, (v - self._origin[1]) / self._scale
-        return np.column_stack([np.ones(len(a)), a, b, a * a, a * b, b * b])
-
-    def grid(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Rays x/z and y/z, each (len(v), len(u)), of a whole grid of pixels."""
-        a, b = (u - self._origin[0]) / self._scale, ((v - self._origin[1]) / self._scale)[:, None]
-        c = self._coefficients.T
-        x, y = ((k[0] + k[1] * a + k[3] * a * a) + b * (k[2] + k[4] * a) + k[5] * (b * b) for k in c)
-        return x, y
-
-    def on_plane(self, u: Array, v: Array, point: Array, normal: Array) -> Array:
-        """Points (N, 3) m where the rays through pixels (u, v) meet a plane."""
-        ray = np.column_stack([self._basis(u, v) @ self._coefficients, np.ones(len(u))])
-        return np.asarray(ray * (float(point @ normal) / (ray @ normal))[:, None])
 
 
 def organised_edges(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> EdgePoints:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from weldcal.calibration.flange.rays import RayModel
 from weldcal.calibration.flange.rim import (
     EdgePoints,
     FacePixels,
-    RayModel,
     connected_parts,
     connected_pixels,
     face_pixels,

@@ -11,14 +11,13 @@ from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.flange.face import Face, FlangeFitConfig
 from weldcal.calibration.flange.rim import plane_axes, sector_count
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
-from weldcal.calibration.geometry.plane import PlaneFit
-from weldcal.calibration.geometry.plane_moments import weighted_moments
+from weldcal.calibration.geometry.plane import PlaneFit, weighted_moments
+from weldcal.calibration.geometry.robust import MAD, TUKEY
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_TUKEY, _MAD = 4.685, 1.4826
 _FEW = 1200  # points that find the plane and the outline; all of them then measure
 _TRIPLES = 24
 _ROUGH_SECTORS = 60
@@ -111,14 +110,14 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
     votes = (off < config.hypothesis_tolerance_m).sum(axis=1) * (length > 1e-5)
     best = int(np.argmax(votes))
     normal, at = normals[:, best], a[:, best]
-    scale = config.hypothesis_tolerance_m / _TUKEY * 2.0
+    scale = config.hypothesis_tolerance_m / TUKEY * 2.0
     points, values = Q, np.ones(3)
     for k in range(3):
         d = normal @ points - normal @ at
         if k:
             spread = np.abs(d if k < 2 else d[:: max(1, d.size // _FEW)])
-            scale = max(_MAD * float(np.partition(spread, len(spread) // 2)[len(spread) // 2]), 2e-5)
-        share, at, moments = weighted_moments(points, d, _TUKEY * scale)
+            scale = max(MAD * float(np.partition(spread, len(spread) // 2)[len(spread) // 2]), 2e-5)
+        share, at, moments = weighted_moments(points, d, TUKEY * scale)
         if not share > 0.3:
             return None, d
         values, vectors = np.linalg.eigh(moments)
@@ -129,7 +128,7 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
         return None, d
     exact = vectors[:, 0]
     d = normal @ P - normal @ at
-    good = np.abs(d) < _TUKEY * scale
+    good = np.abs(d) < TUKEY * scale
     count = int(np.count_nonzero(good))
     inside = d * good
     rms = float(np.sqrt(inside @ inside / max(count, 1)))

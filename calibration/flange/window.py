@@ -20,7 +20,8 @@ from weldcal.calibration.flange.face import (
     lowered_by,
     thickness,
 )
-from weldcal.calibration.flange.rim import RayModel, plane_axes
+from weldcal.calibration.flange.rays import RayModel
+from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
 from weldcal.models.flanges import FlangeStandard

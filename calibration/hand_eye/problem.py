@@ -8,14 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.geometry.se3 import (
-    IDENTITY,
-    inverse,
-    left_jacobian_inverse,
-    log_rotation,
-    moved,
-)
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse, left_jacobian_inverse, log_rotation, moved, skew
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import f as fisher
 
 from weldcal.calibration.errors import UndeterminedPoses
-from weldcal.calibration.geometry.se3 import IDENTITY, inverse
+from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate, solve
 from weldcal.calibration.hand_eye.determinacy import (
     Diversity,
@@ -121,8 +121,6 @@ class HandEyeResult:
 
 def pose_difference(estimate: RigidTransform, truth: RigidTransform) -> Array:
     """Change (6,) [rotation; translation] on the parent's side that moves the estimate to the truth."""
-    from weldcal.calibration.geometry.se3 import difference
-
     return difference(np.asarray(estimate.GetAsMatrix4()), np.asarray(truth.GetAsMatrix4()))
 
 

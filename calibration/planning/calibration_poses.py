@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
@@ -197,8 +197,8 @@ def _random_feature(
     # uniform over the cap of directions within theta_max of the line of sight
     tilt = float(np.arccos(rng.uniform(np.cos(config.theta_max_rad), 1.0)))
     side = np.cross(sight, [1.0, 0.0, 0.0])
-    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight).matrix() @ (side / np.linalg.norm(side))
-    normal = exp_rotation(tilt * side).matrix() @ sight
+    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ (side / np.linalg.norm(side))
+    normal = exp_rotation(tilt * side) @ sight
     x = np.cross([0.0, 1.0, 0.0], normal)
     x /= np.linalg.norm(x)
     R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal])) @ RotationMatrix.MakeZRotation(

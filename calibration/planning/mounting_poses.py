@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.problem import linearise
 from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene

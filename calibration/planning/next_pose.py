@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, skew
 from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.problem import Problem, State, linearise

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
-from weldcal.calibration.geometry.rigid import rotation_vector, skew
+from weldcal.calibration.geometry.se3 import rotation_vector, skew
 
 Array = NDArray[np.float64]
 

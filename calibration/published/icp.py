@@ -8,12 +8,12 @@ from typing import Literal, Protocol
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.flange.unobservable import COMPONENTS, blind_components, information, sigmas, surface_normals
-from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
+from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 
@@ -181,7 +181,7 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     seen = E_R.inverse()
     value = np.concatenate([rotation_vector(seen.rotation()), seen.translation()])
     value[[name in blind for name in COMPONENTS]] = 0.0
-    correction = X_RC.inverse() @ RigidTransform(exp_rotation(value[:3]), value[3:]).inverse() @ X_RC
+    correction = X_RC.inverse() @ RigidTransform(RotationMatrix(exp_rotation(value[:3])), value[3:]).inverse() @ X_RC
     fitness, rmse = float(result.fitness), float(result.inlier_rmse)
     return VerificationError(value, correction, fitness, rmse, blind, sigmas(matrix, noise))
 
@@ -212,7 +212,7 @@ def sight(
         for sign in (1.0, -1.0):
             d = np.zeros(6)
             d[k] = sign * size
-            D_R = RigidTransform(exp_rotation(d[:3]), d[3:])
+            D_R = RigidTransform(RotationMatrix(exp_rotation(d[:3])), d[3:])
             moved = verification.X_BR @ D_R @ verification.X_BR.inverse() @ X_BC
             reported.append(icp_error(moved, verification).value[k])
         share[k] = (reported[0] - reported[1]) / (2.0 * size)

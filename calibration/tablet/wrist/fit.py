@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import least_squares
 
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import check_layout, check_turns
@@ -212,7 +212,7 @@ def _refine(
 
 def _move(X: RigidTransform, x: Array) -> RigidTransform:
     """(exp(x_0..2) R, p + x_3..5)."""
-    return RigidTransform(exp_rotation(x[:3]) @ X.rotation(), X.translation() + x[3:])
+    return RigidTransform(RotationMatrix(exp_rotation(x[:3])) @ X.rotation(), X.translation() + x[3:])
 
 
 def _open_directions(p_FP: Array, pen_covariance: Array, spread: float) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.base_circle import fit_base_circle
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.hand_eye.stated_noise import information_of, with_stated_noise

@@ -21,7 +21,7 @@ from weldcal.calibration.eye_on_base.self_calibration import (
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 WRONG = ScannerCorrection(1.003, (0.015, -0.01))
