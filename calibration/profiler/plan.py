@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
 

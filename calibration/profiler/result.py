@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.errors import DegenerateMotion
-from weldcal.calibration.profiler.motion import Floats, skew
+from weldcal.calibration.profiler.motion import Floats
 
 VAGUE_M = 0.02  # one sigma of a direction from which on there is no calibration
 LEVER_M = 0.1  # a turn is weighed against a shift at this distance from the flange

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewRotations, TooFewTranslations
 from weldcal.calibration.profiler.motion import (
     FlangePoses,
@@ -18,7 +19,6 @@ from weldcal.calibration.profiler.motion import (
     checked_points,
     rotation_axes_spread,
     rotation_groups,
-    skew,
 )
 from weldcal.models.errors import InputError
 

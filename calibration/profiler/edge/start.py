@@ -10,8 +10,9 @@ import itertools
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew, turned
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, turned
 
 ITERATIONS = 60
 SETTLED = 1e-6  # of the cost, in one step: the reprojection goes on from there
