@@ -43,11 +43,6 @@ class PlanarPath:
         """Arc length from the first to the last piece's end, m."""
         return sum(length for length, _ in self.pieces)
 
-    @property
-    def tightest_radius_m(self) -> float:
-        """Smallest radius of any piece, m (infinite for straight paths)."""
-        return min((1.0 / abs(k) for _, k in self.pieces if k != 0.0), default=math.inf)
-
     def at(self, s: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Points (N,2) and headings (N,) at arc lengths s (N,), exact on every piece."""
         s = np.atleast_1d(np.asarray(s, dtype=np.float64))

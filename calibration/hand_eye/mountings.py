@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.hand_eye.problem import Problem, State
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.hand_eye.problem import Problem
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -186,29 +185,6 @@ def problem_of(mounting: Mounting, sightings: Sequence[Sighting], known: dict[st
         covariance = np.array([c for c in stated if c is not None], dtype=float)
     free = tuple(k in mounting.unknowns and k not in known for k in "XYZ")
     return Problem(F, G, H, full, normal, covariance, (free[0], free[1], free[2]))
-
-
-def calibrate_mounting(
-    configuration: str,
-    sightings: Sequence[Sighting],
-    *,
-    known: dict[str, RigidTransform] | None = None,
-    config: HandEyeConfig | None = None,
-) -> HandEyeResult:
-    """Calibrate a mounting from sightings of any kind together: points, points with normals, full poses.
-
-    ``known``: letters (Y, Z) of poses that are given rather than sought; the paper's method takes the flange or the circle
-    of the base mounting as the target, whose place the robot's drawing states. Raises as solve_problem, and InputError.
-    """
-    mounting = get_mounting(configuration)
-    known = known or {}
-    for k in known:
-        if k not in mounting.unknowns:
-            raise InputError(f"{configuration} has no unknown '{k}'; it has {', '.join(mounting.unknowns)}.")
-    problem = problem_of(mounting, sightings, known)
-    given = [np.asarray(known[k].GetAsMatrix4()) if k in known else IDENTITY for k in "XYZ"]
-    state: State = (given[0], given[1], given[2])
-    return solve_problem(problem, state, config=config, equation=mounting.equation, labels=mounting.labels)
 
 
 def _frame_with_z(z: Array) -> Array:

@@ -89,7 +89,7 @@ def plan_calibration_poses(
         raise InputError("A calibration needs at least 4 poses: ask for 4 or more.")
     config = config or PlannerConfig()
     pool, why = _candidates(arm, X_FR, X_BC_guess, scanner, q_start, config, tool)
-    chosen = _greedy(pool, [], n, X_BC_guess, config)
+    chosen = _greedy(pool, n, X_BC_guess, config)
     if len(chosen) < n:
         raise UnreachableScanner(_explain(why, len(chosen), n))
     p = np.array([c.X_BR.translation() for c in chosen])
@@ -98,27 +98,6 @@ def plan_calibration_poses(
             "The poses that the arm can take before the scanner lie in one plane; move the scanner closer to the arm."
         )
     return chosen
-
-
-def next_best_pose(
-    arm: ArmModel,
-    X_FR: RigidTransform,
-    X_BC: RigidTransform,
-    scanner: ScannerPreset,
-    taken: Sequence[RigidTransform],
-    *,
-    q_start: Array,
-    config: PlannerConfig | None = None,
-    tool: Sequence[Capsule] = (),
-) -> PlannedPose:
-    """The pose that adds most to the feature poses X_BR already scanned (``taken``); same limits and errors
-    as above."""
-    config = config or PlannerConfig()
-    pool, why = _candidates(arm, X_FR, X_BC, scanner, q_start, config, tool)
-    chosen = _greedy(pool, list(taken), 1, X_BC, config)
-    if not chosen:
-        raise UnreachableScanner(_explain(why, 0, 1))
-    return chosen[0]
 
 
 def predicted_sigma(
@@ -257,18 +236,16 @@ def _sigma_at_work(information: Array) -> float:
     return float(np.sqrt(np.trace(np.linalg.inv(information)[3:6, 3:6])))
 
 
-def _greedy(
-    pool: list[PlannedPose], taken: list[RigidTransform], n: int, X_BC: RigidTransform, config: PlannerConfig
-) -> list[PlannedPose]:
+def _greedy(pool: list[PlannedPose], n: int, X_BC: RigidTransform, config: PlannerConfig) -> list[PlannedPose]:
+    """The ``n`` poses of the pool that in turn add most to the log determinant of the information, apart from each other."""
     if not pool:
         return []
-    work = _work_point(config, X_BC, taken + [c.X_BR for c in pool])
+    work = _work_point(config, X_BC, [c.X_BR for c in pool])
     # what is believed before the first scan: weak, so that four poses already span space; the bias is known to about 1
     # mm
-    prior = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
-    total = prior + sum((_information(X, X_BC, work, config) for X in taken), np.zeros((9, 9)))
+    total = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
     gains = [_information(c.X_BR, X_BC, work, config) for c in pool]
-    places = [np.asarray(X.translation()) for X in taken]
+    places: list[Array] = []
     chosen: list[PlannedPose] = []
     free = set(range(len(pool)))
     while len(chosen) < n and free:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.se3 import exp_rotation, skew
-from weldcal.calibration.hand_eye.linearisation import inverse_information
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.hand_eye.problem import linearise
 from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
@@ -102,13 +101,6 @@ def prior(scene: MountingScene) -> Array:
     unknowns = len(scene.mounting.unknowns) - len(scene.known)
     each = [1.0 / _PRIOR[0] ** 2] * 3 + [1.0 / _PRIOR[1] ** 2] * 3
     return np.diag(each * unknowns + [1.0 / _BIAS_M**2] * 3)
-
-
-def sigma_at_work(scene: MountingScene, total: Array) -> float:
-    """Predicted standard deviation (3-D, m) of a point at the scanner's best distance, in the frame that carries it."""
-    C = inverse_information(total)[:6, :6]
-    J = np.hstack([-skew(scene.X_LC.rotation().matrix() @ work_point(scene)), np.eye(3)])
-    return float(np.sqrt(max(float(np.trace(J @ C @ J.T)), 0.0)))
 
 
 def work_point(scene: MountingScene) -> Array:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.errors import DegenerateMotion
 from weldcal.calibration.profiler.motion import Floats
 
@@ -42,11 +41,6 @@ class ProfilerEstimate:
     def X_FS(self) -> RigidTransform:
         """The same as a transform."""
         return RigidTransform(RotationMatrix(self.rotation), self.translation)
-
-    def mapped_covariance(self, x_m: float, z_m: float) -> Floats:
-        """Covariance (3, 3) m^2 in F of where a profile point (x, z) lies, by the calibration's own uncertainty alone."""
-        J = np.hstack([-skew(self.rotation @ np.array([x_m, 0.0, z_m])), np.eye(3)])
-        return np.asarray(J @ self.covariance @ J.T)
 
 
 def worst_direction(normal_matrix: Floats) -> str:

@@ -48,11 +48,6 @@ class PlanarFit:
         """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
         return hand_over(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
 
-    def touch_covariance(self, rays: Array, theta_rad: Array) -> Array:
-        """Covariance (m, 2, 2) m^2 of those positions, of plane motion and pen."""
-        J = _jacobian(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
-        return np.asarray(J @ self.covariance @ np.swapaxes(J, 1, 2))
-
 
 @dataclass(frozen=True)
 class PlanarConfig:

@@ -54,11 +54,6 @@ class LinearFit:
         """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
         return np.asarray((_design(rays.T, theta_rad) @ self.parameters).T)
 
-    def touch_covariance(self, rays: Array, theta_rad: Array) -> Array:
-        """Covariance (m, 2, 2) m^2 of those positions, of the calibration alone."""
-        A = np.swapaxes(_design(rays.T, theta_rad), 0, 1)
-        return np.asarray(A @ self.covariance @ np.swapaxes(A, 1, 2))
-
 
 def _design(rays: Array, theta_rad: Array) -> Array:
     """(2, n, 6): rows of x, then of y, for rays (2, n)."""

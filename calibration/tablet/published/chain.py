@@ -40,11 +40,6 @@ class Landmarks:
     correction: Array
 
 
-def parameter_names(model: Model) -> tuple[str, ...]:
-    """Names of a model's twelve parameters."""
-    return HTM_NAMES if model == "htm" else DH_NAMES
-
-
 def search_range(model: Model) -> Array:
     """Search range (12, 2) of a model's parameters: Tables 5 and 6, mm and degrees."""
     return HTM_RANGE if model == "htm" else DH_RANGE

@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tests.places import SHARED_DATA
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import (
     ArcNotFound,
@@ -93,7 +94,11 @@ def test_sixteen_scans_more_make_it_surer() -> None:
         sphere_joint(sphere_trial(world, 400, translations=4, free=n, touches=20, views=0).data, "rigid", SIGMAS, start)
         for n in (6, 22)
     )
-    assert np.trace(many.mapped_covariance(0.0, 0.2)) < 0.5 * np.trace(few.mapped_covariance(0.0, 0.2))
+    variance = []
+    for found in (few, many):  # of where the profile point (0, 0.2) m lies in F
+        J = np.hstack([-skew(found.rotation @ np.array([0.0, 0.0, 0.2])), np.eye(3)])
+        variance.append(np.trace(J @ found.covariance @ J.T))
+    assert variance[1] < 0.5 * variance[0]
 
 
 def test_one_wrong_side_ruins_the_papers_method_and_not_the_joint_one_which_takes_no_sides() -> None:
