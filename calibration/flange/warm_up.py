@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import get_flange
 
 _FLANGE = "iso9409-1-50-4-m6"
@@ -27,5 +27,5 @@ def warm_up() -> None:
     z = np.where(face, _DISTANCE_M + noise, np.nan)
     points = np.stack([z * u * pitch / _DISTANCE_M, z * v * pitch / _DISTANCE_M, z], axis=-1)
     found = fit_flange(points, standard)
-    fit_flange(points, standard, guess=FlangeGuess(found.center_C, 0.7 * standard.outer_m, found.normal_C))
+    fit_flange(points, standard, guess=found)
     fit_flange(points[face], standard)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from weldcal.calibration.flange.edge_labels import WRONG, border_likelihood
-from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import find_holes
 from weldcal.calibration.flange.track import borders, near_edge, ring_points
 from weldcal.calibration.flange.warm_up import warm_up
@@ -97,7 +97,7 @@ def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
     X_CR = facing(np.array([0.0, 0.02, 0.8]), 0.2, 0.0, 0.0)
     scene = flange_frame(get_scanner("phoxi_m", 824), standard, np.random.default_rng(0), X_CR=X_CR).points_C
     found = fit_flange(scene, standard)
-    fit_flange(scene, standard, guess=FlangeGuess(found.center_C, 0.7 * standard.outer_m, found.normal_C))
+    fit_flange(scene, standard, guess=found)
     find_holes(scene, found, standard)
     fit_flange(scene[np.linalg.norm(scene - found.center_C, axis=2) < 0.6 * standard.outer_m], standard)
     assert compiled() == ready
