@@ -23,7 +23,7 @@ _LITTLE = 0.1  # gain by one more pose, as a share of the error, that is not wor
 def sampling_advice(
     estimate: CalibrationEstimate, observations: Sequence[Observation], *, required_m: float | None = None
 ) -> tuple[str, ...]:
-    """Advice from an estimate and the sightings that made it (those left out as outliers count for nothing).
+    """Advice from an estimate and the observations that made it (those left out as outliers count for nothing).
 
     Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
     field a scanned point is worst known, and what one more pose like these would gain; with ``required_m`` (standard

@@ -40,7 +40,7 @@ class FewPosesEstimate:
 def estimate_from_whole_poses(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], turn_rad: float = 0.0
 ) -> FewPosesEstimate:
-    """X_BC from the sightings whose hole pattern was seen (n >= 1): each gives all six degrees of freedom.
+    """X_BC from the observations whose hole pattern was seen (n >= 1): each gives all six degrees of freedom.
 
     ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says it is;
     ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged (chordal
@@ -86,7 +86,7 @@ def calibrate_from_few(
     *,
     seed: int = 0,
 ) -> CalibrationEstimate:
-    """X_BC from one to three sightings, with a covariance that rests on what is usual of robot and scanner where the data are
+    """X_BC from one to three observations, with a covariance that rests on what is usual of robot and scanner where the data are
     too few to say.
 
     With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three pairs, or two

@@ -1,4 +1,4 @@
-"""From a dataset to sightings of the flange: every cloud fitted or refused by name, pairs taken as they are."""
+"""From a dataset to observations of the flange: every cloud fitted or refused by name, pairs taken as they are."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class FlangeObservations:
     """What was seen: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
     (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
 
@@ -45,7 +45,7 @@ def see_flanges(
     holes: bool = True,
     seed: int = 0,
     tell: Callable[[float], None] = lambda fraction: None,
-) -> Sightings:
+) -> FlangeObservations:
     """Fit the flange in every cloud of a dataset, or take its pairs as they are.
 
     ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole. Without
@@ -53,7 +53,9 @@ def see_flanges(
     InputError, before any work, naming the first cloud file that is damaged.
     """
     if data.pairs:
-        return Sightings(tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, data.refused)
+        return FlangeObservations(
+            tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, data.refused
+        )
     _check_clouds(data)
     observations: list[Observation] = []
     fits: dict[str, FlangeFit] = {}
@@ -74,7 +76,7 @@ def see_flanges(
             patterns[id] = pattern
         clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
-    return Sightings(tuple(observations), fits, patterns, clouds, tuple(refused))
+    return FlangeObservations(tuple(observations), fits, patterns, clouds, tuple(refused))
 
 
 def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:

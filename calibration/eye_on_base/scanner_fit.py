@@ -1,4 +1,4 @@
-"""A scanner's correction from sightings of the flange: what the robot's motion and the hole circles say of it."""
+"""A scanner's correction from observations of the flange: what the robot's motion and the hole circles say of it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from weldcal.calibration.geometry.se3 import exp_rotation, skew
 Array = NDArray[np.float64]
 
 LEAST_PATTERNS = 6
-STARTS = 30  # random starts of an estimate: these sightings are cleared of gross outliers
+STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
 _MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
 _USUAL_SPREAD_M = 1e-4
@@ -75,13 +75,13 @@ def from_motion(
     usual: bool = False,
     start: RigidTransform | None = None,
 ) -> CorrectionEstimate:
-    """Correction and camera pose that together bring sightings (n >= 3) and robot poses to agree; with ``patterns``, the
+    """Correction and camera pose that together bring observations (n >= 3) and robot poses to agree; with ``patterns``, the
     hole circles to their nominal size as well.
 
-    The sightings are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
+    The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
     held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton over the 9, 12 or 16 unknowns,
     reweighted (soft L1 beyond two sigma); each kind of datum counts by its own spread, found from the residuals over its own
-    redundancy. ``start`` is a camera pose near by, as from the same sightings and one more: it saves the search for one. Raises
+    redundancy. ``start`` is a camera pose near by, as from the same observations and one more: it saves the search for one. Raises
     TooFewPoses below three and, without ``start``, what estimate_eye_on_base raises.
     """
     if len(observations) < 3:

@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 _LEAST_POSES = 8  # nine unknowns, and as many held-out errors as make a comparison
 _LEAST_FOR_THIRD = 12  # sixteen unknowns
 _FEWEST_PATTERNS = 3  # below eight poses, where the hole circle decides
-_BLIND_SCALE = 2e-3  # a scale known worse than this is as good as unknown: scanners are right to 0.2 %
-_BLIND_GRADIENT = 2e-2
+_UNKNOWN_SCALE = 2e-3  # a scale known worse than this is as good as unknown: scanners are right to 0.2 %
+_UNKNOWN_GRADIENT = 2e-2
 _EVIDENT = 0.999  # probability that the correction is not zero by chance
 _EVIDENT_FEW = 0.95  # the same below eight poses, where the correction is held back besides
 _CHANCE_FEW = 1.6  # held-out errors of four poses differ by as much by chance: root of F (12, 12) at 5 %
@@ -65,7 +65,7 @@ def self_calibrate(
     *,
     seed: int = 0,
 ) -> SelfCalibration:
-    """Decide on a scanner correction from good sightings (n) and the hole patterns seen in them (by id).
+    """Decide on a scanner correction from good observations (n) and the hole patterns seen in them (by id).
 
     It is accepted only if robot motion and hole circle each determine it and do not contradict each other, if it is
     not zero by chance, and if errors on poses that neither correction nor calibration saw fall below
@@ -86,7 +86,7 @@ def self_calibrate(
             return few
         return refused(f"No scanner correction: {n} poses do not determine one; take {_LEAST_POSES} or more.")
     motion = from_motion(observations, {}, seed=seed)
-    if motion.sigma[0] > _BLIND_SCALE or float(motion.sigma[1:].max()) > _BLIND_GRADIENT:
+    if motion.sigma[0] > _UNKNOWN_SCALE or float(motion.sigma[1:].max()) > _UNKNOWN_GRADIENT:
         return refused(
             "No scanner correction: the positions vary too little for one (its scale would be known to "
             f"{1e2 * motion.sigma[0]:.2f} %); spread the poses over the field of view and in depth."
@@ -186,7 +186,7 @@ def apply_self_calibration(
     seed: int = 0,
     wanted: bool = True,
 ) -> tuple[SelfCalibration | None, list[Observation], CalibrationEstimate]:
-    """The verdict on the scanner (None where it is not ``wanted``), the sightings as corrected by it, and their estimate.
+    """The verdict on the scanner (None where it is not ``wanted``), the observations as corrected by it, and their estimate.
 
     ``rigid`` is the estimate without a correction. Held-out errors of the one returned come from corrections, too, that
     never saw the pose; its covariance contains that of the correction.
@@ -237,7 +237,7 @@ def calibrate_corrected(
     order: int = 1,
     start: RigidTransform | None = None,
 ) -> tuple[RigidTransform, ScannerCorrection]:
-    """Camera pose and correction from the same sightings, undecided: for cross-validation."""
+    """Camera pose and correction from the same observations, undecided: for cross-validation."""
     found = from_motion(observations, patterns, seed=seed, order=order, usual=True, start=start)
     assert found.X_BC is not None
     return found.X_BC, found.correction

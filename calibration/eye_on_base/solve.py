@@ -1,4 +1,4 @@
-"""Eye-on-base calibration from all sightings: robust, weighted on SE(3), with the uncertainty the residuals admit."""
+"""Eye-on-base calibration from all observations: robust, weighted on SE(3), with the uncertainty the residuals admit."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class _Solution:
 def estimate_eye_on_base(
     observations: list[Observation] | tuple[Observation, ...], config: SolveConfig | None = None
 ) -> CalibrationEstimate:
-    """Estimate X_BC from sightings of the flange at n poses; positions and (where seen) normals are used together.
+    """Estimate X_BC from observations of the flange at n poses; positions and (where seen) normals are used together.
 
     Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
     of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and

@@ -19,7 +19,7 @@ from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
 Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
-"""Camera pose and scanner correction from sightings."""
+"""Camera pose and scanner correction from observations."""
 
 
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:

@@ -1,4 +1,4 @@
-"""One sighting of the flange: where the robot says it was, and where the scanner saw it."""
+"""One observation of the flange: where the robot says it was, and where the scanner saw it."""
 
 from __future__ import annotations
 

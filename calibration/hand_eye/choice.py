@@ -1,4 +1,4 @@
-"""From sightings to the one fit to trust: starts, gross outliers, candidates, and the choice by errors left out."""
+"""From observations to the one fit to trust: starts, gross outliers, candidates, and the choice by errors left out."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SUBSETS = 60
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to weigh the sightings: the loss, and how much less than estimated the translations count."""
+    """One way to weigh the observations: the loss, and how much less than estimated the translations count."""
 
     name: str
     loss: Loss
@@ -71,7 +71,7 @@ def solve(
 
     The candidate is chosen by errors left out of the fit: the one whose worse column (degrees or length, each relative
     to the best candidate of that column) is best, so that neither is bought with the other. Raises InconsistentPoses
-    where no rigid poses explain enough sightings.
+    where no rigid poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
     w, d = residuals(problem, state)
@@ -137,7 +137,7 @@ def solve(
 
 
 def _gate(problem: Problem, w: Array, d: Array) -> Flags:
-    """Sightings (n,) whose residuals lie within the gate, the noise taken from the medians."""
+    """Observations (n,) whose residuals lie within the gate, the noise taken from the medians."""
     everything = np.ones(len(problem), dtype=bool)
     if len(problem) <= 4:
         return everything

@@ -159,7 +159,7 @@ def determinacy(
     noise_rad: float,
     labels: dict[str, str],
 ) -> Determinacy:
-    """Name the directions that the sightings leave open.
+    """Name the directions that the observations leave open.
 
     ``information`` and ``covariance`` (m, m) of the unknowns; ``length``: extent of the data; ``noise_rad``: per axis.
     A direction is open where the information vanishes, where its predicted standard deviation exceeds a tenth of a

@@ -116,7 +116,7 @@ MOUNTINGS: dict[str, Mounting] = {
 
 
 @dataclass(frozen=True)
-class Sighting:
+class TargetObservation:
     """One sample. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
     carries the camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
 
@@ -158,16 +158,18 @@ def chain(mounting: Mounting, X_BF: Array, X_BL: Array | None = None, X_DE: Arra
     return (X_BL, H) if mounting.name == "eye_on_arm_target_on_base" else (inverse(X_BF) @ X_BL, H)
 
 
-def problem_of(mounting: Mounting, sightings: Sequence[Sighting], known: dict[str, RigidTransform]) -> Problem:
-    """The equation of these sightings. ``known``: letters of unknowns that are given (a flange as target: Y or Z)."""
-    X_BF = np.array([s.X_BF.GetAsMatrix4() for s in sightings]).reshape(-1, 4, 4)
-    links = [s.X_BL for s in sightings]
-    others = [s.X_DE for s in sightings]
+def problem_of(
+    mounting: Mounting, observations: Sequence[TargetObservation], known: dict[str, RigidTransform]
+) -> Problem:
+    """The equation of these observations. ``known``: letters of unknowns that are given (a flange as target: Y or Z)."""
+    X_BF = np.array([s.X_BF.GetAsMatrix4() for s in observations]).reshape(-1, 4, 4)
+    links = [s.X_BL for s in observations]
+    others = [s.X_DE for s in observations]
     X_BL = None if any(x is None for x in links) else np.array([x.GetAsMatrix4() for x in links if x is not None])
     X_DE = None if any(x is None for x in others) else np.array([x.GetAsMatrix4() for x in others if x is not None])
     F, H = chain(mounting, X_BF, X_BL, X_DE)
-    G = np.broadcast_to(IDENTITY, (len(sightings), 4, 4)).copy()
-    for i, s in enumerate(sightings):
+    G = np.broadcast_to(IDENTITY, (len(observations), 4, 4)).copy()
+    for i, s in enumerate(observations):
         G[i, :3, 3] = s.p_CM
         if s.R_CM is not None:
             G[i, :3, :3] = s.R_CM.matrix()
@@ -175,9 +177,9 @@ def problem_of(mounting: Mounting, sightings: Sequence[Sighting], known: dict[st
             G[i, :3, :3] = _frame_with_z(np.asarray(s.n_CM, dtype=float))
     if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(H).all()):
         raise InputError("A sample holds numbers that are not finite.")
-    full = np.array([s.R_CM is not None for s in sightings], dtype=bool)
-    normal = np.array([s.R_CM is None and s.n_CM is not None for s in sightings], dtype=bool)
-    stated = [s.covariance for s in sightings]
+    full = np.array([s.R_CM is not None for s in observations], dtype=bool)
+    normal = np.array([s.R_CM is None and s.n_CM is not None for s in observations], dtype=bool)
+    stated = [s.covariance for s in observations]
     covariance = None
     if any(c is not None for c in stated):
         if any(c is None for c in stated):

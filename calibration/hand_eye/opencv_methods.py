@@ -1,4 +1,4 @@
-"""OpenCV's seven hand-eye methods on the same sightings, for comparison: they fail without a word, so we say it."""
+"""OpenCV's seven hand-eye methods on the same observations, for comparison: they fail without a word, so we say it."""
 
 from __future__ import annotations
 

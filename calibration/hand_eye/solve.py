@@ -69,8 +69,8 @@ class HandEyeResult:
     p + b), a (rad) a rotation on the parent's side about the child's origin, b the displacement of that origin, both in
     the parent's axes; open directions carry a standard deviation of ten (rad, or extents of the motion).
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
-    and ``translation`` (n,): residuals of all sightings at the origin of the target. ``left_out``: their linearised
-    errors when left out one by one. ``sigma_rotation_rad``, ``sigma_translation``: noise per axis beyond the sightings'
+    and ``translation`` (n,): residuals of all observations at the origin of the target. ``left_out``: their linearised
+    errors when left out one by one. ``sigma_rotation_rad``, ``sigma_translation``: noise per axis beyond the observations'
     own; ``noise_centre`` (3,): the point of the target where it holds. Lengths are in the unit of the data.
     """
 
@@ -193,7 +193,7 @@ def solve_problem(
     """Solve F_i X G_i = Y H_i Z for the free poses; ``known`` holds the others (Y and Z may carry a known feature).
 
     Raises TooFewPoses, RepeatedPoses, PureTranslation, CoplanarPoses before any work, InconsistentPoses where no rigid
-    poses explain the sightings, and UndeterminedPoses where more than one translation or any rotation of the camera
+    poses explain the observations, and UndeterminedPoses where more than one translation or any rotation of the camera
     stays open (unless ``config.allow_open``).
     """
     config = config or HandEyeConfig()

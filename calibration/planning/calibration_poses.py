@@ -215,7 +215,7 @@ def _refuse(
 
 
 def _information(X_BR: RigidTransform, X_BC: RigidTransform, work: Array, config: PlannerConfig) -> Array:
-    """Information (9, 9) of one sighting on [rotation about the work point; translation; centre bias in R]."""
+    """Information (9, 9) of one observation on [rotation about the work point; translation; centre bias in R]."""
     lever = X_BR.translation() - work
     R = X_BR.rotation().matrix()
     J_p = np.hstack([-skew(lever), np.eye(3), -R])

@@ -85,11 +85,13 @@ def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: Mou
 
 
 def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
-    """What sightings of the circle at some poses would tell (k, m + 3, m + 3): of the free unknowns, in the order of the
+    """What observations of the circle at some poses would tell (k, m + 3, m + 3): of the free unknowns, in the order of the
     solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,) along the
     circle's own axes."""
-    sightings = [scene.sighting(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses]
-    lin = linearise(scene.problem(sightings), scene.state, np.zeros(3))
+    observations = [
+        scene.observation(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses
+    ]
+    lin = linearise(scene.problem(observations), scene.state, np.zeros(3))
     Jd = np.concatenate([lin.Jd, np.broadcast_to(np.eye(3), (len(poses), 3, 3))], axis=2)
     Jd = Jd / np.broadcast_to(sigma_m, (3,))[:, None]
     Jw = np.concatenate([lin.Jw, np.zeros((len(poses), 3, 3))], axis=2) / sigma_rad

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from scipy.spatial.distance import cdist
 
 from weldcal.calibration.geometry.se3 import IDENTITY
-from weldcal.calibration.hand_eye.mountings import Mounting, Sighting, get_mounting, problem_of
+from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
 from weldcal.models.arms.kinematics import ArmModel, link_frames
@@ -104,18 +104,18 @@ class MountingScene:
         on_base = self.configuration in ("eye_in_hand", "eye_on_arm_target_on_base")
         return self.X_HR if on_base else frames[FLANGE] @ self.X_HR
 
-    def sighting(
+    def observation(
         self, q: Array, q_2: Array | None, p_CR: Array, n_CR: Array, covariance: Array | None = None
-    ) -> Sighting:
+    ) -> TargetObservation:
         """A circle seen with the arms at q and q_2, as the solver takes it."""
         frames = self.frames(q)
         X_DE = None if self.arm_2 is None or q_2 is None else link_frames(self.arm_2, q_2)[FLANGE]
         X_BL = frames[self.link] if "arm" in self.configuration else None
-        return Sighting(frames[FLANGE], p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
+        return TargetObservation(frames[FLANGE], p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
 
-    def problem(self, sightings: Sequence[Sighting]) -> Problem:
-        """The equation of some sightings."""
-        return problem_of(self.mounting, sightings, self.known)
+    def problem(self, observations: Sequence[TargetObservation]) -> Problem:
+        """The equation of some observations."""
+        return problem_of(self.mounting, observations, self.known)
 
 
 class Bodies:

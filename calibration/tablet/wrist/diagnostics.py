@@ -21,7 +21,7 @@ _LEAST_TO_DOUBT = 6  # landmarks
 _BETTER = 0.4  # what a change must leave of the residuals to be told
 
 
-def wrist_doubts(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> tuple[str, ...]:
+def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> tuple[str, ...]:
     """Sentences for the result's warnings; `names` of the landmarks."""
     found = []
     scale, deviation = touched_scale(data)

@@ -125,7 +125,7 @@ def digest(
     if job.purpose == "verify":
         return dc.replace(status, kept_aside=(*status.kept_aside, compare(job.label, fit, belief, q, q_2)))
     X_CR = belief.seen(q, q_2)
-    sighting = scene.sighting(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
+    sighting = scene.observation(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
     seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), sighting, fit.coverage)
     status = dc.replace(status, seen=(*status.seen, seen), message="")
     if len(status.seen) < fewest(scene):

@@ -56,7 +56,7 @@ def test_the_normal_stays_upright_on_the_corrected_face() -> None:
     assert np.degrees(np.arccos(min(1.0, float(seen @ n)))) > 0.1  # it does turn
 
 
-def test_a_sighting_is_corrected_whole() -> None:
+def test_an_observation_is_corrected_whole() -> None:
     o = Observation("a", RigidTransform(), np.array([0.1, 0.0, 0.5]), np.array([0.0, 0.0, -1.0]))
     c = corrected_observation(CORRECTION, o)
     assert np.allclose(c.p_CR, CORRECTION.points(o.p_CR))

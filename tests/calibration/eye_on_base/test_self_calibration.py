@@ -33,7 +33,7 @@ NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4
 def _cell(
     needs: ScannerCorrection, *, n: int = 18, seed: int = 0, spread: float = 1.0
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """Sightings and hole circles by a scanner that needs a correction; the robot tells the truth."""
+    """Observations and hole circles by a scanner that needs a correction; the robot tells the truth."""
     rng = np.random.default_rng(seed)
     observations, patterns = [], {}
     for k in range(n):
@@ -75,7 +75,7 @@ def test_both_sources_find_the_error_and_it_is_corrected() -> None:
     assert s.accepted is not None
     assert s.accepted.scale == pytest.approx(WRONG.scale, abs=1e-3)
     assert s.sentence.startswith("The scanner is corrected")
-    # what is left of a held-out error is the noise of one sighting in 3-D, and what 18 of them cannot average out
+    # what is left of a held-out error is the noise of one observation in 3-D, and what 18 of them cannot average out
     assert float(np.sqrt(np.mean(s.held_out_m**2))) < 1.5 * np.sqrt(3.0) * NOISE_M
 
 

@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.calibration.hand_eye.poses import Array, noise, random_poses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, pose
-from weldcal.calibration.hand_eye.mountings import MOUNTINGS, Sighting, get_mounting, problem_of
+from weldcal.calibration.hand_eye.mountings import MOUNTINGS, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, as_transform, solve_problem
 from weldcal.calibration.planning.next_pose import next_pose
@@ -21,7 +21,7 @@ TURN, SHIFT = np.radians(0.05), 2e-4
 QUICK = HandEyeConfig(folds=0)
 
 
-def sightings(name: str, kind: str, n: int = 20) -> tuple[list[Sighting], dict[str, RigidTransform]]:
+def make_observations(name: str, kind: str, n: int = 20) -> tuple[list[TargetObservation], dict[str, RigidTransform]]:
     """Samples of a mounting written with its own equation in frames, not with the solver's F and H."""
     rng = np.random.default_rng(list(MOUNTINGS).index(name))
     X_BF, X_BL, X_DE = (random_poses(n, rng) for _ in range(3))
@@ -35,7 +35,7 @@ def sightings(name: str, kind: str, n: int = 20) -> tuple[list[Sighting], dict[s
     }[name]()
     X_CM = target @ noise(n, rng, TURN, SHIFT)
     samples = [
-        Sighting(
+        TargetObservation(
             as_transform(X_BF[i]),
             X_CM[i, :3, 3],
             n_CM=X_CM[i, :3, 2] if kind == "normals" else None,
@@ -49,7 +49,9 @@ def sightings(name: str, kind: str, n: int = 20) -> tuple[list[Sighting], dict[s
     return samples, truth
 
 
-def calibrate(name: str, samples: list[Sighting], known: dict[str, RigidTransform] | None = None) -> HandEyeResult:
+def calibrate(
+    name: str, samples: list[TargetObservation], known: dict[str, RigidTransform] | None = None
+) -> HandEyeResult:
     known, mounting = known or {}, get_mounting(name)
     X, Y, Z = (np.asarray(known[k].GetAsMatrix4()) if k in known else IDENTITY for k in "XYZ")
     problem = problem_of(mounting, samples, known)
@@ -58,7 +60,7 @@ def calibrate(name: str, samples: list[Sighting], known: dict[str, RigidTransfor
 
 @pytest.mark.parametrize("name", list(MOUNTINGS))
 def test_full_poses_find_all_unknowns(name: str) -> None:
-    samples, truth = sightings(name, "poses")
+    samples, truth = make_observations(name, "poses")
     result = calibrate(name, samples)
     assert set(result.poses) == set(truth)
     for letter, X in truth.items():
@@ -69,7 +71,7 @@ def test_full_poses_find_all_unknowns(name: str) -> None:
 @pytest.mark.parametrize("kind", ["points", "normals"])
 def test_a_flange_or_mounting_circle_as_target_finds_the_camera(name: str, kind: str) -> None:
     # the paper's way: the feature's place on the robot is known, only its centre (and normal) is seen
-    samples, truth = sightings(name, kind)
+    samples, truth = make_observations(name, kind)
     last = max(truth)
     known = {last: truth[last]}
     result = calibrate(name, samples, known)
@@ -78,9 +80,9 @@ def test_a_flange_or_mounting_circle_as_target_finds_the_camera(name: str, kind:
 
 
 def test_poses_points_and_normals_go_together() -> None:
-    samples, truth = sightings("eye_in_hand", "poses")
-    points, _ = sightings("eye_in_hand", "points")
-    normals, _ = sightings("eye_in_hand", "normals")
+    samples, truth = make_observations("eye_in_hand", "poses")
+    points, _ = make_observations("eye_in_hand", "points")
+    normals, _ = make_observations("eye_in_hand", "normals")
     mixed = samples[:8] + points[8:14] + normals[14:]
     result = calibrate("eye_in_hand", mixed)
     assert result.normalised_error("X", truth["X"]) < result.region(0.999)
@@ -94,9 +96,9 @@ def test_mountings_say_their_directions() -> None:
         assert all(u.symbol in m.equation and u.symbol in m.sketch for u in m.unknowns.values())
     with pytest.raises(InputError, match="choose one of eye_in_hand"):
         get_mounting("eye_in_foot")
-    samples, _ = sightings("eye_on_arm_target_on_base", "poses", 6)
+    samples, _ = make_observations("eye_on_arm_target_on_base", "poses", 6)
     with pytest.raises(InputError, match="pose of the link"):
-        calibrate("eye_on_arm_target_on_base", [Sighting(s.X_BF, s.p_CM) for s in samples])
+        calibrate("eye_on_arm_target_on_base", [TargetObservation(s.X_BF, s.p_CM) for s in samples])
 
 
 def test_the_next_pose_keeps_its_promise() -> None:
@@ -110,7 +112,8 @@ def test_the_next_pose_keeps_its_promise() -> None:
     problem = full_problem(F, seen(F))
     mounting = get_mounting("eye_in_hand")
     samples = [
-        Sighting(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation()) for a, b in zip(F, problem.G, strict=True)
+        TargetObservation(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation())
+        for a, b in zip(F, problem.G, strict=True)
     ]
     result = calibrate("eye_in_hand", samples)
     advice = next_pose(problem, result, mounting, (IDENTITY,) * 3)
@@ -127,7 +130,8 @@ def test_the_next_pose_keeps_its_promise() -> None:
     for poses in (more, again):
         G = inverse(poses @ X) @ Y @ noise(len(poses), np.random.default_rng(4), TURN, SHIFT)
         both = [
-            Sighting(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation()) for a, b in zip(poses, G, strict=True)
+            TargetObservation(as_transform(a), b[:3, 3], R_CM=as_transform(b).rotation())
+            for a, b in zip(poses, G, strict=True)
         ]
         found = calibrate("eye_in_hand", both)
         sigmas.append(np.trace(found.covariance["X"][3:, 3:]) / found.sigma_translation**2)

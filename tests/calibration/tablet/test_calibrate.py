@@ -20,7 +20,7 @@ from tests.calibration.tablet.image import grid, picture, project
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
-from weldcal.calibration.tablet.wrist.diagnostics import wrist_doubts
+from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
@@ -318,7 +318,10 @@ def test_what_looks_wrong_with_full_poses_is_told(visit: Path, tmp_path: Path, c
     loaded = _loaded(
         folder, **({"image": folder / "picture.png"} if "principal" in warning else {"seen": folder / "seen.csv"})
     )
-    told = (*loaded.warnings, *wrist_doubts(loaded.data, fit_wrist(loaded.data, leave_one_out=False), loaded.names))
+    told = (
+        *loaded.warnings,
+        *wrist_diagnostics(loaded.data, fit_wrist(loaded.data, leave_one_out=False), loaded.names),
+    )
     assert re.search(warning, " ".join(told)), told
 
 

@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.observations import Sightings, corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
@@ -109,7 +109,7 @@ class Material:
 
     data: Dataset
     standard: FlangeStandard
-    seen: Sightings
+    seen: FlangeObservations
     faces: dict[str, Array]
     circles: list[Observation]
     good: dict[str, Observation]
@@ -276,7 +276,7 @@ def _sights(material: Material, held: str) -> tuple[SightRow, ...]:
     rows = []
     for title, v in kinds:
         error = icp_error(X, v)
-        rows.append(SightRow(title, error.value, sight(X, v).share, error.blind))
+        rows.append(SightRow(title, error.value, sight(X, v).share, error.unobservable))
     return tuple(rows)
 
 
