@@ -1,4 +1,4 @@
-"""Plates with a V-groove along a straight, S or L seam: the CAD that is planned on, and the part as it really is.
+"""Plates with a V-groove along a straight, S or L seam: the nominal geometry and the manufactured part.
 
 Frame P: origin on the top face at the centre of the (uncut) plate, x along it, z up; the groove is cut from above.
 The groove runs right through: the seam starts at one plate edge and ends at another. On real parts the plate outline is

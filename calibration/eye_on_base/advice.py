@@ -1,4 +1,4 @@
-"""Which poses to add next, and when to stop: what the poses taken so far leave open, in sentences."""
+"""Advises which poses to add and when to stop, from what the poses so far leave uncertain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LITTLE = 0.1  # gain by one more pose, as a share of the error, that is not wor
 def sampling_advice(
     estimate: CalibrationEstimate, observations: Sequence[Observation], *, required_m: float | None = None
 ) -> tuple[str, ...]:
-    """Advice from an estimate and the observations that made it (those left out as outliers count for nothing).
+    """Advice from an estimate and the observations that made it (outliers are ignored).
 
     Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
     field a scanned point is worst known, and what one more pose like these would gain; with ``required_m`` (standard
@@ -77,8 +77,8 @@ def sampling_advice(
 
 
 def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
-    """Of the ends of the axes along which poses (n, 3) m spread, half as far again, the one (3,) where a scanned point is known
-    worst."""
+    """The place (3,) m with the largest uncertainty of a scanned point, of the ends of the principal axes of poses (n, 3) m,
+    half as far again."""
     middle = p_B.mean(axis=0)
     spread = np.linalg.svd(p_B - middle, full_matrices=False)
     reach = spread[2] * (spread[1] / np.sqrt(len(p_B)))[:, None]

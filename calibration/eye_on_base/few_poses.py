@@ -1,4 +1,4 @@
-"""The scanner's pose from one, two or three scans: with normals, or whole poses where the turn of the holes is known."""
+"""Estimates X_BC from one, two or three scans, from normals or from whole poses by the hole pattern."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _USUAL_WEIGHT = 4.0  # residuals' worth of what is usual of robot and scanner
 
 @dataclass(frozen=True, eq=False)
 class FewPosesEstimate:
-    """X_BC from ``ids``, and how far (m) each flange centre is from where it puts it; zero where there is only one."""
+    """X_BC from ``ids``, and the residuals (m) of the flange centres; zero where there is only one."""
 
     X_BC: RigidTransform
     ids: tuple[str, ...]
@@ -86,8 +86,8 @@ def calibrate_from_few(
     *,
     seed: int = 0,
 ) -> CalibrationEstimate:
-    """X_BC from one to three observations, with a covariance that rests on what is usual of robot and scanner where the data are
-    too few to say.
+    """X_BC from one to three observations, with a covariance from the usual errors of robot and scanner where the data are
+    too few.
 
     With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three pairs, or two
     scans with face normals. Held-out errors are those of each pose under the others, NaN where the others are too few. Raises

@@ -1,4 +1,4 @@
-"""From a dataset to observations of the flange: every cloud fitted or refused by name, pairs taken as they are."""
+"""Fits the flange in every cloud of a dataset; returns observations and the reasons of refused scans."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error
 
 @dataclass(frozen=True, eq=False)
 class FlangeObservations:
-    """What was seen: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
+    """Results of the flange fits: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
     (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
 
     observations: tuple[Observation, ...]
@@ -46,7 +46,7 @@ def see_flanges(
     seed: int = 0,
     tell: Callable[[float], None] = lambda fraction: None,
 ) -> FlangeObservations:
-    """Fit the flange in every cloud of a dataset, or take its pairs as they are.
+    """Fit the flange in every cloud of a dataset, or use its pairs as they are.
 
     ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole. Without
     ``holes`` no hole pattern is looked for. Deterministic for ``seed``. ``tell`` is told the fraction done. Raises
@@ -99,7 +99,7 @@ def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, see
 
 
 def _check_clouds(data: Dataset) -> None:
-    """Read every file before any work: a damaged one is the user's to mend, unlike a scan in which no flange is found.
+    """Read every file before any work: the user must replace a damaged one, unlike a scan in which no flange is found.
 
     Raises:
         InputError: naming the first such file, what is wrong with it and how many there are.
@@ -112,7 +112,7 @@ def _check_clouds(data: Dataset) -> None:
             bad.append(f"{id}: {e.reason}")
     if bad:
         more = f" ({len(bad) - 1} more clouds are damaged too)" if len(bad) > 1 else ""
-        raise InputError(f"A cloud cannot be used{more}; mend it, or take it away together with its pose: {bad[0]}")
+        raise InputError(f"A cloud cannot be used{more}; replace it, or remove it together with its pose: {bad[0]}")
 
 
 def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransform | None) -> FlangeGuess | None:

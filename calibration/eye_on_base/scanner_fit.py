@@ -1,4 +1,4 @@
-"""A scanner's correction from observations of the flange: what the robot's motion and the hole circles say of it."""
+"""Fits a scanner correction to observations of the flange, from the robot's motion and from the hole circles."""
 
 from __future__ import annotations
 
@@ -75,8 +75,8 @@ def from_motion(
     usual: bool = False,
     start: RigidTransform | None = None,
 ) -> CorrectionEstimate:
-    """Correction and camera pose that together bring observations (n >= 3) and robot poses to agree; with ``patterns``, the
-    hole circles to their nominal size as well.
+    """Fit correction and camera pose together to observations (n >= 3) and robot poses; with ``patterns`` the hole circles'
+    nominal size is fitted, too.
 
     The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
     held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton over the 9, 12 or 16 unknowns,
@@ -175,7 +175,7 @@ def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HoleP
 
 
 def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
-    """The correction whose factors (K,) differ by ``change`` from those of a right scanner."""
+    """The correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
     limited = np.clip(change[0], -0.05, 0.05)
     bend = tuple(float(v) for v in change[3:])
     return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)

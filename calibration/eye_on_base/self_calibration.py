@@ -1,4 +1,4 @@
-"""The scanner's own scale error, from the robot's motion and from the flange's hole circle; believed where they agree."""
+"""Decides whether to correct the scanner, by comparing robot motion, hole circles and held-out errors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _GAIN = 0.95  # of the held-out error that must be left at most: a correction th
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """The verdict. ``found`` is None where the scanner is taken as it is; ``sentence`` says why, or what was found;
+    """Decision on the scanner correction. ``found`` is None where the scanner is taken as it is; ``sentence`` says why, or what was found;
     ``worth_saying`` where a reader of the result should know it. ``held_out_m`` and ``held_out_tilt_rad`` (n,) are errors
     of each pose under a correction and a calibration that never saw it; NaN where they were not needed."""
 
@@ -54,7 +54,7 @@ class SelfCalibration:
 
     @property
     def accepted(self) -> ScannerCorrection | None:
-        """The correction that is believed; None where the scanner is taken as it is."""
+        """The accepted correction; None where the scanner is not corrected."""
         return None if self.found is None else self.found.correction
 
 
@@ -65,7 +65,7 @@ def self_calibrate(
     *,
     seed: int = 0,
 ) -> SelfCalibration:
-    """Decide on a scanner correction from good observations (n) and the hole patterns seen in them (by id).
+    """Decide on a scanner correction from inlier observations (n) and the hole patterns seen in them (by id).
 
     It is accepted only if robot motion and hole circle each determine it and do not contradict each other, if it is
     not zero by chance, and if errors on poses that neither correction nor calibration saw fall below
@@ -153,7 +153,7 @@ def _from_few(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], rigid_held_out_m: Array, seed: int
 ) -> SelfCalibration | None:
     """The verdict below eight poses: the hole circles, and motion as far as it tells, held to what scanners usually are off;
-    believed where that is not zero by chance and errors at poses left out of correction and calibration do not rise beyond
+    believed where that is not zero by chance and held-out errors do not rise beyond
     chance; None where they do. That they fall is not asked: four errors from three poses each are no measure of a gain."""
     n = len(observations)
     if n < 4 or sum(o.id in patterns for o in observations) < _FEWEST_PATTERNS:
@@ -237,7 +237,7 @@ def calibrate_corrected(
     order: int = 1,
     start: RigidTransform | None = None,
 ) -> tuple[RigidTransform, ScannerCorrection]:
-    """Camera pose and correction from the same observations, undecided: for cross-validation."""
+    """Camera pose and correction from the same observations, without the decision: for cross-validation."""
     found = from_motion(observations, patterns, seed=seed, order=order, usual=True, start=start)
     assert found.X_BC is not None
     return found.X_BC, found.correction

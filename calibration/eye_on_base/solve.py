@@ -1,4 +1,4 @@
-"""Eye-on-base calibration from all observations: robust, weighted on SE(3), with the uncertainty the residuals admit."""
+"""Solves eye-on-base calibration: robust weighted least squares on SE(3) with a covariance from the residuals."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 
 @dataclass(frozen=True)
 class SolveConfig:
-    """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
+    """Settings of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
     agree). ``usual_weight`` is how many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts
     for beside the residuals themselves: three poses have too few of them."""
 
@@ -101,8 +101,8 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to {100 * config.max_outliers:.0f} % wrong ones are "
-            "left out); check units, pose order and that the camera did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to {100 * config.max_outliers:.0f} % outliers are "
+            "excluded); check units, pose order and that the camera did not move."
         )
     spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
@@ -127,7 +127,7 @@ def estimate_eye_on_base(
     warnings = []
     if not inliers.all():
         names = ", ".join(o.id for o, keep in zip(observations, inliers, strict=True) if not keep)
-        warnings.append(f"{n - int(inliers.sum())} of {n} poses disagree with the rest and were left out: {names}.")
+        warnings.append(f"{n - int(inliers.sum())} of {n} poses disagree with the rest and were excluded: {names}.")
     kept = [o for o, keep in zip(observations, inliers, strict=True) if keep]
     sigma_p = float(np.sqrt(solution.var_p))
     return CalibrationEstimate(

@@ -1,4 +1,4 @@
-"""Errors on poses a calibration never saw: folds, and how the error falls with the number of scans."""
+"""Held-out errors of a calibration: k-fold cross-validation and convergence over the number of scans."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
 
 
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
-    """Distance (n,) m between where a calibration puts the flange centres and where the robot says they are."""
+    """Distances (n,) m between the flange centres by the calibration and by the robot."""
     return np.array([float(np.linalg.norm(X_BC @ o.p_CR - o.p_BR)) for o in observations])
 
 

@@ -1,5 +1,4 @@
-"""A circle as the border between pixels on a face and pixels off it: maximum likelihood, blind to pixels that are
-missing."""
+"""Maximum-likelihood circle fit to pixels labelled on or off a face; missing pixels are ignored."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ _SETTLED = 0.05  # gain of the log likelihood below which a step is the last
 
 
 def refine_circle(xy: Array, on_face: NDArray[np.bool_], start: CircleFit, pitch: float, *, outer: bool) -> CircleFit:
-    """Circle (centre and radius) that best divides pixels (N, 2) m on the face from those off it, near its edge.
+    """Fit the circle that best divides pixels (N, 2) m on the face from those off it, near its edge.
 
     A pixel is on the face with the probability Phi(distance to the edge / width), or its label is wrong (2 %). The
     width is the one of a short ladder that makes the labels most likely. Whether a pixel was measured at all may depend
@@ -85,7 +84,7 @@ def _climb(xy: Array, side: Array, theta: Array, width: float) -> tuple[Array, A
 def refine_pair(
     places: Sequence[Single], on_face: Sequence[NDArray[np.bool_]], starts: Sequence[CircleFit], pitch: float
 ) -> list[CircleFit]:
-    """The outer edge and the bore of one face, as ``refine_circle`` finds them from pixels (2, N_k) m, both at once.
+    """Fit outer edge and bore of one face together to pixels (2, N_k) m, as ``refine_circle`` fits one.
 
     ``places`` are about the centres of ``starts``, which are right to a fifth of a pixel. The two share the width of
     their border, which is the scanner's, and the number of steps. Single precision: a millionth of a pixel. Raises
@@ -141,8 +140,8 @@ def _pair_likelihood(
 
 @compiled()
 def exponential(x: np.float32) -> np.float32:
-    """exp(x) for -80 < x < 80, right to 5e-6: 2^n by its bits, the rest by a series; written so that it is done for eight
-    or sixteen numbers at once, which a library's cannot be here."""
+    """exp(x) for -80 < x < 80 with a relative error of 5e-6: 2^n by its bits, the rest by a series. Vectorises, unlike a
+    library call in a compiled loop."""
     y = x * _LOG2_E
     n = np.floor(y + _HALF)
     f = (y - n) * _LN_2

@@ -1,4 +1,4 @@
-"""The robot's flange in a scan: the plane of its face and the concentric edges that give its centre."""
+"""Finds a flange in a scan: the plane of its face and the centre of its concentric edges."""
 
 from __future__ import annotations
 
@@ -31,8 +31,7 @@ _OUT_OF_ROUND_M = 7e-5  # per axis, from half of an edge: halves of recorded clo
 
 @dataclass(frozen=True)
 class FlangeGuess:
-    """Where to look: about ``center_C`` (3,) m, no farther than ``radius_m``, and the outward normal (3,)
-    where known."""
+    """Expected flange: within ``radius_m`` of ``center_C`` (3,) m, with outward normal (3,) where known."""
 
     center_C: Array
     radius_m: float

@@ -1,4 +1,4 @@
-"""Viewing rays of an organised scan as a function of the pixel: a quadratic model, and a pinhole where that fits."""
+"""Models the viewing rays of an organised scan over its pixels: quadratic, or pinhole where that fits."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def _pinhole(A: Array, p: Array) -> Array | None:
 
 
 def pinhole_window(cloud: Array, center: Array, reach: float) -> tuple[tuple[slice, slice], Array | None] | None:
-    """The pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels; and
+    """Rectangle of the pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels; and
     their rays, as ``pinhole_rays`` gives them, where that pinhole fits the whole image."""
     some = _sampled(cloud, 12)
     if some is None or not float(center[2]) > 2.0 * reach:

@@ -1,5 +1,4 @@
-"""Where the edges of a flat face are: mask crossings on organised clouds, outermost points per sector on unordered
-ones."""
+"""Locates the edges of a flat face: mask crossings in organised clouds, extreme points per sector in unordered ones."""
 
 from __future__ import annotations
 
@@ -92,7 +91,7 @@ def organised_edges(points: Array, face: Mask, rays: RayModel, point: Array, nor
 
 
 def face_pixels(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> FacePixels:
-    """Every pixel of a grid (H, W, 3) that says whether the face is there (all but small gaps), in the plane's axes."""
+    """Pixels of a grid (H, W, 3) labelled on or off the face (all but small gaps), in the plane's axes."""
     axes = np.column_stack(plane_axes(normal))
     v, u = np.nonzero(~unknown_pixels(points))
     on_plane = rays.on_plane(u.astype(float), v.astype(float), point, normal)
@@ -100,8 +99,8 @@ def face_pixels(points: Array, face: Mask, rays: RayModel, point: Array, normal:
 
 
 def unknown_pixels(points: Array) -> Mask:
-    """Pixels (H, W) without a reading that tell nothing of an edge: small gaps. One that holds 3 x 3 pixels is void,
-    not face."""
+    """Mask (H, W) of small gaps without a reading, which carry no information on an edge. A gap that holds 3 x 3 pixels
+    counts as off the face."""
     gap = np.isnan(points[..., 2])
     void = ndimage.binary_opening(np.pad(gap, 2, constant_values=True), np.ones((3, 3), dtype=bool))[2:-2, 2:-2]
     return np.asarray(gap & ~void)
@@ -128,7 +127,7 @@ def sector_edges(xy: Array, center: Array, pitch: float, *, outer: bool, band: t
 
 
 def sector_count(radius: float, pitch: float) -> int:
-    """Into how many sectors an edge of that radius is divided."""
+    """Number of sectors for an edge of that radius (m) and point pitch (m)."""
     return int(np.clip(2.0 * np.pi * radius / (_SECTOR_PITCHES * pitch), 24, 720))
 
 

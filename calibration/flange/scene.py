@@ -1,4 +1,4 @@
-"""A scan, cropped and ready to be searched: points alone, or points with their pixel grid and viewing rays."""
+"""A cropped scan: points alone, or points with their pixel grid and viewing rays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The flange in a cloud that shows little else: plane and both edges in a millisecond, or nothing (then it is searched)."""
+"""Fits plane and both edges to a cloud that shows little but the flange; returns None where it does not."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OWN_SHARE = 0.6  # of the points must lie on the one plane, and as many of the 
 
 
 def fit_segmented(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> Face | None:
-    """The face of a flange in points (N, 3) m that are mostly its own; None where anything is out of the ordinary.
+    """Fit a flange face to points (N, 3) m that mostly lie on it; None where any test fails.
 
     Least median of planes on a seeded part, Tukey-weighted least squares on all; then the outermost and innermost point
     of each sector, and both circles at once. Deterministic for ``config.seed``. Points are held in single precision about

@@ -59,7 +59,7 @@ def sigmas(matrix: Array, noise_m: float) -> Array:
 
 
 def unobservable_components(matrix: Array) -> tuple[str, ...]:
-    """Names of the components that a displacement of the flange leaves (nearly) without a trace on the surface."""
+    """Names of the components along which a displacement of the flange changes the surface (nearly) not at all."""
     return tuple(name for name, s in zip(COMPONENTS, _shares(matrix), strict=True) if s < UNOBSERVABLE_SHARE)
 
 

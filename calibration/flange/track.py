@@ -1,4 +1,4 @@
-"""The flange where it was a moment ago: plane and both edges from the few pixels that fix them, or nothing (then search)."""
+"""Fits plane and both edges of a flange within 3 mm of a given pose; returns None where it is not found there."""
 
 from __future__ import annotations
 
@@ -48,9 +48,9 @@ _THREE = np.ones((3, 3), np.uint8)
 def fit_tracked(
     cloud: Array, center: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig
 ) -> Face | None:
-    """The face in a scan (H, W, 3) m whose centre (3,) m and outward normal (3,) were so a moment ago, 3 mm away at most.
+    """Fit the face in a scan (H, W, 3) m within 3 mm of the centre (3,) m and near the outward normal (3,) given.
 
-    None wherever anything is out of the ordinary: not there, partly hidden, no bore, rays that are no pinhole's.
+    None where it is absent, partly hidden or without a bore, and where the rays are not a pinhole's.
     """
     found = pinhole_window(cloud, center, 0.5 * standard.outer_m + _SLACK_M)
     if found is None:
@@ -238,7 +238,7 @@ def _measured(view: _View, fits: list[CircleFit], pitch: float, standard: Flange
 def ring_points(
     z: Single, turned: Array, at: Array, step: int, inner: float, outer: float, tall: float
 ) -> tuple[Array, Index]:
-    """Of every ``step``-th pixel of depths (h, w) m along rows and columns those on a ring about a point.
+    """Select the points on a ring about a point from every ``step``-th pixel of depths (h, w) m.
 
     ``turned`` (3, 3) are the coefficients of the rays in axes whose third is the normal, ``at`` (3,) the point in them;
     ``inner``, ``outer`` and ``tall`` m bound the ring. Returns (x, y, height) (3, N) m about the point and the indices
@@ -266,7 +266,7 @@ def ring_points(
 
 @compiled()
 def borders(face: Mask, known: Mask, turned: Array, at: Array, near: Array) -> tuple[Single, Mask, Index]:
-    """Where the face (h, w) ends between two neighbouring pixels that both say something.
+    """Crossings of the face mask (h, w) between two neighbouring known pixels.
 
     ``turned`` and ``at`` as in ``places``; ``near`` (2,) m is a point on the plane. Returns the places (2, N) m about it
     in its axes, whether the face lies on the inner side of each, and the flat index of the pixel off the face.
@@ -315,7 +315,7 @@ def near_edge(
     pitch: float,
     block: int,
 ) -> tuple[Single, Mask]:
-    """Pixels that say something within ``reach`` m of a circle on the plane: places (2, N) m about its centre, and which
+    """Known pixels within ``reach`` m of a circle on the plane: places (2, N) m about its centre, and which
     lie on the face (N,). The face may end ``lowered`` m below the plane. Blocks of pixels are looked at first."""
     h, w = face.shape
     out, on = np.empty((2, h * w), np.float32), np.empty(h * w, np.bool_)

@@ -1,4 +1,4 @@
-"""A first fit of a made flange: compiled loops are ready before a robot that moves waits for one."""
+"""Compiles the flange fit's loops by fitting a synthetic flange once."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ _NOISE_M = 3e-5
 
 @cache
 def warm_up() -> None:
-    """Searches, follows and cuts out a ring of one standard, once a process: a twentieth of a second, or the seconds that compiling
-    takes where it was never done on this machine."""
+    """Run every path of the flange fit once per process: 0.05 s, or some seconds where the loops are not compiled yet."""
     standard = get_flange(_FLANGE)
     pitch = 2.6 * standard.face_outer_radius_m / _WIDTH
     v, u = np.mgrid[:_WIDTH, :_WIDTH] - 0.5 * (_WIDTH - 1)

@@ -1,4 +1,4 @@
-"""A flange face in a window of an organised scan: plane, edge crossings, and both circles as borders between pixels."""
+"""Fits a flange face in a window of an organised scan: plane, edge crossings, and both circles from pixel labels."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def measure_window(
     config: FlangeFitConfig,
     refusal: Refusal,
 ) -> Face | None:
-    """The face whose outer edge has about ``center`` (3,) m and ``radius`` m, in a part (h, w, 3) of a scan.
+    """Fit the face with an outer edge near ``center`` (3,) m and ``radius`` m in a part (h, w, 3) of a scan.
 
     ``normal`` (3,) outward, within a few degrees. None with the reason noted where it fails a test of a flange.
     """

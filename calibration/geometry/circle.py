@@ -1,4 +1,4 @@
-"""Robust geometric circle fit in the plane, with an honest covariance."""
+"""Robust geometric circle fit in the plane, with the covariance of centre and radius."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STEPS = 7  # of Gauss-Newton in the compiled fit
 
 @dataclass(frozen=True)
 class CircleFit:
-    """A circle and what is known of it: centre (2,) and radius in m, covariance (3, 3) of (cx, cy, r) in m^2."""
+    """A fitted circle: centre (2,) and radius in m, covariance (3, 3) of (cx, cy, r) in m^2, rms m, inliers (N,)."""
 
     center: Array
     radius: float
@@ -104,8 +104,8 @@ def refine_circles(
     settled: float | None = None,
     fixed: NDArray[np.bool_] | None = None,
 ) -> list[CircleFit]:
-    """Circles about the origin of their points (N_k, 2) [m], as ``fit_circle`` refines them from radii [m] that are
-    right to a millimetre or so. Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
+    """Refine circles about the origin of their points (N_k, 2) [m] from radii [m] that are right to about a millimetre.
+    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
     settled = 1e-2 * noise_floor if settled is None else settled
     out = []
     for k, (edge, radius) in enumerate(zip(edges, radii, strict=True)):
@@ -242,7 +242,7 @@ def fuse(centers: list[Array], covariances: list[Array]) -> tuple[Array, Array]:
     """Covariance-weighted mean of concentric centres (k of (m,), (m, m)); inflated where they disagree beyond chance.
 
     Returns the fused centre (m,) and its covariance (m, m). The inflation is the Birge ratio (reduced chi-square, never
-    below one): two rims that are not concentric say how much a centre may be trusted.
+    below one): rims that are not concentric widen the covariance.
     """
     information = np.linalg.inv(np.array(covariances))
     total = np.linalg.inv(information.sum(axis=0))

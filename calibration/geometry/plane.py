@@ -1,4 +1,4 @@
-"""Robust plane fit: local seeded hypotheses, then Tukey-weighted least squares."""
+"""Robust plane fits: seeded local hypotheses, Tukey-weighted least squares, and compiled fits for many points."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, no
 
 @compiled(any_order=True)
 def weighted_moments(p: Single, d: Single, limit: float) -> tuple[float, Single, NDArray[np.float64]]:
-    """Of points (3, N) m at distances (N,) m from a plane, with Tukey's weights: the mean weight, the middle (3,) m and the
+    """Tukey-weighted moments of points (3, N) m at distances (N,) m from a plane: the mean weight, the mean (3,) m and the
     covariance (3, 3) m^2. ``limit`` m is where a point's weight ends. In single precision, so the points must be about their middle."""
     n = p.shape[1]
     k = np.float32(1.0 / limit)
@@ -115,7 +115,7 @@ def weighted_moments(p: Single, d: Single, limit: float) -> tuple[float, Single,
 
 @compiled()
 def plane_steps(p: Array, tolerance: float) -> tuple[bool, Array, Array, float, Array]:
-    """The plane height = a + b x + c y through points (3, N) m by Tukey's weights, from the median height on.
+    """Fit the plane height = a + b x + c y to points (3, N) m with Tukey weights, starting at the median height.
 
     Returns whether more than three points in ten agree, (a, b, c), the moments (3, 3) of (1, x, y) with those weights, the
     residual beyond which a point says nothing and all residuals (N,).
@@ -171,7 +171,7 @@ def plane_steps(p: Array, tolerance: float) -> tuple[bool, Array, Array, float, 
 
 
 def shared_noise(e: Array, good: NDArray[np.bool_], at: NDArray[np.intp], shape: tuple[int, int]) -> float:
-    """How many readings of a grid tell only as much as one, because neighbours share their noise; at least 1.
+    """Number of grid readings per independent one, from the noise that neighbours share; at least 1.
 
     ``e`` (N,) are residuals at the flat indices ``at`` (N,) of an image of that ``shape``, 0 where not ``good`` (N,). The
     variance of sums over blocks of 10 x 10 pixels over what independent readings would have.

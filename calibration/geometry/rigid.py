@@ -1,4 +1,4 @@
-"""Closed-form rigid transform between two point sets (and directions): the paper's Eq. (10) to (12)."""
+"""Closed-form rigid registration of two point sets or direction sets: the paper's Eq. (10) to (12)."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidT
 
 
 def fit_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array]:
-    """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid; collinear sets are left
-    out (k <= s)."""
+    """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid; collinear sets are
+    omitted (k <= s)."""
     R, t, good = fit_all_rigid_sets(p_B, p_C)
     return R[good], t[good]
 

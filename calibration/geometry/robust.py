@@ -16,7 +16,7 @@ _FLAT = 1e-9  # of a diagonal element, what earlier rows leave of it: less, and 
 
 @compiled()
 def middle(a: Array) -> float:
-    """The middle one of numbers (N,) by size, the upper of two; they are put into another order (Hoare's selection)."""
+    """Median of numbers (N,), the upper of two middle ones, by Hoare's selection; reorders its argument."""
     low, high, k = 0, len(a) - 1, len(a) // 2
     while low < high:
         pivot, i, j = a[(low + high) // 2], low, high
@@ -40,7 +40,7 @@ def middle(a: Array) -> float:
 
 @compiled()
 def solved(N: Array, g: Array, free: int) -> tuple[bool, Array]:
-    """Whether the leading ``free`` rows of a symmetric matrix (3, 3) are positive definite, and x with N x = g (Cholesky)."""
+    """Solve N x = g for the leading ``free`` rows of a symmetric matrix (3, 3) by Cholesky; False where not positive definite."""
     L, x = np.zeros((3, 3)), np.zeros(3)
     for i in range(free):
         for j in range(i + 1):

@@ -1,4 +1,4 @@
-"""What the motion can tell and what it cannot: checks before solving, directions left open after it, by name."""
+"""Checks what the motion determines: diversity before the solution, unobservable directions after it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _distinct(stated: list[Array], extent: float) -> int:
 
 
 def check_poses(problem: Problem, *, allow_coplanar: bool = False) -> Diversity:
-    """Refuse what no estimator can solve, before any work.
+    """Refuse poses that do not determine a solution, before any work.
 
     Raises TooFewPoses (fewer equations than unknowns and three to spare), RepeatedPoses, PureTranslation, and
     CoplanarPoses for points alone in one plane or on one line.
@@ -199,7 +199,7 @@ def determinacy(
 
 
 def with_open_directions(covariance: Array, found: Determinacy, length: float) -> Array:
-    """Covariance (m, m) that is never sure of an open direction: ten radians or extents of standard deviation there."""
+    """Covariance (m, m) with unobservable directions widened: ten radians or extents of standard deviation there."""
     out = covariance.copy()
     scale = np.tile([1.0, 1.0, 1.0, length, length, length], len(out) // 6)
     for v in found.directions:
@@ -209,7 +209,7 @@ def with_open_directions(covariance: Array, found: Determinacy, length: float) -
 
 
 def without_drift(problem: Problem, state: State, found: Determinacy) -> State:
-    """The answer whose positions are shortest along directions that carry no information at all."""
+    """The solution with the shortest positions along directions that carry no information."""
     for v in found.directions:
         blocks = v.reshape(-1, 6)
         if float(np.abs(blocks[:, :3]).max()) > 1e-6 * float(np.abs(blocks[:, 3:]).max()):

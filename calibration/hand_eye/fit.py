@@ -1,4 +1,4 @@
-"""Weighted least squares on SE(3): robust, rotation and translation each by the noise their own residuals admit."""
+"""Robust weighted least squares on SE(3); variances of rotation and translation come from the residuals."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def fit(
     begin: Linearised | None = None,
     iterations: int = 60,
     tolerance: float = 1e-6,
-    left_out: bool = True,
+    leave_one_out: bool = True,
 ) -> Fit:
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
@@ -176,6 +176,6 @@ def fit(
     # every observation, at the same state
     w, d = (lin.w, lin.d) if sub is problem else residuals(problem, state, centre)
     left_w, left_d = w.copy(), d.copy()
-    if left_out:
+    if leave_one_out:
         left_w[keep], left_d[keep] = s.leave_one_out(lin)
     return Fit(state, noise, centre, loss, keep, s, lin, left_w, left_d, w, d)

@@ -1,4 +1,4 @@
-"""One linearisation in units of its noise: normal equations, robust weights, covariance, errors left out."""
+"""Whitened linearisation of a hand-eye problem: normal equations, robust weights, covariance, leave-one-out errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at it
 
 
 class Loss(Enum):
-    """How much an observation's own residual may cost."""
+    """Robust loss of an observation's residual."""
 
     SQUARES = "least squares"
     HUBER = "Huber"

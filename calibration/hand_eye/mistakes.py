@@ -1,4 +1,4 @@
-"""The usual mistakes in a file of poses: each undone in turn, and named where the poses then agree far better."""
+"""Detects usual mistakes in pose files: applies each correction and names the one that makes the poses agree."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Trial:
 
 
 def likely_mistake(pairs: PosePairs, given: HandEyeResult | None, config: HandEyeConfig) -> str | None:
-    """The one correction of the input under which the poses agree, and far better than in ``given`` (None: where they do not
+    """Find the one correction of the input under which the poses agree far better than in ``given`` (None: where they do not
     agree at all as they stand); None where no correction does. One robot only.
 
     With both lists inverted the equation holds as well, camera and target exchanged: no data can tell.

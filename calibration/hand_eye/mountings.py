@@ -1,4 +1,4 @@
-"""Every mounting by its name: which frames its equation ties, what its unknowns are called, and a sketch of them."""
+"""The supported mountings: the frames of each equation, the names of its unknowns, and a sketch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Unknown:
 
     @property
     def sentence(self) -> str:
-        """What the result prints before the numbers."""
+        """Description of the pose for printed results."""
         return f"pose of the {self.child_words} in the {self.parent_words} frame: {self.symbol}"
 
 
@@ -117,7 +117,7 @@ MOUNTINGS: dict[str, Mounting] = {
 
 @dataclass(frozen=True)
 class TargetObservation:
-    """One sample. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
+    """One observation of the target. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
     carries the camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
 
     Measured: ``p_CM`` (3,) always, with ``n_CM`` (3,) the unit z axis of the target (its normal) or ``R_CM`` all of its

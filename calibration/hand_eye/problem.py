@@ -1,4 +1,4 @@
-"""One equation for every mounting, F_i X G_i = Y H_i Z, with residuals and their derivatives."""
+"""The equation F_i X G_i = Y H_i Z of every mounting, with residuals and analytic derivatives."""
 
 from __future__ import annotations
 

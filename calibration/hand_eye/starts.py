@@ -1,4 +1,4 @@
-"""Closed-form answers to start from: quaternions, Kronecker products, dual quaternions, logarithms, or a grid of turns."""
+"""Closed-form initial estimates: quaternions, Kronecker products, dual quaternions, logarithms, a rotation grid."""
 
 from __future__ import annotations
 

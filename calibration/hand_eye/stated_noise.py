@@ -1,4 +1,4 @@
-"""How sure a hand-eye result is where every observation states its own covariance: never surer than those say."""
+"""Covariance of a hand-eye result whose observations state their own covariances."""
 
 from __future__ import annotations
 

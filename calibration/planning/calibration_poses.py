@@ -1,4 +1,4 @@
-"""Which flange poses to scan: reachable, clear, in view, and the ones that tell most about where the camera is."""
+"""Plans flange poses for eye-on-base calibration: reachable, clear, visible and D-optimal."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def plan_calibration_poses(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> list[PlannedPose]:
-    """Plan ``n`` (>= 4) flange poses, most telling first: greedy D-optimal on the information of X_BC about the work
+    """Plan ``n`` (>= 4) flange poses, most informative first: greedy D-optimal on the information of X_BC about the work
     point.
 
     A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued.

@@ -1,4 +1,4 @@
-"""A mounting as it is believed to stand: who carries the scanner, who carries the circle it looks at, and what may touch."""
+"""The scene of a mounting as estimated: carriers of scanner and circle, and the bodies that may collide."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _ALONG = np.linspace(0.0, 1.0, 9)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class MountingScene:
-    """What is believed before and while the poses are planned.
+    """The estimated scene during planning.
 
     ``link``: place in link_frames of what carries the scanner (0 base, 6 flange), ``X_LC`` the scanner there. ``X_HR``: the
     circle on what carries it: in the base, on the flange, or on the second arm's flange. ``radius_m``: its outer edge.
@@ -51,7 +51,7 @@ class MountingScene:
 
     @property
     def mounting(self) -> Mounting:
-        """Its equation and words."""
+        """The mounting of this configuration."""
         return get_mounting(self.configuration)
 
     @property
@@ -75,7 +75,7 @@ class MountingScene:
 
     @property
     def state(self) -> State:
-        """The belief as the solver's start."""
+        """The estimate as the solver's start."""
         X, target = np.asarray(self.X_LC.GetAsMatrix4()), np.asarray(self.X_HR.GetAsMatrix4())
         if self.X_BD is None:
             return X, target, IDENTITY
@@ -119,7 +119,7 @@ class MountingScene:
 
 
 class Bodies:
-    """What may touch or hide: arms, the scanner where an arm carries it; each capsule is nine points with a radius."""
+    """Bodies that may collide or occlude: arms, the scanner where an arm carries it; each capsule is nine points with a radius."""
 
     def __init__(self, scene: MountingScene) -> None:
         self.scene = scene

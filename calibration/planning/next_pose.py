@@ -1,4 +1,4 @@
-"""Which pose to add: the one that would shrink the uncertainty at the work point most, reachable and visible."""
+"""Chooses the next hand-eye pose: the reachable, visible one that reduces the uncertainty at the work point most."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class NextPose:
     checked: str = ""
 
     def sentence(self) -> str:
-        """What to do, for a person."""
+        """Instruction for the operator."""
         a = "(" + ", ".join(f"{v + 0.0:+.2f}" for v in self.axis_C) + ")"
         before = "open" if not np.isfinite(self.sigma_before) else f"{1e3 * self.sigma_before:.2f} mm"
         where = ""
@@ -75,7 +75,7 @@ def next_pose(
     arm: Chain | None = None,
     view: View | None = None,
 ) -> NextPose | None:
-    """The most telling of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
+    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
 
     Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for it
     within its limits; where none is named, or where it does not even reach the poses so far (another base or tool frame), the

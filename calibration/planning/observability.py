@@ -1,4 +1,4 @@
-"""What a set of poses can and cannot tell: diversity the solution needs, and errors that would stay hidden in it."""
+"""Checks the diversity of a set of poses and names the errors that they cannot show."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def turn_deg(poses: list[RigidTransform]) -> float:
 
 
 def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float, normals: bool) -> tuple[str, ...]:
-    """Sentences naming the errors that these poses cannot show; empty when there are none worth naming."""
+    """Sentences that name the errors these poses cannot show; empty where there are none."""
     if len(poses) < 2:
         return ("Everything but the flange itself: one pose gives no second look.",)
     # a calibration that fits to a few micrometres still cannot see a bias with a lever of a few degrees

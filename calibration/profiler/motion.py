@@ -1,4 +1,4 @@
-"""The robot's side of a profiler's calibration: flange poses as arrays, checked once, and what their motion lacks."""
+"""Flange poses of a profiler calibration as arrays, with checks of their motion."""
 
 from __future__ import annotations
 

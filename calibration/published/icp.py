@@ -1,4 +1,4 @@
-"""Algorithm 1's own figure: an ICP of one flange against its model (Eq. 13), and how much of a real error it sees."""
+"""Algorithm 1's verification figure: ICP of a flange against its model (Eq. 13), and the share of an error it shows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _UNSEEN_SHARE = 0.5  # a component of which less than half shows is called unsee
 
 @dataclass(frozen=True)
 class VerificationError:
-    """Where a calibration puts the verification flange, relative to where the robot says it is.
+    """Pose error of the verification flange under a calibration, relative to the robot's pose of it.
 
     ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature
     frame R; all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or
@@ -207,7 +207,7 @@ class Sight:
 def sight(
     X_BC: RigidTransform, verification: Verification, *, shift_m: float = 3e-4, turn_rad: float = float(np.radians(0.3))
 ) -> Sight:
-    """Displace a good calibration by known small errors at the flange and see what the registration reports of them.
+    """Measure the share of known small errors at the flange that the registration reports.
 
     0.3 mm and 0.3 degrees are sizes worth seeing; both signs are tried and averaged.
     """

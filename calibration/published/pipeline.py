@@ -1,4 +1,4 @@
-"""The paper's calibration by name: scene, circle, Eq. (9)-(12), Algorithm 1 by the ICP of Eq. (13), Eq. (21)."""
+"""The paper's calibration pipeline: segmentation, circle, Eq. (9)-(12), Algorithm 1 with the ICP of Eq. (13)."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Method = Literal["point_to_point", "point_to_plane"]
 
 @dataclass(frozen=True)
 class PublishedParameters:
-    """Everything the pipeline is told: segmentation, circle, and the registration.
+    """Parameters of the pipeline: segmentation, circle, and registration.
 
     Partners at most 1 mm apart, Open3D's iterations and its stop rule 1e-6 on numbers of ``unit_m`` (the authors' clouds
     are in mm, the AUBO's in m, which stops a thousand times earlier) and the program's point-to-plane or the
@@ -143,7 +143,7 @@ def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, 
 
 
 def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
-    """Eq. (10)-(12) on every pair, without weights and without a look for outliers: Table 1's calibration."""
+    """Eq. (10)-(12) on every pair, without weights or outlier rejection: Table 1's calibration."""
     return fit_rigid(np.array([o.p_BR for o in pairs]), np.array([o.p_CR for o in pairs]))
 
 

@@ -1,4 +1,4 @@
-"""Where the edge problem may start: point-to-line least squares from the 24 orientations of a cube, all at once.
+"""Initial estimates of the edge problem: point-to-line least squares from the 24 orientations of a cube.
 
 The distance of a point to a line has no division by the angle between edge and scan plane, so that this converges from any
 orientation, where the reprojection of edge_joint would not.

@@ -1,4 +1,4 @@
-"""The sphere paper's own method: X_FS from sphere centres in two linear steps, then its compensation by touches.
+"""The sphere paper's method: X_FS from sphere centres in two linear steps, then compensation by touches.
 
 Kept as published, beside sphere_joint, which needs neither the side of the centre nor the pure translations.
 """

@@ -1,4 +1,4 @@
-"""Where the sphere problem may start: radial least squares from the 24 orientations of a cube, all at once, on few points."""
+"""Initial estimates of the sphere problem: radial least squares from the 24 orientations of a cube."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera and pen by the tablet's true size: PnP, then a rigid motion in the plane and the pen's offset."""
+"""Fits camera and pen by the tablet's known size: PnP, then a planar rigid motion and the pen offset."""
 
 from __future__ import annotations
 

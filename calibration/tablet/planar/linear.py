@@ -1,4 +1,4 @@
-"""Camera and pen from one linear least squares of six unknowns: a similarity of the image plane, and the pen's offset."""
+"""Fits camera and pen by linear least squares in six unknowns: an image-plane similarity and the pen offset."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def fit_linear(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> LinearFit
 
 
 def _left_out_together(rays: Array, hand: Array, theta_rad: Array, number: NDArray[np.int64]) -> Array:
-    """Left-out errors (n, 2) m where all touches of a landmark are left out with it; NaN where what is left fixes nothing."""
+    """Leave-one-out errors (n, 2) m, all touches of a landmark held out together; NaN where the rest determines nothing."""
     errors = np.full((rays.shape[1], 2), np.nan)
     for k in range(number.max() + 1):
         keep, one = number != k, number == k

@@ -1,4 +1,4 @@
-"""The paper's two chains, from image and from tablet to the base: homogeneous transforms (HTM) and Denavit-Hartenberg (DH)."""
+"""The tablet paper's two chains to the base: homogeneous transforms (HTM) and Denavit-Hartenberg (DH)."""
 
 from __future__ import annotations
 

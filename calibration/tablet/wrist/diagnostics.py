@@ -1,4 +1,4 @@
-"""What looks wrong with touches from full robot poses: their size, one landmark, the order of numbers; told, never mended."""
+"""Diagnoses touches from full robot poses: scale, single wrong landmarks and wrong order; changes nothing."""
 
 from __future__ import annotations
 

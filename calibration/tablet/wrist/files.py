@@ -1,4 +1,4 @@
-"""Reading what a visit to the tablet left: the page's CSV with robot poses and an image."""
+"""Reads a tablet visit: the page's CSV, robot poses and an image."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _picture(path: Path) -> NDArray[np.uint8]:
         raise TabletDataError(f"There is no file '{path}'.")
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if picture is None:
-        raise TabletDataError(f"'{path.name}' is no image that can be read.")
+        raise TabletDataError(f"'{path.name}' is not a readable image.")
     return np.asarray(picture, dtype=np.uint8)
 
 
@@ -154,7 +154,7 @@ def _warnings(
         found.append("The page's size was not checked with a card: lengths may be wrong by percents.")
     without = [k for k in sorted(rows) if k not in used]
     if without:
-        found.append(f"Left out, for want of a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
+        found.append(f"Excluded, without a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
     if picture is not None:
         size = np.array(picture.shape[::-1])
         off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size

@@ -1,4 +1,4 @@
-"""Camera and pen on the wrist from full robot poses: touches fix tablet and pen, images fix the camera, all in one fit."""
+"""Fits tablet, pen and camera together from full robot poses, touches and images."""
 
 from __future__ import annotations
 

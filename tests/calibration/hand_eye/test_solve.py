@@ -116,7 +116,7 @@ def test_thirty_percent_of_gross_outliers_are_flagged_and_cost_little() -> None:
         # the target's bound: 1.2 times the clean fit, whose answer it is here
         for a, b in zip(errors(dirty, {"X": X, "Y": Y}), errors(clean, {"X": X, "Y": Y}), strict=True):
             assert a <= 1.2 * b
-        assert "left out" in dirty.warnings[0]
+        assert "excluded" in dirty.warnings[0]
 
 
 def test_a_half_turn_camera_and_a_half_turn_hand_are_no_trouble() -> None:

@@ -121,7 +121,7 @@ def test_a_scan_of_something_else_is_named() -> None:
     profiles[3] = profiles[3] + np.array([0.0, 1.5 * MM])
     e = sphere_joint(replace(trial.data, profiles=profiles), "rigid", SIGMAS, init=start)
     assert e.wrong_poses == (3,)
-    assert e.reduced_chi2 == pytest.approx(1.0, abs=0.15)  # it is left out, and the rest agrees
+    assert e.reduced_chi2 == pytest.approx(1.0, abs=0.15)  # it is excluded, and the rest agrees
 
 
 def test_the_arms_errors_move_the_flange_as_their_derivatives_say() -> None:
