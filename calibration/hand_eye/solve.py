@@ -70,7 +70,8 @@ class HandEyeResult:
     the parent's axes; open directions carry a standard deviation of ten (rad, or extents of the motion).
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
     and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
-    ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target where it holds. Lengths are in the unit of the data.
+    ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target where it
+    holds. Lengths are in the unit of the data.
     """
 
     equation: str
