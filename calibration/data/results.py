@@ -227,8 +227,8 @@ def correction_note(result: CalibrationResult) -> str | None:
     correction = correction_from_document(c)
     assert correction is not None
     return (
-        "X_BC belongs to corrected scanner points: multiply every point (x, y, z), in metres, by "
-        f"{correction.formula} before it is used; without that, calibrate with --no-scanner-correction."
+        "X_BC applies to corrected scanner points: multiply every point (x, y, z), in metres, by "
+        f"{correction.formula} before use, or calibrate with --no-scanner-correction."
     )
 
 

@@ -159,7 +159,7 @@ def _said(estimate: CalibrationEstimate, n: int) -> CalibrationEstimate:
         else f"the held-out errors are those of {n - 1} of them"
     )
     text = (
-        f"From {scans} only: the uncertainty rests on what is usual of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "
-        f"{np.degrees(USUAL_TILT_RAD):.2f} degrees an axis), {judged}; a calibration from {ENOUGH} poses and more can judge itself."
+        f"From {scans} only: the uncertainty is based on typical errors of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "
+        f"{np.degrees(USUAL_TILT_RAD):.2f} degrees per axis); {judged}. A calibration from {ENOUGH} poses or more estimates its own errors."
     )
     return replace(estimate, warnings=(*estimate.warnings, text))

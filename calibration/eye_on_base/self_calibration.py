@@ -128,7 +128,7 @@ def self_calibrate(
         )
         held_out, tilt = bent, bent_tilt
         together = from_motion(observations, patterns, seed=seed, order=order, usual=True)
-    said += ". X_BC belongs to scans that are corrected so."
+    said += ". X_BC applies to scans with this correction."
     return SelfCalibration(together, motion, holes, held_out, tilt, said, True)
 
 
@@ -173,7 +173,7 @@ def _from_few(
         tilts,
         f"The scanner is corrected by what the flange's hole circle shows, as {n} poses are too few for the robot's motion to "
         f"confirm it: a scale of {_percent(found)}; held-out errors are {1e3 * after:.3f} mm with it and {1e3 * before:.3f} without "
-        "(mean). X_BC belongs to scans that are corrected so.",
+        "(mean). X_BC applies to scans with this correction.",
         True,
     )
 

@@ -193,7 +193,7 @@ def determinacy(
         part = np.abs(v / scale)
         turning = float(part.reshape(-1, 6)[:, :3].max()) > float(part.reshape(-1, 6)[:, 3:].max())
         much = f"{np.degrees(sigma):.2f} deg" if turning else f"{100.0 * sigma:.1f} % of the extent of the motion"
-        warnings.append(f"Known only to about {much} (1 sigma): {name}; more turn about other axes would help.")
+        warnings.append(f"Known only to about {much} (1 sigma): {name}; rotate more about other axes.")
     condition = float(np.sqrt(values[-1] / values[0])) if values[0] > RANK * values[-1] else float("inf")
     return Determinacy(tuple(directions), names, tuple(dict.fromkeys(warnings)), condition)
 

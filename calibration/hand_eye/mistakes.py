@@ -96,7 +96,7 @@ def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
     # the positions fit when multiplied by 1 + s
     return (
         f"The camera's distances seem {abs(100 * s):.1f} % (+- {100 * sigma:.1f}) too {'short' if s > 0.0 else 'long'} for the "
-        "robot's motion; check the size of the target and the camera's focal length, for an error there shifts the answer."
+        "robot's motion; check the size of the target and the camera's focal length: an error of either shifts the result."
     )
 
 

@@ -227,7 +227,7 @@ def solve_problem(
     if numbers < _SPARE * problem.size:
         warnings.append(
             f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size} unknowns: "
-            "a wrong sample or a wrong convention would hardly show; add some before trusting the answer."
+            "a wrong sample or convention is hard to detect; add samples before you rely on the result."
         )
     if not keep.all():
         names = ", ".join(str(i) for i in np.nonzero(~keep)[0])

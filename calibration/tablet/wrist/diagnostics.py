@@ -36,8 +36,8 @@ def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...])
     pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
     if pixel > _BAD_PIXEL:
         found.append(
-            f"The picture shows the landmarks {pixel:.1f} px from where the fit has them: check the camera's numbers, its distortion, "
-            "and that picture and page belong together."
+            f"The image shows the landmarks {pixel:.1f} px from the positions of the fit: check the camera's intrinsics, its distortion, "
+            "and that image and page belong together."
         )
     return tuple(found)
 
@@ -82,7 +82,9 @@ def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> s
         without = [_misfit(data.pick(np.arange(len(names)) != k)) for k in range(len(names))]
         worst = int(np.argmin(without))
         if without[worst] < min(_BETTER * left_m, _GOOD_TOUCH_M):  # else more than one of them is wrong
-            return f"{plain}, without landmark {names[worst]} to {1e3 * without[worst]:.2f}: touch it again, or leave it out."
+            return (
+                f"{plain}, without landmark {names[worst]} to {1e3 * without[worst]:.2f}: touch it again or exclude it."
+            )
     changed = {
         "the quaternions' w where z is written": tuple(_rolled(X, 1) for X in data.X_BF),
         "the quaternions' w where x is written": tuple(_rolled(X, -1) for X in data.X_BF),

@@ -151,7 +151,7 @@ def _warnings(
 ) -> tuple[str, ...]:
     found = []
     if any(rows[k].get("size_checked", "1") == "0" for k in used):
-        found.append("The page's size was not checked with a card: lengths may be wrong by percents.")
+        found.append("The page's size was not checked with a card: lengths may be wrong by some per cent.")
     without = [k for k in sorted(rows) if k not in used]
     if without:
         found.append(f"Excluded, without a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
@@ -160,8 +160,8 @@ def _warnings(
         off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size
         if off.max() > _OFF_CENTRE:
             found.append(
-                f"The picture has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at "
-                f"{intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these numbers seem to belong to pictures of another "
+                f"The image has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at "
+                f"{intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these intrinsics seem to belong to images of another "
                 "size, or turned."
             )
     return tuple(found)

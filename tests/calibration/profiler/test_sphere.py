@@ -201,7 +201,7 @@ def test_a_wrong_radius_is_named() -> None:
     felt = [data.touches.rotation, data.touches.translation, data.tip]
     free = fit_touch_sphere(*felt, RADIUS_M, solve_radius=True)  # type: ignore[arg-type]
     assert free.radius_m == pytest.approx(RADIUS_M, abs=0.1 * MM)
-    with pytest.raises(RadiusError, match="make a sphere"):
+    with pytest.raises(RadiusError, match="fit a sphere"):
         fit_touch_sphere(*felt, RADIUS_M + 0.5 * MM, solve_radius=True)  # type: ignore[arg-type]
     with pytest.raises(InconsistentData, match="check the radius"):
         sphere_joint(replace(data, radius_m=RADIUS_M + 3 * MM), "rigid", SIGMAS, init=start)
