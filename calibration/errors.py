@@ -1,4 +1,4 @@
-"""Named refusals of the calibration room: each says in one sentence what to change."""
+"""Exceptions of the calibration package; each message names what to change."""
 
 from __future__ import annotations
 

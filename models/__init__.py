@@ -1,1 +1,1 @@
-"""What exists: arms, flanges, scanners, the soft tool, workpieces, scenarios."""
+"""Numbers and shapes of arms, flanges, scanners, profilers, the welding tool, workpieces and scenarios."""

@@ -1,4 +1,4 @@
-"""The circle of a robot's own base mounting: the ring that its foot ends in, which a scanner on the wrist can look back at."""
+"""The circle of a robot's base mounting: its standard and its pose in the base."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A grooved plate bent over a cylinder: the same seam in space, its up-normal turning along it."""
+"""Bends a grooved plate over a cylinder: the same seam in space, with an up-normal that turns along it."""
 
 from __future__ import annotations
 

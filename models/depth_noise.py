@@ -1,4 +1,4 @@
-"""What a real scanner does to a perfect depth map: noise, warp, flying pixels, dropouts and quantisation, seeded."""
+"""Applies a scanner's errors to a perfect depth map: noise, warp, flying pixels, dropouts and quantisation; seeded."""
 
 from __future__ import annotations
 

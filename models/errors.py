@@ -1,4 +1,4 @@
-"""The one base of every named exception: what a user can put right, in one sentence."""
+"""Base classes of all named exceptions."""
 
 from __future__ import annotations
 

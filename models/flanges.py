@@ -1,4 +1,4 @@
-"""The robot's own tool flange as data (ISO 9409-1:2004) and as geometry: the feature that calibration looks at.
+"""Tool flanges by ISO 9409-1:2004: dimensions and meshes.
 
 Frame R: origin at the circle centre in the plane of the flat face, z the outward face normal; the body lies at z < 0.
 

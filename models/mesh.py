@@ -1,4 +1,4 @@
-"""Triangle meshes that are closed, oriented outward and readable by Drake: extrusions, revolutions and swept grids."""
+"""Closed, outward-oriented triangle meshes for Drake: extrusions, revolutions and swept grids."""
 
 from __future__ import annotations
 

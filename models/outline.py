@@ -1,4 +1,4 @@
-"""The edges of a mesh that a draughtsman would draw: where two faces meet at an angle, and where a face ends."""
+"""Extracts the feature edges of a mesh: creases and open boundaries."""
 
 from __future__ import annotations
 

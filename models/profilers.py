@@ -1,4 +1,4 @@
-"""A laser profiler as it measures: rays of one plane cast onto meshes, then noise, rounding, spikes and missing returns.
+"""Simulates a laser profiler: rays of one plane cast onto meshes, with noise, rounding, spikes and missing returns.
 
 Frame S: x along the laser line, z away from the sensor, y across the plane of light; a profile point [x, z] is (x, 0, z).
 """

@@ -1,4 +1,4 @@
-"""Robots by name: which flange they carry, what they may do, and how far their kinematics are known here."""
+"""Supported robots: flange, payload, reach, and the sources of their numbers."""
 
 from __future__ import annotations
 

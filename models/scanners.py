@@ -1,4 +1,4 @@
-"""3D scanners by name: intrinsics, working range and noise, and the depth maps they would return.
+"""Supported 3D scanners: intrinsics, working range and noise, and their depth maps.
 
 One pixel convention everywhere: OpenCV's, the centre of the first pixel at (0, 0). `drake_intrinsics` is the only place
 that converts it to what Drake's camera wants.
@@ -155,7 +155,7 @@ def get_scanner(name: str, width: int | None = None, height: int | None = None) 
         raise InputError(f"Scanner '{name}' is not known: use one of {', '.join(SCANNERS)}.")
     if width is None:
         if height is not None:
-            raise InputError("A scanner is resized by its width: give the width too, or leave the height out.")
+            raise InputError("A scanner is resized by its width: give the width too, or omit the height.")
         return preset
     return preset.resized(width, height)
 

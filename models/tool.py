@@ -1,4 +1,4 @@
-"""The touch-based welding tool of Fig. 7: plate with a flange-like ring, finger camera, soft tip with its tag, torch."""
+"""The touch-based welding tool (paper, Fig. 7): plate with flange ring, finger camera, soft tip with tag, torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plates with a V-groove along a straight, S or L seam: the CAD that is planned on, and the part as it really is.
+"""Plates with a V-groove along a straight, S or L seam: the nominal geometry and the manufactured part.
 
 Frame P: origin on the top face at the centre of the (uncut) plate, x along it, z up; the groove is cut from above.
 The groove runs right through: the seam starts at one plate edge and ends at another. On real parts the plate outline is
@@ -42,11 +42,6 @@ class PlanarPath:
     def length_m(self) -> float:
         """Arc length from the first to the last piece's end, m."""
         return sum(length for length, _ in self.pieces)
-
-    @property
-    def tightest_radius_m(self) -> float:
-        """Smallest radius of any piece, m (infinite for straight paths)."""
-        return min((1.0 / abs(k) for _, k in self.pieces if k != 0.0), default=math.inf)
 
     def at(self, s: npt.ArrayLike) -> tuple[Floats, Floats]:
         """Points (N,2) and headings (N,) at arc lengths s (N,), exact on every piece."""

@@ -1,1 +1,1 @@
-"""Datasets, clouds, tables and results: reading and writing, every refusal named."""
+"""Reads and writes datasets, point clouds, tables and calibration results."""

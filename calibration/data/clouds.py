@@ -1,4 +1,4 @@
-"""Point clouds from PLY, PCD, NPZ, NPY and text files, refused with a reason when empty, truncated or full of NaN."""
+"""Reads point clouds from PLY, PCD, NPZ, NPY and text files; refuses damaged ones with a reason."""
 
 from __future__ import annotations
 

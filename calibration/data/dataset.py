@@ -1,4 +1,4 @@
-"""A calibration dataset folder: poses, clouds and pairs, read with every number checked and every refusal named."""
+"""Reads, checks and writes a calibration dataset folder: poses, clouds and pairs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _REACH_M = (0.001, 10.0)  # distances from the base that a robot flange can have
 
 @dataclass(frozen=True)
 class Pair:
-    """A centre already found: camera point (3,) m and the robot's pose of the feature (rotation identity where not
+    """A centre found by other means: camera point (3,) m and the robot's pose of the feature (rotation identity where not
     given)."""
 
     id: str
@@ -57,7 +57,7 @@ class Dataset:
         return RigidTransform(_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
 
     def guess(self, id: str) -> RigidTransform | None:
-        """Where the header's guess of the scanner's pose puts the feature in the camera frame, X_CR; None without a guess."""
+        """Pose X_CR of the feature in the camera frame from the header's guess of X_BC; None without a guess."""
         g = self.header.scanner_guess
         if g is None:
             return None
@@ -187,7 +187,7 @@ def _rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
     seen: set[str] = set()
     for row in rows:
         if not row["id"] or Path(row["id"]).name != row["id"]:
-            raise DatasetError(f"'{path.name}' has a row whose id '{row['id']}' is empty or no plain name.")
+            raise DatasetError(f"'{path.name}' has a row whose id '{row['id']}' is empty or not a plain name.")
         if row["id"] in seen:
             raise DatasetError(f"'{path.name}' gives the id '{row['id']}' twice; keep one row for each scan.")
         seen.add(row["id"])
@@ -284,14 +284,14 @@ def _match(folder: Path, poses: dict[str, RigidTransform]) -> tuple[dict[str, Pa
     if orphans:
         names = ", ".join(p.name for p in orphans[:5])
         raise DatasetError(
-            f"'poses.csv' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or take the "
-            "cloud away."
+            f"'poses.csv' has no pose for {names}; add the missing row{'s' if len(orphans) > 1 else ''} or remove the "
+            "cloud."
         )
     return clouds, tuple(refused)
 
 
 def _repeated(scans: Mapping[str, tuple[object, ...]]) -> tuple[tuple[str, str], ...]:
-    """Scans that are another one to the last digit: they would count twice, and be foretold by their own copy."""
+    """Scans identical to another one, with the reason: a copy would count twice and predict itself in cross-validation."""
     first: dict[tuple[object, ...], str] = {}
     again = []
     for id, scan in scans.items():

@@ -1,4 +1,4 @@
-"""dataset.yaml as typed data: what the files of a calibration dataset hold, and in which units."""
+"""Schema of dataset.yaml: the contents of a calibration dataset and its units."""
 
 # no `from __future__ import annotations` here: pydrake's YAML reader needs the field types themselves, not their names
 
@@ -24,7 +24,7 @@ class Feature:
 
 @dataclass
 class ScannerGuess:
-    """Where the scanner roughly stands, X_BC: position m, quaternion wxyz, and how far off that may put the feature, m."""
+    """Approximate pose X_BC of the scanner: position m, quaternion wxyz, and the largest error of the feature it causes, m."""
 
     xyz: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     wxyz: list[float] = field(default_factory=lambda: [1.0, 0.0, 0.0, 0.0])
@@ -33,7 +33,7 @@ class ScannerGuess:
 
 @dataclass
 class DatasetHeader:
-    """dataset.yaml, as written."""
+    """Contents of dataset.yaml."""
 
     schema: int = 0
     robot: str = ""

@@ -1,4 +1,4 @@
-"""A calibration as a file: what was found, how well, from which data; written whole or not at all, and read back."""
+"""Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.eye_on_base.scanner_model import correction_from_document
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ class PoseRecord:
 
 @dataclass(frozen=True)
 class IcpRecord:
-    """Algorithm 1's own figure at one verification pose: six numbers at the flange centre, and what it does not see."""
+    """Algorithm 1's ICP figure at one verification pose: six numbers at the flange centre, and the components it does not see."""
 
     id: str
     method: str
@@ -53,7 +53,7 @@ class IcpRecord:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """All that calibration.yaml holds. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
+    """Contents of calibration.yaml. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
     origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one;
     ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans."""
 
@@ -92,7 +92,7 @@ def matrix4(X: RigidTransform) -> list[list[float]]:
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that a reader sees the old file or the whole new one, never a part."""
+    """Write a text file atomically: a reader sees the old file or the complete new one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -220,15 +220,15 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
 
 
 def correction_note(result: CalibrationResult) -> str | None:
-    """One sentence for who reads X_BC without this program: it belongs to corrected points; None where it does not."""
+    """Note for users of X_BC in other programs that it applies to corrected points; None without a correction."""
     c = result.scanner_correction
     if c is None:
         return None
     correction = correction_from_document(c)
     assert correction is not None
     return (
-        "X_BC belongs to corrected scanner points: multiply every point (x, y, z), in metres, by "
-        f"{correction.formula} before it is used; without that, calibrate with --no-scanner-correction."
+        "X_BC applies to corrected scanner points: multiply every point (x, y, z), in metres, by "
+        f"{correction.formula} before use, or calibrate with --no-scanner-correction."
     )
 
 

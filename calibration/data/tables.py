@@ -1,4 +1,4 @@
-"""CSV tables as people and spreadsheets write them: any usual separator, decimal commas, comments, any case of the header."""
+"""Reads CSV tables with any usual separator, decimal commas, comments and headers in any case."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
     """Names of the columns (lower case) and the rows by name, all stripped; a cell that is missing is empty.
 
     The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #, empty
-    lines and rows without a value are left out. Decimal commas become points where the comma separates nothing. Raises
+    lines and rows without a value are skipped. Decimal commas become points where the comma separates nothing. Raises
     InputError: no such file, no text.
     """
     if not path.is_file():
@@ -25,9 +25,9 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as e:
-        raise InputError(f"'{path.name}' is no CSV text.") from e
+        raise InputError(f"'{path.name}' is not a CSV text file.") from e
     if "\0" in text:
-        raise InputError(f"'{path.name}' is no CSV text.")
+        raise InputError(f"'{path.name}' is not a CSV text file.")
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
     if not lines:
         return [], []

@@ -1,1 +1,1 @@
-"""From observations of the flange to X_BC of a scanner beside the arm, its covariance and its validation."""
+"""Estimates X_BC of a scanner beside the arm from observations of the flange, with covariance and validation."""

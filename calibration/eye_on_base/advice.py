@@ -1,4 +1,4 @@
-"""Which poses to add next, and when to stop: what the poses taken so far leave open, in sentences."""
+"""Advises which poses to add and when to stop, from what the poses so far leave uncertain."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LITTLE = 0.1  # gain by one more pose, as a share of the error, that is not wor
 def sampling_advice(
     estimate: CalibrationEstimate, observations: Sequence[Observation], *, required_m: float | None = None
 ) -> tuple[str, ...]:
-    """Advice from an estimate and the sightings that made it (those left out as outliers count for nothing).
+    """Advice from an estimate and the observations that made it (outliers are ignored).
 
     Names the directions in which positions vary too little, says whether orientations vary, where in the poses' own
     field a scanned point is worst known, and what one more pose like these would gain; with ``required_m`` (standard
@@ -48,7 +48,7 @@ def sampling_advice(
     turned = turn_deg([o.X_BR for o in used])
     if turned < _TURN_DEG:
         out.append(
-            f"Turn and tilt the flange between poses, by 20 degrees and more: these differ by {turned:.1f} degrees, so a "
+            f"Turn and tilt the flange between poses by 20 degrees or more: these poses differ by {turned:.1f} degrees, so a "
             "constant error of the flange centre or of the tool's offset cannot be seen."
         )
     sigma = sigma_at(estimate, middle)
@@ -56,29 +56,31 @@ def sampling_advice(
     if sigma_at(estimate, weak) > _WEAK_FACTOR * sigma:
         x, y, z = 1e3 * weak
         out.append(
-            f"The next pose tells most near ({x:.0f}, {y:.0f}, {z:.0f}) mm of the base: a scanned point is known to "
-            f"{1e3 * sigma_at(estimate, weak):.2f} mm there and to {1e3 * sigma:.2f} mm in the middle."
+            f"The most informative next pose is near ({x:.0f}, {y:.0f}, {z:.0f}) mm in the base: the uncertainty of a scanned point is "
+            f"{1e3 * sigma_at(estimate, weak):.2f} mm there and {1e3 * sigma:.2f} mm in the middle."
         )
     n = len(used)
     gain = 1.0 - np.sqrt(n / (n + 1.0))
     if required_m is not None and sigma <= required_m and not out:
-        out.append(f"Stop: a scanned point is known to {1e3 * sigma:.2f} mm, {1e3 * required_m:.2f} mm were asked for.")
+        out.append(
+            f"Stop: the uncertainty of a scanned point is {1e3 * sigma:.2f} mm, {1e3 * required_m:.2f} mm is required."
+        )
     elif gain < _LITTLE and not out:
         out.append(
-            f"Stop here if {1e3 * sigma:.2f} mm is enough: one more pose would improve that by {100 * gain:.0f} %, and the "
-            f"scatter of a single scan, {1e3 * estimate.sigma_position_m:.2f} mm an axis, by nothing."
+            f"Stop if {1e3 * sigma:.2f} mm is enough: one more pose would reduce it by {100 * gain:.0f} %, and would "
+            f"not reduce the scatter of a single scan, {1e3 * estimate.sigma_position_m:.2f} mm per axis."
         )
     elif gain >= _LITTLE:
         want = int(np.ceil(1.0 / (1.0 - (1.0 - _LITTLE) ** 2)))
         out.append(
-            f"Add poses up to {want} or more: each still improves {1e3 * sigma:.2f} mm by {100 * gain:.0f} % or more."
+            f"Add poses, up to {want} or more: each reduces the uncertainty of {1e3 * sigma:.2f} mm by {100 * gain:.0f} % or more."
         )
     return tuple(out)
 
 
 def weakest_place(estimate: CalibrationEstimate, p_B: Array) -> Array:
-    """Of the ends of the axes along which poses (n, 3) m spread, half as far again, the one (3,) where a scanned point is known
-    worst."""
+    """The place (3,) m with the largest uncertainty of a scanned point, of the ends of the principal axes of poses (n, 3) m,
+    half as far again."""
     middle = p_B.mean(axis=0)
     spread = np.linalg.svd(p_B - middle, full_matrices=False)
     reach = spread[2] * (spread[1] / np.sqrt(len(p_B)))[:, None]

@@ -1,4 +1,4 @@
-"""A calibration and what is known of it: X_BC, its covariance, held-out errors, and what a scanned point owes to them."""
+"""The estimate of X_BC with its covariance, residuals and held-out errors, and the error of a scanned point."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 from scipy.stats import f as f_distribution
 
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
-from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.geometry.se3 import skew
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -30,7 +30,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class CalibrationEstimate:
-    """Pose of the camera in the base and what is known of it.
+    """Pose of the camera in the base with its covariance, residuals and held-out errors.
 
     ``covariance`` (6, 6), order [rotation; translation]: X_BC = (exp(dtheta) R, p + dp), dtheta (rad) a rotation on the
     base side about the camera origin, dp (m) the displacement of the camera origin, both expressed in B.
@@ -83,5 +83,5 @@ def with_scanner(
 
 
 def few_residuals(redundancy: float) -> float:
-    """By how much a region widens whose scale was found from so many spare numbers."""
+    """Factor by which a 95 % region widens because its scale was estimated with that redundancy (F to chi-square)."""
     return float(6.0 * f_distribution.ppf(0.95, 6, redundancy) / chi2.ppf(0.95, 6))

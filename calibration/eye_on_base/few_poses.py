@@ -1,4 +1,4 @@
-"""The scanner's pose from one, two or three scans: with normals, or whole poses where the turn of the holes is known."""
+"""Estimates X_BC from one, two or three scans, from normals or from whole poses by the hole pattern."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from weldcal.calibration.eye_on_base.solve import USUAL_SPREAD_M, USUAL_TILT_RAD
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.planning.observability import unobservable_sentences
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ _USUAL_WEIGHT = 4.0  # residuals' worth of what is usual of robot and scanner
 
 @dataclass(frozen=True, eq=False)
 class FewPosesEstimate:
-    """X_BC from ``ids``, and how far (m) each flange centre is from where it puts it; zero where there is only one."""
+    """X_BC from ``ids``, and the residuals (m) of the flange centres; zero where there is only one."""
 
     X_BC: RigidTransform
     ids: tuple[str, ...]
@@ -40,7 +40,7 @@ class FewPosesEstimate:
 def estimate_from_whole_poses(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], turn_rad: float = 0.0
 ) -> FewPosesEstimate:
-    """X_BC from the sightings whose hole pattern was seen (n >= 1): each gives all six degrees of freedom.
+    """X_BC from the observations whose hole pattern was seen (n >= 1): each gives all six degrees of freedom.
 
     ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says it is;
     ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged (chordal
@@ -86,8 +86,8 @@ def calibrate_from_few(
     *,
     seed: int = 0,
 ) -> CalibrationEstimate:
-    """X_BC from one to three sightings, with a covariance that rests on what is usual of robot and scanner where the data are
-    too few to say.
+    """X_BC from one to three observations, with a covariance from the usual errors of robot and scanner where the data are
+    too few.
 
     With ``axis_turn_rad`` (see estimate_from_whole_poses) one scan that shows the holes is enough; without it three pairs, or two
     scans with face normals. Held-out errors are those of each pose under the others, NaN where the others are too few. Raises
@@ -159,7 +159,7 @@ def _said(estimate: CalibrationEstimate, n: int) -> CalibrationEstimate:
         else f"the held-out errors are those of {n - 1} of them"
     )
     text = (
-        f"From {scans} only: the uncertainty rests on what is usual of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "
-        f"{np.degrees(USUAL_TILT_RAD):.2f} degrees an axis), {judged}; a calibration from {ENOUGH} poses and more can judge itself."
+        f"From {scans} only: the uncertainty is based on typical errors of robot and scanner ({1e3 * USUAL_SPREAD_M:.2f} mm and "
+        f"{np.degrees(USUAL_TILT_RAD):.2f} degrees per axis); {judged}. A calibration from {ENOUGH} poses or more estimates its own errors."
     )
     return replace(estimate, warnings=(*estimate.warnings, text))

@@ -1,9 +1,9 @@
-"""From a dataset to sightings of the flange: every cloud fitted or refused by name, pairs taken as they are."""
+"""Fits the flange in every cloud of a dataset; returns observations and the reasons of refused scans."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
@@ -25,8 +26,8 @@ _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """What was seen: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
+class FlangeObservations:
+    """Results of the flange fits: an observation for each usable scan, its fit, its hole pattern where one shows and its face's points
     (N, 3) m by id (none for pairs), and (id, reason) for each scan that is refused."""
 
     observations: tuple[Observation, ...]
@@ -44,15 +45,17 @@ def see_flanges(
     holes: bool = True,
     seed: int = 0,
     tell: Callable[[float], None] = lambda fraction: None,
-) -> Sightings:
-    """Fit the flange in every cloud of a dataset, or take its pairs as they are.
+) -> FlangeObservations:
+    """Fit the flange in every cloud of a dataset, or use its pairs as they are.
 
     ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole. Without
     ``holes`` no hole pattern is looked for. Deterministic for ``seed``. ``tell`` is told the fraction done. Raises
     InputError, before any work, naming the first cloud file that is damaged.
     """
     if data.pairs:
-        return Sightings(tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, data.refused)
+        return FlangeObservations(
+            tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, data.refused
+        )
     _check_clouds(data)
     observations: list[Observation] = []
     fits: dict[str, FlangeFit] = {}
@@ -73,7 +76,16 @@ def see_flanges(
             patterns[id] = pattern
         clouds[id] = face_cloud(points, fit, standard)
         observations.append(observation_from_fit(id, data.poses[id], fit, data.X_FR))
-    return Sightings(tuple(observations), fits, patterns, clouds, tuple(refused))
+    return FlangeObservations(tuple(observations), fits, patterns, clouds, tuple(refused))
+
+
+def corrected_observation(correction: ScannerCorrection, o: Observation) -> Observation:
+    """An observation with the scanner's correction applied to its centre p_CR (m) and its normal n_C."""
+    return replace(
+        o,
+        p_CR=correction.points(o.p_CR),
+        n_C=None if o.n_C is None else correction.normals(np.asarray(o.p_CR), o.n_C),
+    )
 
 
 def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, seed: int, *, whole: bool) -> FlangeFit:
@@ -87,7 +99,7 @@ def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, see
 
 
 def _check_clouds(data: Dataset) -> None:
-    """Read every file before any work: a damaged one is the user's to mend, unlike a scan in which no flange is found.
+    """Read every file before any work: the user must replace a damaged one, unlike a scan in which no flange is found.
 
     Raises:
         InputError: naming the first such file, what is wrong with it and how many there are.
@@ -100,7 +112,7 @@ def _check_clouds(data: Dataset) -> None:
             bad.append(f"{id}: {e.reason}")
     if bad:
         more = f" ({len(bad) - 1} more clouds are damaged too)" if len(bad) > 1 else ""
-        raise InputError(f"A cloud cannot be used{more}; mend it, or take it away together with its pose: {bad[0]}")
+        raise InputError(f"A cloud cannot be used{more}; replace it, or remove it together with its pose: {bad[0]}")
 
 
 def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransform | None) -> FlangeGuess | None:

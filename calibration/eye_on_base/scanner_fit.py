@@ -1,4 +1,4 @@
-"""A scanner's correction from sightings of the flange: what the robot's motion and the hole circles say of it."""
+"""Fits a scanner correction to observations of the flange, from the robot's motion and from the hole circles."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.scanner_model import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 
 Array = NDArray[np.float64]
 
 LEAST_PATTERNS = 6
-STARTS = 30  # random starts of an estimate: these sightings are cleared of gross outliers
+STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers
 _MARGIN_M = 0.03  # a face reaches so far about its centre: there, too, a bend was seen
 _USUAL = np.array([2e-3, 1.5e-2, 1.5e-2])  # what scanners are off in scale and gradient (1/m)
 _USUAL_SPREAD_M = 1e-4
@@ -75,13 +75,13 @@ def from_motion(
     usual: bool = False,
     start: RigidTransform | None = None,
 ) -> CorrectionEstimate:
-    """Correction and camera pose that together bring sightings (n >= 3) and robot poses to agree; with ``patterns``, the
-    hole circles to their nominal size as well.
+    """Fit correction and camera pose together to observations (n >= 3) and robot poses; with ``patterns`` the hole circles'
+    nominal size is fitted, too.
 
-    The sightings are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
+    The observations are cleared of gross outliers. ``order`` 1 to 3 is the highest power of x and y in the factor. With ``usual`` it is
     held to what scanners are usually off, which lets few poses say as much as they know. Gauss-Newton over the 9, 12 or 16 unknowns,
     reweighted (soft L1 beyond two sigma); each kind of datum counts by its own spread, found from the residuals over its own
-    redundancy. ``start`` is a camera pose near by, as from the same sightings and one more: it saves the search for one. Raises
+    redundancy. ``start`` is a camera pose near by, as from the same observations and one more: it saves the search for one. Raises
     TooFewPoses below three and, without ``start``, what estimate_eye_on_base raises.
     """
     if len(observations) < 3:
@@ -139,7 +139,7 @@ def from_motion(
         information = J.T @ (w[:, None] * J) + np.diag(prior**2)
         unknown = np.concatenate([np.zeros(6), change])
         step = -np.linalg.solve(information, J.T @ (w * e) + prior**2 * unknown)
-        dR = exp_rotation(step[:3]).matrix()
+        dR = exp_rotation(step[:3])
         R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:6]
         change = change + step[6:]
         if k in (2, 4, 6, 8):  # robust spreads of what the unknowns leave, each kind by its own redundancy
@@ -175,7 +175,7 @@ def from_holes(observations: Sequence[Observation], patterns: Mapping[str, HoleP
 
 
 def correction_of(change: Array, field: tuple[float, float, float, float] | None = None) -> ScannerCorrection:
-    """The correction whose factors (K,) differ by ``change`` from those of a right scanner."""
+    """The correction whose factors (K,) differ by ``change`` from those of a perfect scanner."""
     limited = np.clip(change[0], -0.05, 0.05)
     bend = tuple(float(v) for v in change[3:])
     return ScannerCorrection(1.0 + float(limited), (float(change[1]), float(change[2])), bend, field if bend else None)

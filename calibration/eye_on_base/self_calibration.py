@@ -1,4 +1,4 @@
-"""The scanner's own scale error, from the robot's motion and from the flange's hole circle; believed where they agree."""
+"""Decides whether to correct the scanner, by comparing robot motion, hole circles and held-out errors."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import (
     CIRCLE_OWN,
     CorrectionEstimate,
     from_holes,
     from_motion,
 )
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -28,8 +29,8 @@ Array = NDArray[np.float64]
 _LEAST_POSES = 8  # nine unknowns, and as many held-out errors as make a comparison
 _LEAST_FOR_THIRD = 12  # sixteen unknowns
 _FEWEST_PATTERNS = 3  # below eight poses, where the hole circle decides
-_BLIND_SCALE = 2e-3  # a scale known worse than this is as good as unknown: scanners are right to 0.2 %
-_BLIND_GRADIENT = 2e-2
+_UNKNOWN_SCALE = 2e-3  # a scale known worse than this is as good as unknown: scanners are right to 0.2 %
+_UNKNOWN_GRADIENT = 2e-2
 _EVIDENT = 0.999  # probability that the correction is not zero by chance
 _EVIDENT_FEW = 0.95  # the same below eight poses, where the correction is held back besides
 _CHANCE_FEW = 1.6  # held-out errors of four poses differ by as much by chance: root of F (12, 12) at 5 %
@@ -39,7 +40,7 @@ _GAIN = 0.95  # of the held-out error that must be left at most: a correction th
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """The verdict. ``found`` is None where the scanner is taken as it is; ``sentence`` says why, or what was found;
+    """Decision on the scanner correction. ``found`` is None where the scanner is taken as it is; ``sentence`` says why, or what was found;
     ``worth_saying`` where a reader of the result should know it. ``held_out_m`` and ``held_out_tilt_rad`` (n,) are errors
     of each pose under a correction and a calibration that never saw it; NaN where they were not needed."""
 
@@ -53,7 +54,7 @@ class SelfCalibration:
 
     @property
     def accepted(self) -> ScannerCorrection | None:
-        """The correction that is believed; None where the scanner is taken as it is."""
+        """The accepted correction; None where the scanner is not corrected."""
         return None if self.found is None else self.found.correction
 
 
@@ -64,7 +65,7 @@ def self_calibrate(
     *,
     seed: int = 0,
 ) -> SelfCalibration:
-    """Decide on a scanner correction from good sightings (n) and the hole patterns seen in them (by id).
+    """Decide on a scanner correction from inlier observations (n) and the hole patterns seen in them (by id).
 
     It is accepted only if robot motion and hole circle each determine it and do not contradict each other, if it is
     not zero by chance, and if errors on poses that neither correction nor calibration saw fall below
@@ -85,7 +86,7 @@ def self_calibrate(
             return few
         return refused(f"No scanner correction: {n} poses do not determine one; take {_LEAST_POSES} or more.")
     motion = from_motion(observations, {}, seed=seed)
-    if motion.sigma[0] > _BLIND_SCALE or float(motion.sigma[1:].max()) > _BLIND_GRADIENT:
+    if motion.sigma[0] > _UNKNOWN_SCALE or float(motion.sigma[1:].max()) > _UNKNOWN_GRADIENT:
         return refused(
             "No scanner correction: the positions vary too little for one (its scale would be known to "
             f"{1e2 * motion.sigma[0]:.2f} %); spread the poses over the field of view and in depth."
@@ -127,7 +128,7 @@ def self_calibrate(
         )
         held_out, tilt = bent, bent_tilt
         together = from_motion(observations, patterns, seed=seed, order=order, usual=True)
-    said += ". X_BC belongs to scans that are corrected so."
+    said += ". X_BC applies to scans with this correction."
     return SelfCalibration(together, motion, holes, held_out, tilt, said, True)
 
 
@@ -152,7 +153,7 @@ def _from_few(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], rigid_held_out_m: Array, seed: int
 ) -> SelfCalibration | None:
     """The verdict below eight poses: the hole circles, and motion as far as it tells, held to what scanners usually are off;
-    believed where that is not zero by chance and errors at poses left out of correction and calibration do not rise beyond
+    believed where that is not zero by chance and held-out errors do not rise beyond
     chance; None where they do. That they fall is not asked: four errors from three poses each are no measure of a gain."""
     n = len(observations)
     if n < 4 or sum(o.id in patterns for o in observations) < _FEWEST_PATTERNS:
@@ -172,7 +173,7 @@ def _from_few(
         tilts,
         f"The scanner is corrected by what the flange's hole circle shows, as {n} poses are too few for the robot's motion to "
         f"confirm it: a scale of {_percent(found)}; held-out errors are {1e3 * after:.3f} mm with it and {1e3 * before:.3f} without "
-        "(mean). X_BC belongs to scans that are corrected so.",
+        "(mean). X_BC applies to scans with this correction.",
         True,
     )
 
@@ -185,7 +186,7 @@ def apply_self_calibration(
     seed: int = 0,
     wanted: bool = True,
 ) -> tuple[SelfCalibration | None, list[Observation], CalibrationEstimate]:
-    """The verdict on the scanner (None where it is not ``wanted``), the sightings as corrected by it, and their estimate.
+    """The verdict on the scanner (None where it is not ``wanted``), the observations as corrected by it, and their estimate.
 
     ``rigid`` is the estimate without a correction. Held-out errors of the one returned come from corrections, too, that
     never saw the pose; its covariance contains that of the correction.
@@ -196,7 +197,7 @@ def apply_self_calibration(
     scanner = self_calibrate(good, patterns, rigid.held_out.position_m[rigid.inliers], seed=seed)
     if scanner.found is None or scanner.accepted is None:
         return scanner, observations, rigid
-    corrected = [scanner.accepted.observation(o) for o in observations]
+    corrected = [corrected_observation(scanner.accepted, o) for o in observations]
     found = scanner.found
     assert found.X_BC is not None
     estimate = replace(
@@ -223,7 +224,7 @@ def held_out_errors(
             X, correction = calibrate_corrected(rest, patterns, seed=seed, order=order, start=start)
         except InputError:
             continue
-        seen = [correction.observation(o)]
+        seen = [corrected_observation(correction, o)]
         errors[i], tilts[i] = float(position_errors(X, seen)[0]), float(tilt_errors(X, seen)[0])
     return errors, tilts
 
@@ -236,7 +237,7 @@ def calibrate_corrected(
     order: int = 1,
     start: RigidTransform | None = None,
 ) -> tuple[RigidTransform, ScannerCorrection]:
-    """Camera pose and correction from the same sightings, undecided: for cross-validation."""
+    """Camera pose and correction from the same observations, without the decision: for cross-validation."""
     found = from_motion(observations, patterns, seed=seed, order=order, usual=True, start=start)
     assert found.X_BC is not None
     return found.X_BC, found.correction

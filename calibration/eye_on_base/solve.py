@@ -1,4 +1,4 @@
-"""Eye-on-base calibration from all sightings: robust, weighted on SE(3), with the uncertainty the residuals admit."""
+"""Solves eye-on-base calibration: robust weighted least squares on SE(3) with a covariance from the residuals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from scipy.stats import f as f_distribution
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, few_residuals, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation, fit_rigid, fit_rigid_sets, fit_rotation, skew
+from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets, fit_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
 
 __all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
@@ -36,7 +37,7 @@ USUAL_SPREAD_M, USUAL_TILT_RAD = 1.5e-4, 1.2e-3
 
 @dataclass(frozen=True)
 class SolveConfig:
-    """Knobs of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
+    """Settings of the estimator. ``max_outliers`` is the share of gross outliers it must survive (and the least that
     agree). ``usual_weight`` is how many residuals the usual spread of robot and scanner (USUAL_SPREAD_M, USUAL_TILT_RAD) counts
     for beside the residuals themselves: three poses have too few of them."""
 
@@ -81,7 +82,7 @@ class _Solution:
 def estimate_eye_on_base(
     observations: list[Observation] | tuple[Observation, ...], config: SolveConfig | None = None
 ) -> CalibrationEstimate:
-    """Estimate X_BC from sightings of the flange at n poses; positions and (where seen) normals are used together.
+    """Estimate X_BC from observations of the flange at n poses; positions and (where seen) normals are used together.
 
     Start: closed form (paper, Eq. (10)-(12)) on seeded minimal sets, concentrated on the best (1 - max_outliers) share
     of the poses. Then Gauss-Newton on SE(3) with Huber weights inside a chi-square gate; the variances of positions and
@@ -100,8 +101,8 @@ def estimate_eye_on_base(
     need = max(3, int(np.ceil((1.0 - config.max_outliers) * n - 1e-9)))
     if int(inliers.sum()) < need and n > 4:
         raise InconsistentPoses(
-            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to {100 * config.max_outliers:.0f} % wrong ones are "
-            "left out); check units, pose order and that the camera did not move."
+            f"Only {int(inliers.sum())} of {n} poses agree on one camera position (up to {100 * config.max_outliers:.0f} % outliers are "
+            "excluded); check units, pose order and that the camera did not move."
         )
     spread = float(np.sqrt(((data.b - data.b.mean(axis=0)) ** 2).sum(axis=1).mean()))
     if np.sqrt(solution.var_p) > _WORST_SHARE * spread:
@@ -126,7 +127,7 @@ def estimate_eye_on_base(
     warnings = []
     if not inliers.all():
         names = ", ".join(o.id for o, keep in zip(observations, inliers, strict=True) if not keep)
-        warnings.append(f"{n - int(inliers.sum())} of {n} poses disagree with the rest and were left out: {names}.")
+        warnings.append(f"{n - int(inliers.sum())} of {n} poses disagree with the rest and were excluded: {names}.")
     kept = [o for o, keep in zip(observations, inliers, strict=True) if keep]
     sigma_p = float(np.sqrt(solution.var_p))
     return CalibrationEstimate(
@@ -290,7 +291,7 @@ def _fit(data: _Data, keep: Flags, start: _Solution, usual: float = 0.0, iterati
         g = g + np.einsum("nki,n,nk->i", J_n, w_n, e_n)
         N = N_p + N_n
         step = -np.linalg.lstsq(N, g, rcond=1e-12)[0]
-        dR = exp_rotation(step[:3]).matrix()
+        dR = exp_rotation(step[:3])
         R, p = dR @ R, dR @ (p - pivot) + pivot + step[3:]
         R = RotationMatrix.ProjectToRotationMatrix(R).matrix()
         # Helmert's simplified estimator: each group's weighted square sum over its own redundancy

@@ -1,4 +1,4 @@
-"""Errors on poses a calibration never saw: folds, and how the error falls with the number of scans."""
+"""Held-out errors of a calibration: k-fold cross-validation and convergence over the number of scans."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Cost, algorithm1_start, algorithm1_step, translation_cost
@@ -18,11 +19,11 @@ from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
 Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
-"""Camera pose and scanner correction from sightings."""
+"""Camera pose and scanner correction from observations."""
 
 
 def position_errors(X_BC: RigidTransform, observations: Sequence[Observation]) -> Array:
-    """Distance (n,) m between where a calibration puts the flange centres and where the robot says they are."""
+    """Distances (n,) m between the flange centres by the calibration and by the robot."""
     return np.array([float(np.linalg.norm(X_BC @ o.p_CR - o.p_BR)) for o in observations])
 
 
@@ -69,7 +70,7 @@ def k_fold(
                 )
             except InputError:
                 continue
-            errors[r, test] = position_errors(X, [correction.observation(observations[i]) for i in test])
+            errors[r, test] = position_errors(X, [corrected_observation(correction, observations[i]) for i in test])
     return errors
 
 

@@ -1,1 +1,1 @@
-"""From a scan to the circle of the robot's flange: search, fit, tracking and hole pattern."""
+"""Finds, fits and tracks the robot's flange in a scan: its circle and its hole pattern."""

@@ -1,4 +1,4 @@
-"""The circle of a robot's base mounting in a scan: a narrow ring round a column that hides its far side, over a table."""
+"""Fits the circle of a robot's base mounting in a scan that shows only an arc of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import CircleFitError, FlangeNotFound, PlaneFitError
 from weldcal.calibration.flange.edge_labels import refine_circle
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess
-from weldcal.calibration.flange.rim import RayModel, coverage, plane_axes
+from weldcal.calibration.flange.rays import RayModel
+from weldcal.calibration.flange.rim import coverage, plane_axes
 from weldcal.calibration.flange.search import window_about
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, local_planes
@@ -31,7 +32,7 @@ _BAND_PX = 3.0  # about the edge whose pixels place it
 
 @dataclass(frozen=True)
 class BaseCircleConfig:
-    """``radius_sigma_m``: how well the drawing knows the outer radius, which an arc alone tells badly; ``min_arc``: share of
+    """Limits of the fit. ``radius_sigma_m``: uncertainty of the drawing's outer radius, which an arc determines badly; ``min_arc``: share of
     the edge that must be seen; ``min_points`` on the ring."""
 
     radius_sigma_m: float = 1e-4
@@ -61,7 +62,7 @@ def fit_base_circle(
     """
     config = config or BaseCircleConfig()
     if guess.normal_C is None:
-        raise FlangeNotFound("A base circle is looked for near a guess with its normal: give normal_C.")
+        raise FlangeNotFound("A base circle needs a guess with its normal: give normal_C.")
     window = window_about(points_C, guess.center_C, guess.radius_m, 1)
     valid = np.zeros((0, 0), dtype=bool) if window is None else np.isfinite(window[..., 2])
     if window is None or int(valid.sum()) < config.min_points:
@@ -84,7 +85,7 @@ def fit_base_circle(
     if best is None:
         raise FlangeNotFound(
             f"No ring {1e3 * standard.outer_m:.0f} mm across with at least {100 * config.min_arc:.0f} % of its edge in "
-            "sight was found where the robot's foot is expected."
+            "sight was found where the robot's base is expected."
         )
     return _refine(window, best[1], best[2], rays, standard, config)
 

@@ -1,4 +1,4 @@
-"""Is this flat face a flange? Its concentric edges, located as well as the scan allows, and the tests it must pass."""
+"""Fits the concentric edges of a flat face and tests whether it is a flange."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulat
 
 @dataclass(frozen=True)
 class FlangeFitConfig:
-    """What counts as a flange. Lengths in m; the defaults suit structured-light scanners and admit time-of-
+    """Acceptance limits of the flange fit. Lengths in m; the defaults suit structured-light scanners and admit time-of-
     flight ones. Below half of the outer edge, ``min_coverage`` of it is enough only beside a quarter of a concentric bore."""
 
     seed: int = 0
@@ -45,13 +45,13 @@ class FlangeFitConfig:
 
 @dataclass
 class Refusal:
-    """The most telling reason so far: a candidate that failed a late test says more than one that failed early."""
+    """The reason of the candidate that passed most tests before it failed."""
 
     stage: int = -1
     text: str = ""
 
     def note(self, stage: int, text: str) -> None:
-        """Keep a reason unless a later test has already spoken."""
+        """Keep a reason unless a later stage has given one."""
         if stage > self.stage:
             self.stage, self.text = stage, text
 
@@ -71,7 +71,7 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """What the tests of a flange need: its plane and edges, the pitch between points m, the share of the outer edge seen,
+    """Measurements that the tests of a flange use: its plane and edges, the pitch between points m, the share of the outer edge seen,
     the points on the face, and the shares of the bore's core and of the ring between the edges that are face."""
 
     plane: PlaneFit
@@ -86,7 +86,7 @@ class Measured:
 
 
 def thickness(plane: PlaneFit) -> float:
-    """How far (m) from the plane a point of the face may lie."""
+    """Largest distance (m) of a face point from the plane."""
     return max(3.0 * plane.rms, 0.0002)
 
 
@@ -98,7 +98,7 @@ def faces_on_plane(
     config: FlangeFitConfig,
     refusal: Refusal,
 ) -> list[Face]:
-    """Flange faces on one plane (point and normal (3,)): every connected part of about the flange's size is tried."""
+    """Find flange faces on one plane (point and normal (3,)), among its connected parts of about the flange's size."""
     d = scene.points - seed_point
     around = np.einsum("nk,nk->n", d, d) < (1.2 * standard.outer_m) ** 2
     try:
@@ -130,7 +130,7 @@ def faces_on_plane(
 
 
 def edge_bounds(pitch: float, standard: FlangeStandard, config: FlangeFitConfig) -> tuple[float, float]:
-    """Radii that the outer edge may have: between the flat face and the cylinder, and some slack."""
+    """Smallest and largest radius (m) accepted for the outer edge: from flat face to cylinder, with slack."""
     slack = max(config.radius_tolerance * standard.outer_radius_m, 1.5 * pitch)
     return standard.face_outer_radius_m - slack, standard.outer_radius_m + slack
 
@@ -296,7 +296,7 @@ def _edge(
 
 
 def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusal: Refusal) -> Face | None:
-    """The face if its size, its edge and its bore are a flange's; else None, with the reason noted."""
+    """Test size, edge and bore; return the face, or None with the reason noted."""
     bounds = edge_bounds(m.pitch, standard, config)
     rough = max(config.max_rim_rms_m, 0.7 * m.pitch)
     if not bounds[0] < m.outer.radius < bounds[1]:
@@ -340,6 +340,6 @@ def judge(m: Measured, standard: FlangeStandard, config: FlangeFitConfig, refusa
 
 
 def _concentric(outer: CircleFit, bore: CircleFit, pitch: float) -> bool:
-    """Do two circles share their centre, within four sigmas and a fraction of a pixel?"""
+    """Whether two circles share their centre, within four sigmas and 0.3 of a pixel."""
     spread = float(np.sqrt(np.trace(outer.covariance[:2, :2]) + np.trace(bore.covariance[:2, :2])))
     return float(np.hypot(*(outer.center - bore.center))) < 4.0 * spread + 0.3 * pitch

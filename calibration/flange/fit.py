@@ -1,4 +1,4 @@
-"""The robot's flange in a scan: the plane of its face and the concentric edges that give its centre."""
+"""Finds a flange in a scan: the plane of its face and the centre of its concentric edges."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ Array = NDArray[np.float64]
 
 _GOOD_COVERAGE = 0.8  # a face seen this well, with its bore, ends the search
 _WARP = 0.2  # and so much of that along the normal: a scanner's warp tilts a half more than it tilts the whole
+_TRACKED_RADIUS = 0.7  # of the flange's diameter: about the fit of the scan before
 _OUT_OF_ROUND_M = 7e-5  # per axis, from half of an edge: halves of recorded clouds against the whole ones
 
 
 @dataclass(frozen=True)
 class FlangeGuess:
-    """Where to look: about ``center_C`` (3,) m, no farther than ``radius_m``, and the outward normal (3,)
-    where known."""
+    """Expected flange: within ``radius_m`` of ``center_C`` (3,) m, with outward normal (3,) where known."""
 
     center_C: Array
     radius_m: float
@@ -68,42 +68,51 @@ def fit_flange(
     points_C: Array,
     standard: FlangeStandard,
     *,
-    guess: FlangeGuess | None = None,
+    guess: FlangeGuess | FlangeFit | None = None,
     config: FlangeFitConfig | None = None,
 ) -> FlangeFit:
     """Find the flange face in a cloud (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, camera frame.
 
-    With ``guess`` only that part of the scene is searched; without one every separate body of about the flange's size
-    is. Deterministic for ``config.seed``. Raises FlangeNotFound with the reason: nothing there, no plane, wrong size
-    (also millimetres taken for metres), too little of the edge seen, too rough an edge, no bore. Feature and check of
-    radius: paper, section 2.1.4; edges instead of its 3-point circle search, which repeats to 0.4 mm.
+    The method follows from what is given, fastest first; where one finds nothing or doubts its result, the next one decides.
+    Organised scans: tracking within 3 mm of a guess that has a normal, a fit of the window about that guess, a search of the
+    guess's surroundings; without a guess a search of the whole scan. Unordered clouds: a fit that takes the points for the
+    flange's own, a search about the guess, or of every separate body of about the flange's size.
+
+    ``guess`` limits the search; a FlangeFit of the scan before is a guess, too. Deterministic for ``config.seed``. Raises
+    FlangeNotFound with the reason: nothing there, no plane, wrong size (also millimetres taken for metres), too little of the
+    edge seen, too rough an edge, no bore. Feature and check of radius: paper, section 2.1.4; edges instead of its 3-point
+    circle search, which repeats to 0.4 mm.
     """
     config = config or FlangeFitConfig()
     cloud = np.asarray(points_C)
     if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3:
         raise FlangeNotFound(f"A cloud must be (N, 3) or (H, W, 3); this one has the shape {cloud.shape}.")
+    if isinstance(guess, FlangeFit):
+        guess = FlangeGuess(guess.center_C, _TRACKED_RADIUS * standard.outer_m, guess.normal_C)
     refusal = Refusal()
-    if cloud.ndim == 2:
-        part = cloud if guess is None else crop(cloud, guess.center_C, guess.radius_m).points
-        face = fit_segmented(part, standard, config)
-        toward = None if guess is None else guess.normal_C
-        if face is not None and (
-            toward is None or float(face.plane.normal @ toward) > float(np.cos(config.max_guess_tilt_rad))
-        ):
-            return _result(face)
-    if cloud.ndim == 3:
-        found = _organised(cloud, standard, guess, config, refusal)
-        if found is None:
-            _explain_unit(cloud, standard, config)
-    elif guess is not None:
-        found = _find(crop(cloud, guess.center_C, guess.radius_m), standard, guess, config, refusal)
-    else:
-        found = _search(crop(cloud), standard, config, refusal)
-        if found is None:
-            _explain_unit(cloud, standard, config)
+    find = _organised if cloud.ndim == 3 else _unordered
+    found = find(cloud, standard, guess, config, refusal)
+    if found is None and (cloud.ndim == 3 or guess is None):
+        _explain_unit(cloud, standard, config)
     if found is None:
         raise FlangeNotFound(refusal.text)
     return found
+
+
+def _unordered(
+    cloud: Array, standard: FlangeStandard, guess: FlangeGuess | None, config: FlangeFitConfig, refusal: Refusal
+) -> FlangeFit | None:
+    """A list of points: taken for the flange's own first, then searched."""
+    scene = crop(cloud) if guess is None else crop(cloud, guess.center_C, guess.radius_m)
+    face = fit_segmented(cloud if guess is None else scene.points, standard, config)
+    toward = None if guess is None else guess.normal_C
+    if face is not None and (
+        toward is None or float(face.plane.normal @ toward) > float(np.cos(config.max_guess_tilt_rad))
+    ):
+        return _result(face)
+    if guess is None:
+        return _search(scene, standard, config, refusal)
+    return _find(scene, standard, guess, config, refusal)
 
 
 def _organised(

@@ -1,4 +1,4 @@
-"""The hole pattern of a flange: the rotation about its axis that circles cannot show, and a ruler the maker drilled."""
+"""Finds the hole pattern of a flange: its rotation about the flange axis and the scale of its pitch circle."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _OFF_M = 0.0004  # from its place in the pattern: such a hole is a dent or a gap
 
 @dataclass(frozen=True)
 class HolePattern:
-    """Holes found in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the standard,
+    """Holes detected in a flange's face: their centres (k, 3) m in the camera frame, their angles (k,) rad in the standard,
     the circle centre (3,) m they fix, the flange's pose X_CR with the rotation about its axis, and how the pitch circle
     measures against the standard (1 where the scanner's scale is right).
 
@@ -49,7 +49,7 @@ class HolePattern:
 
 
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
-    """The hole pattern in the face of a fitted flange; None where fewer than four holes of it are seen well.
+    """Find the hole pattern in the face of a fitted flange; None where fewer than four of its holes are seen well.
 
     ``points_C`` (N, 3) or (H, W, 3) m. The phase is where the pattern's discs hold the fewest points of the face; each
     hole's rim is a circle, with one radius for all threads in the end, and the pattern is a similarity of the centres

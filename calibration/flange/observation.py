@@ -1,4 +1,4 @@
-"""One sighting of the flange: where the robot says it was, and where the scanner saw it."""
+"""One observation of the flange: its pose in the base from the robot, and its centre and normal from the scanner."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Where the edges of a flat face are: mask crossings on organised clouds, outermost points per sector on unordered
-ones."""
+"""Locates the edges of a flat face: mask crossings in organised clouds, extreme points per sector in unordered ones."""
 
 from __future__ import annotations
 
@@ -8,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from weldcal.calibration.flange.rays import RayModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -54,39 +55,6 @@ def plane_axes(normal: Array) -> tuple[Array, Array]:
     return np.array([a, b, c]), np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
 
-class RayModel:
-    """Viewing rays of an organised cloud as a smooth function of the pixel: x/z and y/z are quadratics in (u, v).
-
-    Exact for a pinhole scanner, whose noise moves a point along its ray; the quadratic absorbs a lens locally.
-    """
-
-    def __init__(self, points: Array, valid: Mask) -> None:
-        v, u = np.nonzero(valid)
-        p = points[v, u]
-        stride = max(1, len(u) // 1500)
-        self._origin = np.array([u.mean(), v.mean()])
-        self._scale = max(float(np.ptp(u)), float(np.ptp(v)), 1.0)
-        basis = self._basis(u[::stride], v[::stride])
-        ray = p[::stride, :2] / p[::stride, 2:]
-        self._coefficients = np.linalg.lstsq(basis, ray, rcond=None)[0]
-
-    def _basis(self, u: Array | NDArray[np.intp], v: Array | NDArray[np.intp]) -> Array:
-        a, b = (u - self._origin[0]) / self._scale, (v - self._origin[1]) / self._scale
-        return np.column_stack([np.ones(len(a)), a, b, a * a, a * b, b * b])
-
-    def grid(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Rays x/z and y/z, each (len(v), len(u)), of a whole grid of pixels."""
-        a, b = (u - self._origin[0]) / self._scale, ((v - self._origin[1]) / self._scale)[:, None]
-        c = self._coefficients.T
-        x, y = ((k[0] + k[1] * a + k[3] * a * a) + b * (k[2] + k[4] * a) + k[5] * (b * b) for k in c)
-        return x, y
-
-    def on_plane(self, u: Array, v: Array, point: Array, normal: Array) -> Array:
-        """Points (N, 3) m where the rays through pixels (u, v) meet a plane."""
-        ray = np.column_stack([self._basis(u, v) @ self._coefficients, np.ones(len(u))])
-        return np.asarray(ray * (float(point @ normal) / (ray @ normal))[:, None])
-
-
 def organised_edges(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> EdgePoints:
     """Edge points of the mask ``face`` (H, W) of an organised cloud (H, W, 3), in the plane's axes about ``point``.
 
@@ -123,7 +91,7 @@ def organised_edges(points: Array, face: Mask, rays: RayModel, point: Array, nor
 
 
 def face_pixels(points: Array, face: Mask, rays: RayModel, point: Array, normal: Array) -> FacePixels:
-    """Every pixel of a grid (H, W, 3) that says whether the face is there (all but small gaps), in the plane's axes."""
+    """Pixels of a grid (H, W, 3) labelled on or off the face (all but small gaps), in the plane's axes."""
     axes = np.column_stack(plane_axes(normal))
     v, u = np.nonzero(~unknown_pixels(points))
     on_plane = rays.on_plane(u.astype(float), v.astype(float), point, normal)
@@ -131,8 +99,8 @@ def face_pixels(points: Array, face: Mask, rays: RayModel, point: Array, normal:
 
 
 def unknown_pixels(points: Array) -> Mask:
-    """Pixels (H, W) without a reading that tell nothing of an edge: small gaps. One that holds 3 x 3 pixels is void,
-    not face."""
+    """Mask (H, W) of small gaps without a reading, which carry no information on an edge. A gap that holds 3 x 3 pixels
+    counts as off the face."""
     gap = np.isnan(points[..., 2])
     void = ndimage.binary_opening(np.pad(gap, 2, constant_values=True), np.ones((3, 3), dtype=bool))[2:-2, 2:-2]
     return np.asarray(gap & ~void)
@@ -159,7 +127,7 @@ def sector_edges(xy: Array, center: Array, pitch: float, *, outer: bool, band: t
 
 
 def sector_count(radius: float, pitch: float) -> int:
-    """Into how many sectors an edge of that radius is divided."""
+    """Number of sectors for an edge of that radius (m) and point pitch (m)."""
     return int(np.clip(2.0 * np.pi * radius / (_SECTOR_PITCHES * pitch), 24, 720))
 
 

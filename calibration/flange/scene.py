@@ -1,4 +1,4 @@
-"""A scan, cropped and ready to be searched: points alone, or points with their pixel grid and viewing rays."""
+"""A cropped scan: points alone, or points with their pixel grid and viewing rays."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from weldcal.calibration.flange.rays import RayModel
 from weldcal.calibration.flange.rim import (
     EdgePoints,
     FacePixels,
-    RayModel,
     connected_parts,
     connected_pixels,
     face_pixels,

@@ -1,4 +1,4 @@
-"""The flange in an organised scan: flat parts of the right size on a thinned grid, then each one at full resolution."""
+"""Searches an organised scan for the flange: flat parts on a thinned grid, then a fit at full resolution."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def window_about(cloud: Array, center: Array, radius: float, step: int) -> Array
 def flat_parts(
     grid: Array, standard: FlangeStandard, config: FlangeFitConfig, sigmas: float = _BEND_SIGMAS[0]
 ) -> Iterator[Part]:
-    """Connected flat parts of a thinned scan (h, w, 3) whose size and outline could be the flange's, likeliest first.
+    """Connected flat parts of a thinned scan (h, w, 3) whose size and outline could be the flange's, most likely first.
 
     A plane seen in perspective has an inverse depth that is linear over the image: where its second differences
     vanish, pixels are flat, and parts of flat pixels end at every step and crease.

@@ -1,4 +1,4 @@
-"""The flange in a cloud that shows little else: plane and both edges in a millisecond, or nothing (then it is searched)."""
+"""Fits plane and both edges to a cloud that shows little but the flange; returns None where it does not."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.flange.face import Face, FlangeFitConfig
 from weldcal.calibration.flange.rim import plane_axes, sector_count
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
-from weldcal.calibration.geometry.plane import PlaneFit
-from weldcal.calibration.geometry.plane_moments import weighted_moments
+from weldcal.calibration.geometry.plane import PlaneFit, weighted_moments
+from weldcal.calibration.geometry.robust import MAD, TUKEY
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-_TUKEY, _MAD = 4.685, 1.4826
 _FEW = 1200  # points that find the plane and the outline; all of them then measure
 _TRIPLES = 24
 _ROUGH_SECTORS = 60
@@ -27,7 +26,7 @@ _OWN_SHARE = 0.6  # of the points must lie on the one plane, and as many of the 
 
 
 def fit_segmented(points: Array, standard: FlangeStandard, config: FlangeFitConfig) -> Face | None:
-    """The face of a flange in points (N, 3) m that are mostly its own; None where anything is out of the ordinary.
+    """Fit a flange face to points (N, 3) m that mostly lie on it; None where any test fails.
 
     Least median of planes on a seeded part, Tukey-weighted least squares on all; then the outermost and innermost point
     of each sector, and both circles at once. Deterministic for ``config.seed``. Points are held in single precision about
@@ -111,14 +110,14 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
     votes = (off < config.hypothesis_tolerance_m).sum(axis=1) * (length > 1e-5)
     best = int(np.argmax(votes))
     normal, at = normals[:, best], a[:, best]
-    scale = config.hypothesis_tolerance_m / _TUKEY * 2.0
+    scale = config.hypothesis_tolerance_m / TUKEY * 2.0
     points, values = Q, np.ones(3)
     for k in range(3):
         d = normal @ points - normal @ at
         if k:
             spread = np.abs(d if k < 2 else d[:: max(1, d.size // _FEW)])
-            scale = max(_MAD * float(np.partition(spread, len(spread) // 2)[len(spread) // 2]), 2e-5)
-        share, at, moments = weighted_moments(points, d, _TUKEY * scale)
+            scale = max(MAD * float(np.partition(spread, len(spread) // 2)[len(spread) // 2]), 2e-5)
+        share, at, moments = weighted_moments(points, d, TUKEY * scale)
         if not share > 0.3:
             return None, d
         values, vectors = np.linalg.eigh(moments)
@@ -129,7 +128,7 @@ def _plane(P: Single, origin: Single, config: FlangeFitConfig) -> tuple[PlaneFit
         return None, d
     exact = vectors[:, 0]
     d = normal @ P - normal @ at
-    good = np.abs(d) < _TUKEY * scale
+    good = np.abs(d) < TUKEY * scale
     count = int(np.count_nonzero(good))
     inside = d * good
     rms = float(np.sqrt(inside @ inside / max(count, 1)))

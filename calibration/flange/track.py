@@ -1,4 +1,4 @@
-"""The flange where it was a moment ago: plane and both edges from the few pixels that fix them, or nothing (then search)."""
+"""Fits plane and both edges of a flange within 3 mm of a given pose; returns None where it is not found there."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ from weldcal.calibration.flange.face import (
     lowered_by,
     thickness,
 )
+from weldcal.calibration.flange.rays import pinhole_rays, pinhole_window
 from weldcal.calibration.flange.rim import plane_axes
-from weldcal.calibration.flange.track_loops import borders, near_edge, plane_steps, ring_points
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
-from weldcal.calibration.geometry.plane import PlaneFit, shared_noise
+from weldcal.calibration.geometry.compiled import compiled
+from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
+from weldcal.calibration.geometry.robust import TUKEY
 from weldcal.models.flanges import FlangeStandard
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]
 
-_TUKEY = 4.685
 _SLACK_M = 0.003  # that the centre may have moved sideways
 _PLANE_POINTS = 2500
 _BLOCK = 4  # pixels a side; what such a block's middle says of the ring and the bore is enough
@@ -40,25 +42,24 @@ _SHARED = 1.3  # variance of a labelled edge over the expected one, as in the wi
 _RING_SEEN = 0.6
 _FLAT_M = 3e-4  # rms of a face from its plane; a rougher one is for the careful way
 _EDGE_POINTS = 240  # crossings that place a circle well enough to look at the pixels about it
-_BENT = 0.05  # pixels: a lens that bends rays more is for the careful way, which knows quadratics
 _THREE = np.ones((3, 3), np.uint8)
 
 
 def fit_tracked(
     cloud: Array, center: Array, normal: Array, standard: FlangeStandard, config: FlangeFitConfig
 ) -> Face | None:
-    """The face in a scan (H, W, 3) m whose centre (3,) m and outward normal (3,) were so a moment ago, 3 mm away at most.
+    """Fit the face in a scan (H, W, 3) m within 3 mm of the centre (3,) m and near the outward normal (3,) given.
 
-    None wherever anything is out of the ordinary: not there, partly hidden, no bore, rays that are no pinhole's.
+    None where it is absent, partly hidden or without a bore, and where the rays are not a pinhole's.
     """
-    found = _rectangle(cloud, center, 0.5 * standard.outer_m + _SLACK_M)
+    found = pinhole_window(cloud, center, 0.5 * standard.outer_m + _SLACK_M)
     if found is None:
         return None
     rect, rays = found
     grid = cloud[rect]
     z = np.ascontiguousarray(grid[..., 2], dtype=np.float32)  # to a twentieth of a micrometre
     if rays is None:
-        rays = _rays(grid)
+        rays = pinhole_rays(grid)
     if rays is None:
         return None
     plane = _plane(z, rays, center, normal, standard, config)
@@ -71,69 +72,6 @@ def fit_tracked(
     except CircleFitError:
         return None
     return judge(_measured(view, fits, pitch, standard), standard, config, Refusal())
-
-
-def _sampled(cloud: Array, across: int) -> tuple[Array, Array] | None:
-    """Of some ``across`` x ``across`` pixels those that were measured: (1, u, v) (n, 3) and points (n, 3)."""
-    H, W = cloud.shape[:2]
-    dv, du = max(1, H // across), max(1, W // across)
-    p = cloud[dv // 2 :: dv, du // 2 :: du]
-    A = np.ones((*p.shape[:2], 3))
-    A[..., 1] = np.arange(du // 2, W, du)
-    A[..., 2] = np.arange(dv // 2, H, dv)[:, None]
-    seen = p[..., 2] == p[..., 2]
-    A, p = A[seen], p[seen]
-    return (A, p) if len(p) >= 12 else None
-
-
-def _pinhole(A: Array, p: Array) -> Array | None:
-    """Coefficients (3, 2) of rays (x/z, y/z) = (1, u, v) @ them, least squares."""
-    try:
-        return np.asarray(np.linalg.solve(A.T @ A, A.T @ (p[:, :2] / p[:, 2:])))
-    except np.linalg.LinAlgError:
-        return None
-
-
-def _rectangle(cloud: Array, center: Array, reach: float) -> tuple[tuple[slice, slice], Array | None] | None:
-    """The pixels that may show a ball of radius ``reach`` m about a centre, by a pinhole through a few of all pixels; and
-    their rays, as ``_rays`` gives them, where that pinhole fits the whole image."""
-    some = _sampled(cloud, 12)
-    if some is None or not float(center[2]) > 2.0 * reach:
-        return None
-    c = _pinhole(*some)
-    if c is None:
-        return None
-    det = c[1, 0] * c[2, 1] - c[2, 0] * c[1, 1]
-    if det == 0.0:
-        return None
-    a, b = center[0] / center[2] - c[0, 0], center[1] / center[2] - c[0, 1]
-    at = ((a * c[2, 1] - b * c[2, 0]) / det, (b * c[1, 0] - a * c[1, 1]) / det)
-    # a ball is seen a little wider than its middle's distance says
-    wide = reach / (float(center[2]) - reach)
-    low = [int(np.floor(x - wide / abs(k))) for x, k in zip(at, (c[1, 0], c[2, 1]), strict=True)]
-    high = [int(np.ceil(x + wide / abs(k))) + 1 for x, k in zip(at, (c[1, 0], c[2, 1]), strict=True)]
-    if min(low) < 0 or high[0] > cloud.shape[1] or high[1] > cloud.shape[0]:
-        return None  # cut by the image's border: partly hidden
-    rays = None
-    off = some[0] @ c - some[1][:, :2] / some[1][:, 2:]
-    if float(np.abs(off).max()) < _BENT * float(np.abs(c[1:]).max()):
-        rays = np.zeros((3, 3))
-        rays[:, :2], rays[0, 2] = c, 1.0
-        rays[0, :2] += low[0] * c[1] + low[1] * c[2]
-    return (slice(low[1], high[1]), slice(low[0], high[0])), rays
-
-
-def _rays(grid: Array) -> Array | None:
-    """Coefficients (3, 3) of the viewing rays (x/z, y/z, 1) = (1, u, v) @ them; None where they are not a pinhole's."""
-    some = _sampled(grid, 10)
-    c = None if some is None else _pinhole(*some)
-    if some is None or c is None:
-        return None
-    if not float(np.abs(some[0] @ c - some[1][:, :2] / some[1][:, 2:]).max()) < _BENT * float(np.abs(c[1:]).max()):
-        return None
-    out = np.zeros((3, 3))
-    out[:, :2], out[0, 2] = c, 1.0
-    return out
 
 
 def _plane(
@@ -248,7 +186,7 @@ def _edges(view: _View, near: Array, height: float, standard: FlangeStandard) ->
         if lowered[k]:
             center = center - lowered[k] * view.slide(center)
         e = e[at]
-        inliers = np.abs(e) < _TUKEY * max(f.rms, 0.3 * pitch)
+        inliers = np.abs(e) < TUKEY * max(f.rms, 0.3 * pitch)
         rms = float(np.sqrt((e * e * inliers).sum() / max(int(np.count_nonzero(inliers)), 1)))
         starts.append(CircleFit(center, f.radius, f.covariance, rms, inliers))
     return _labelled(view, starts, pitch, lowered, clear), pitch
@@ -294,3 +232,116 @@ def _measured(view: _View, fits: list[CircleFit], pitch: float, standard: Flange
         core_share=1.0 - float(np.count_nonzero(core & known & ~face)) / max(int(np.count_nonzero(said)), 1),
         ring_share=count / max(int(np.count_nonzero(ring & known)), int(_RING_SEEN * np.count_nonzero(ring)), 1),
     )
+
+
+@compiled()
+def ring_points(
+    z: Single, turned: Array, at: Array, step: int, inner: float, outer: float, tall: float
+) -> tuple[Array, Index]:
+    """Select the points on a ring about a point from every ``step``-th pixel of depths (h, w) m.
+
+    ``turned`` (3, 3) are the coefficients of the rays in axes whose third is the normal, ``at`` (3,) the point in them;
+    ``inner``, ``outer`` and ``tall`` m bound the ring. Returns (x, y, height) (3, N) m about the point and the indices
+    (N,) in the image of those pixels.
+    """
+    h, w = (z.shape[0] + step - 1) // step, (z.shape[1] + step - 1) // step
+    out, index = np.empty((3, h * w)), np.empty(h * w, np.int64)
+    inner2, outer2 = inner * inner, outer * outer
+    n = 0
+    for j in range(h):
+        v = float(j * step)
+        rx, ry, rz = turned[0, 0] + turned[2, 0] * v, turned[0, 1] + turned[2, 1] * v, turned[0, 2] + turned[2, 2] * v
+        for i in range(w):
+            u = float(i * step)
+            depth = float(z[j * step, i * step])
+            x = depth * (rx + turned[1, 0] * u) - at[0]
+            y = depth * (ry + turned[1, 1] * u) - at[1]
+            d = depth * (rz + turned[1, 2] * u) - at[2]
+            rho2 = x * x + y * y
+            if rho2 > inner2 and rho2 < outer2 and abs(d) < tall:  # false for what was not measured
+                out[0, n], out[1, n], out[2, n], index[n] = x, y, d, j * w + i
+                n += 1
+    return out[:, :n].copy(), index[:n].copy()
+
+
+@compiled()
+def borders(face: Mask, known: Mask, turned: Array, at: Array, near: Array) -> tuple[Single, Mask, Index]:
+    """Crossings of the face mask (h, w) between two neighbouring known pixels.
+
+    ``turned`` and ``at`` as in ``places``; ``near`` (2,) m is a point on the plane. Returns the places (2, N) m about it
+    in its axes, whether the face lies on the inner side of each, and the flat index of the pixel off the face.
+    """
+    h, w = face.shape
+    first, down = np.empty(2 * h * w, np.int64), np.empty(2 * h * w, np.bool_)
+    n = 0
+    for v in range(h):
+        row, below = face[v], face[min(v + 1, h - 1)]
+        for u in range(w - 1):
+            if row[u] != row[u + 1] and known[v, u] and known[v, u + 1]:
+                first[n], down[n] = v * w + u, False
+                n += 1
+            if row[u] != below[u] and known[v, u] and known[v + 1, u]:
+                first[n], down[n] = v * w + u, True
+                n += 1
+    out, inward, beyond = np.empty((2, n), np.float32), np.empty(n, np.bool_), np.empty(n, np.int64)
+    for i in range(n):
+        v, u, k = first[i] // w, first[i] % w, 1 + int(down[i])
+        half_u, half_v = u + 0.5 * (2 - k), v + 0.5 * (k - 1)
+        sz = turned[0, 2] + turned[1, 2] * half_u + turned[2, 2] * half_v
+        sx = turned[0, 0] + turned[1, 0] * half_u + turned[2, 0] * half_v
+        sy = turned[0, 1] + turned[1, 1] * half_u + turned[2, 1] * half_v
+        along = at[2] / sz
+        x, y = along * sx - at[0] - near[0], along * sy - at[1] - near[1]
+        # which way the place moves with the pixel
+        mx = along * (turned[k, 0] - sx * turned[k, 2] / sz)
+        my = along * (turned[k, 1] - sy * turned[k, 2] / sz)
+        on = face[v, u]
+        out[0, i], out[1, i] = x, y
+        inward[i] = (x * mx + y * my > 0.0) == on
+        beyond[i] = first[i] + (w if down[i] else 1) if on else first[i]
+    return out, inward, beyond
+
+
+@compiled()
+def near_edge(
+    face: Mask,
+    known: Mask,
+    turned: Array,
+    at: Array,
+    center: Array,
+    radius: float,
+    reach: float,
+    lowered: float,
+    pitch: float,
+    block: int,
+) -> tuple[Single, Mask]:
+    """Known pixels within ``reach`` m of a circle on the plane: places (2, N) m about its centre, and which
+    lie on the face (N,). The face may end ``lowered`` m below the plane. Blocks of pixels are looked at first."""
+    h, w = face.shape
+    out, on = np.empty((2, h * w), np.float32), np.empty(h * w, np.bool_)
+    lower = lowered / at[2]
+    half = 0.5 * (block - 1)
+    from2, to2 = max(radius - reach, 0.0) ** 2, (radius + reach) ** 2
+    # the middle of a block's corner pixel lies so far from its own, and a leaning face stretches them
+    wide = reach + lowered + 0.6 * block * pitch
+    block_from2, block_to2 = max(radius - wide, 0.0) ** 2, (radius + wide) ** 2
+    n = 0
+    for j in range(0, h, block):
+        for i in range(0, w, block):
+            along = at[2] / (turned[0, 2] + turned[1, 2] * (i + half) + turned[2, 2] * (j + half))
+            x = along * (turned[0, 0] + turned[1, 0] * (i + half) + turned[2, 0] * (j + half)) - at[0] - center[0]
+            y = along * (turned[0, 1] + turned[1, 1] * (i + half) + turned[2, 1] * (j + half)) - at[1] - center[1]
+            if not block_from2 < x * x + y * y < block_to2:
+                continue
+            for v in range(j, min(j + block, h)):
+                for u in range(i, min(i + block, w)):
+                    if not known[v, u]:
+                        continue
+                    along = at[2] / (turned[0, 2] + turned[1, 2] * u + turned[2, 2] * v)
+                    px = along * (turned[0, 0] + turned[1, 0] * u + turned[2, 0] * v)
+                    py = along * (turned[0, 1] + turned[1, 1] * u + turned[2, 1] * v)
+                    x, y = px - lower * px - at[0] - center[0], py - lower * py - at[1] - center[1]
+                    if from2 < x * x + y * y < to2:
+                        out[0, n], out[1, n], on[n] = x, y, face[v, u]
+                        n += 1
+    return out[:, :n].copy(), on[:n].copy()

@@ -1,4 +1,4 @@
-"""A first fit of a made flange: compiled loops are ready before a robot that moves waits for one."""
+"""Compiles the flange fit's loops by fitting a synthetic flange once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 
-from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import get_flange
 
 _FLANGE = "iso9409-1-50-4-m6"
@@ -16,8 +16,7 @@ _NOISE_M = 3e-5
 
 @cache
 def warm_up() -> None:
-    """Searches, follows and cuts out a ring of one standard, once a process: a twentieth of a second, or the seconds that compiling
-    takes where it was never done on this machine."""
+    """Run every path of the flange fit once per process: 0.05 s, or some seconds where the loops are not compiled yet."""
     standard = get_flange(_FLANGE)
     pitch = 2.6 * standard.face_outer_radius_m / _WIDTH
     v, u = np.mgrid[:_WIDTH, :_WIDTH] - 0.5 * (_WIDTH - 1)
@@ -27,5 +26,5 @@ def warm_up() -> None:
     z = np.where(face, _DISTANCE_M + noise, np.nan)
     points = np.stack([z * u * pitch / _DISTANCE_M, z * v * pitch / _DISTANCE_M, z], axis=-1)
     found = fit_flange(points, standard)
-    fit_flange(points, standard, guess=FlangeGuess(found.center_C, 0.7 * standard.outer_m, found.normal_C))
+    fit_flange(points, standard, guess=found)
     fit_flange(points[face], standard)

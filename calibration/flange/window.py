@@ -1,4 +1,4 @@
-"""A flange face in a window of an organised scan: plane, edge crossings, and both circles as borders between pixels."""
+"""Fits a flange face in a window of an organised scan: plane, edge crossings, and both circles from pixel labels."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from weldcal.calibration.flange.face import (
     lowered_by,
     thickness,
 )
-from weldcal.calibration.flange.rim import RayModel, plane_axes
+from weldcal.calibration.flange.rays import RayModel
+from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
 from weldcal.models.flanges import FlangeStandard
@@ -61,16 +62,14 @@ def measure_window(
     config: FlangeFitConfig,
     refusal: Refusal,
 ) -> Face | None:
-    """The face whose outer edge has about ``center`` (3,) m and ``radius`` m, in a part (h, w, 3) of a scan.
+    """Fit the face with an outer edge near ``center`` (3,) m and ``radius`` m in a part (h, w, 3) of a scan.
 
     ``normal`` (3,) outward, within a few degrees. None with the reason noted where it fails a test of a flange.
     """
     z = np.ascontiguousarray(grid[..., 2], dtype=np.float64)
     valid = np.isfinite(z)
-    if int(np.count_nonzero(valid)) < config.min_points:
-        refusal.note(
-            0, f"Only {int(np.count_nonzero(valid))} valid points lie there; the flange needs {config.min_points}."
-        )
+    if (count := int(np.count_nonzero(valid))) < config.min_points:
+        refusal.note(0, f"Only {count} valid points lie there; the flange needs {config.min_points}.")
         return None
     rays = _rays(grid, valid)
     try:
@@ -86,12 +85,12 @@ def measure_window(
     w = _window(z, valid, rays, plane, axes, height)
     cx, cy = (center - plane.point) @ axes
     try:
-        outer, bore, blind, pitch = _edges(w, plane, axes, height, (float(cx), float(cy)), radius, standard)
+        outer, bore, hidden, pitch = _edges(w, plane, axes, height, (float(cx), float(cy)), radius, standard)
     except CircleFitError as e:
         refusal.note(4, str(e))
         return None
     rho2 = (w.x - outer.center[0]) ** 2 + (w.y - outer.center[1]) ** 2
-    return _face(w, rho2, plane, outer, bore, blind, pitch, standard, config, refusal, grid, axes)
+    return _face(w, rho2, plane, outer, bore, hidden, pitch, standard, config, refusal, grid, axes)
 
 
 def _rays(grid: Array, valid: Mask) -> tuple[Array, Array]:
@@ -178,7 +177,7 @@ def _edges(
     radii = [radius, standard.face_inner_radius_m]
     rims: list[Array] = []
     lowered: list[float] = []
-    blind = [np.zeros(72, dtype=bool)] * 2
+    hidden = [np.zeros(72, dtype=bool)] * 2
     offset = np.array(center)
     for k in range(2):  # the second time about the circles found in the first, and clear of the holes
         d = points - offset
@@ -186,10 +185,10 @@ def _edges(
         # the far side of a screw hole and a lone pixel's far side face the wrong way
         outward = (d * off).sum(axis=1)
         rims, lowered = [], []
-        for r, width, way, hidden in zip(radii, widths, (outward, -outward), blind, strict=True):
+        for r, width, way, unseen in zip(radii, widths, (outward, -outward), hidden, strict=True):
             near = (np.abs(rho - r) < width) & (way > 0.0)
-            if hidden.any():
-                near &= ~hidden[_sector(d[:, 0], d[:, 1], len(hidden))]
+            if unseen.any():
+                near &= ~unseen[_sector(d[:, 0], d[:, 1], len(unseen))]
             low = lowered_by(beyond[near], height)
             lowered.append(low)
             rims.append(d[near] - low * slide[near])
@@ -204,18 +203,18 @@ def _edges(
             near_bore = seen == 2 and abs(fits[1].radius - radii[1]) < widths[1]
             radii = [fits[0].radius, fits[1].radius if near_bore else radii[1]]
             widths = [min(w, max(c, 1.2 * pitch) + low) for w, c, low in zip(widths, clear, lowered, strict=True)]
-            blind = [_blind(w, offset, radii[k], pitch, clear[k], outer=k == 0) for k in (0, 1)]
+            hidden = [_hidden_directions(w, offset, radii[k], pitch, clear[k], outer=k == 0) for k in (0, 1)]
     out: list[CircleFit | None] = []
     for k, fit in enumerate(fits):
         start = replace(fit, center=fit.center + offset)
         try:
-            out.append(_labelled(w, axes, start, blind[k], pitch, lowered[k], clear[k], outer=k == 0))
+            out.append(_labelled(w, axes, start, hidden[k], pitch, lowered[k], clear[k], outer=k == 0))
         except CircleFitError:
             if k == 0:
                 raise
             out.append(None)
     assert out[0] is not None
-    return out[0], out[1] if len(out) > 1 else None, blind[0], pitch
+    return out[0], out[1] if len(out) > 1 else None, hidden[0], pitch
 
 
 def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
@@ -223,7 +222,7 @@ def _sector(dx: Array, dy: Array, sectors: int) -> NDArray[np.intp]:
     return ((np.arctan2(dy, dx) + np.pi) * (sectors / (2.0 * np.pi))).astype(np.intp) % sectors
 
 
-def _blind(w: _Window, center: Array, radius: float, pitch: float, clear: float, *, outer: bool) -> Mask:
+def _hidden_directions(w: _Window, center: Array, radius: float, pitch: float, clear: float, *, outer: bool) -> Mask:
     """Directions (sectors,) in which the face does not show beside an edge, nor anything that lies lower: it is hidden, by
     a cable, a shadow or the image's border, and what looks like an edge there is none."""
     way = -1.0 if outer else 1.0
@@ -265,7 +264,7 @@ def _crossings(w: _Window, plane: PlaneFit, axes: Array) -> tuple[Array, Array, 
 
 
 def _labelled(
-    w: _Window, axes: Array, start: CircleFit, blind: Mask, pitch: float, lowered: float, clear: float, *, outer: bool
+    w: _Window, axes: Array, start: CircleFit, hidden: Mask, pitch: float, lowered: float, clear: float, *, outer: bool
 ) -> CircleFit:
     """The edge from the pixels on either side of it. Raises CircleFitError where they do not fix it."""
     x, y = w.x, w.y
@@ -281,12 +280,12 @@ def _labelled(
         d = xy - start.center
         close = np.abs(np.hypot(d[:, 0], d[:, 1]) - start.radius) < reach
         at, xy = at[close], xy[close]
-    if blind.any():
-        seen = ~blind[_sector(xy[:, 0] - start.center[0], xy[:, 1] - start.center[1], len(blind))]
+    if hidden.any():
+        seen = ~hidden[_sector(xy[:, 0] - start.center[0], xy[:, 1] - start.center[1], len(hidden))]
         at, xy = at[seen], xy[seen]
     fit = refine_circle(xy, w.face.ravel()[at], start, pitch, outer=outer)
     # a part of a circle leans on each of its pixels: 1.5 to 2 times the variance in simulated half-hidden flanges
-    return replace(fit, covariance=_SHARED / max(1.0 - float(blind.mean()), 0.2) * fit.covariance)
+    return replace(fit, covariance=_SHARED / max(1.0 - float(hidden.mean()), 0.2) * fit.covariance)
 
 
 def _face(
@@ -295,7 +294,7 @@ def _face(
     plane: PlaneFit,
     outer: CircleFit,
     bore: CircleFit | None,
-    blind: Mask,
+    hidden: Mask,
     pitch: float,
     standard: FlangeStandard,
     config: FlangeFitConfig,
@@ -307,8 +306,8 @@ def _face(
     low, high = standard.face_inner_radius_m + 0.5 * pitch, outer.radius - 0.5 * pitch
     ring = (rho2 > low**2) & (rho2 < high**2)
     core = rho2 < (0.7 * standard.bore_radius_m) ** 2
-    if blind.any():  # what is hidden says nothing of the ring and the bore
-        seen = ~blind[_sector(w.x - outer.center[0], w.y - outer.center[1], len(blind))]
+    if hidden.any():  # what is hidden says nothing of the ring and the bore
+        seen = ~hidden[_sector(w.x - outer.center[0], w.y - outer.center[1], len(hidden))]
         ring, core = ring & seen, core & seen
     count = int(np.count_nonzero(ring & w.face))
     on_ring = int(np.count_nonzero(ring & w.known))
@@ -318,7 +317,7 @@ def _face(
         outer=outer,
         bore=bore,
         pitch=pitch,
-        coverage=_seen(w, outer, blind, pitch),
+        coverage=_seen(w, outer, hidden, pitch),
         bore_coverage=0.0 if bore is None else _seen(w, bore, None, pitch),
         count=count,
         # a bore that is hidden is no bore seen, but lone pixels without a return say nothing (half of a dark bore's floor);
@@ -350,16 +349,16 @@ def _face(
     )
 
 
-def _seen(w: _Window, circle: CircleFit, blind: Mask | None, pitch: float) -> float:
+def _seen(w: _Window, circle: CircleFit, hidden: Mask | None, pitch: float) -> float:
     """Share (0..1) of the directions about a circle in which the face shows at it."""
     x, y = w.x - circle.center[0], w.y - circle.center[1]
     rho2 = x * x + y * y
     width = 2.0 * pitch + 0.0005
     at = np.flatnonzero(w.face & (rho2 < (circle.radius + width) ** 2) & (rho2 > (circle.radius - width) ** 2))
-    count = 72 if blind is None else len(blind)
+    count = 72 if hidden is None else len(hidden)
     shown = np.bincount(_sector(x.ravel()[at], y.ravel()[at], count), minlength=count) > 0
-    if blind is not None:
-        shown &= ~blind
+    if hidden is not None:
+        shown &= ~hidden
     return float(np.count_nonzero(shown)) / count
 
 

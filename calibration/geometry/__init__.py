@@ -1,1 +1,1 @@
-"""Rigid motions, robust circle and plane fits: the geometry that every calibration rests on."""
+"""SE(3), rigid registration, and robust circle and plane fits."""

@@ -1,4 +1,4 @@
-"""Robust geometric circle fit in the plane, with an honest covariance."""
+"""Robust geometric circle fit in the plane, with the covariance of centre and radius."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.geometry.circle_steps import MAD as _MAD
-from weldcal.calibration.geometry.circle_steps import TUKEY as _TUKEY
-from weldcal.calibration.geometry.circle_steps import circle_steps
+from weldcal.calibration.geometry.compiled import compiled
+from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
 
 Array = NDArray[np.float64]
+
+_STEPS = 7  # of Gauss-Newton in the compiled fit
 
 
 @dataclass(frozen=True)
 class CircleFit:
-    """A circle and what is known of it: centre (2,) and radius in m, covariance (3, 3) of (cx, cy, r) in m^2."""
+    """A fitted circle: centre (2,) and radius in m, covariance (3, 3) of (cx, cy, r) in m^2, rms m, inliers (N,)."""
 
     center: Array
     radius: float
@@ -66,8 +67,8 @@ def fit_circle(
         d = q - c
         rho = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
         e = (rho - r) / s
-        scale = max(_MAD * float(np.median(np.abs(e))), noise_floor)
-        t = e / (_TUKEY * scale)
+        scale = max(MAD * float(np.median(np.abs(e))), noise_floor)
+        t = e / (TUKEY * scale)
         weight = np.where(np.abs(t) < 1.0, (1.0 - t**2) ** 2, 0.0)
         J = -np.column_stack([d / rho[:, None], np.ones(len(q))])[:, :free] / s[:, None]
         N = J.T @ (weight[:, None] * J)
@@ -82,7 +83,7 @@ def fit_circle(
     d = q - c
     rho = np.maximum(np.linalg.norm(d, axis=1), 1e-12)
     e = (rho - r) / s
-    inliers = np.abs(e) < _TUKEY * scale
+    inliers = np.abs(e) < TUKEY * scale
     used = int(inliers.sum())
     if used < max(5, free + 2) or not np.isfinite(e).all() or r <= 0:
         raise CircleFitError("No circle agrees with enough of the points.")
@@ -103,8 +104,8 @@ def refine_circles(
     settled: float | None = None,
     fixed: NDArray[np.bool_] | None = None,
 ) -> list[CircleFit]:
-    """Circles about the origin of their points (N_k, 2) [m], as ``fit_circle`` refines them from radii [m] that are
-    right to a millimetre or so. Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
+    """Refine circles about the origin of their points (N_k, 2) [m] from radii [m] that are right to about a millimetre.
+    Steps below ``settled`` [m], else a hundredth of ``noise_floor``, end it. The radii of ``fixed`` ones stay."""
     settled = 1e-2 * noise_floor if settled is None else settled
     out = []
     for k, (edge, radius) in enumerate(zip(edges, radii, strict=True)):
@@ -121,10 +122,80 @@ def refine_circles(
     return out
 
 
+@compiled()
+def circle_steps(
+    x: Array, y: Array, radius: float, free: int, noise_floor: float, settled: float
+) -> tuple[bool, Array, Array, float, float, NDArray[np.bool_]]:
+    """Gauss-Newton with Tukey's weights for one circle about the origin of its points x, y (N,) m; ``free`` is 2 where the
+    radius is known, else 3.
+
+    The scale is the one of the third step. Returns whether the points fix a circle, (cx, cy, r), the information J^T J
+    (3, 3), the variance of psi over its mean slope squared, the rms of the inliers, and which those are (N,).
+    """
+    n = len(x)
+    theta, new = np.zeros(3), np.array([0.0, 0.0, radius])
+    e, t2, size, inliers = np.empty(n), np.empty(n), np.empty(n), np.zeros(n, np.bool_)
+    scale = noise_floor
+    for step in range(_STEPS):
+        for j in range(3):
+            theta[j] = new[j]
+        for i in range(n):
+            dx, dy = x[i] - theta[0], y[i] - theta[1]
+            e[i] = np.sqrt(dx * dx + dy * dy) + 1e-15 - theta[2]
+            size[i] = abs(e[i])
+        if step < 3:
+            scale = max(MAD * middle(size), noise_floor)
+        k = 1.0 / (TUKEY * scale)
+        N, g = np.zeros((3, 3)), np.zeros(3)
+        for i in range(n):
+            t2[i] = (e[i] * k) ** 2
+            inside = max(1.0 - t2[i], 0.0)
+            w = inside * inside
+            rho = e[i] + theta[2]
+            a, b = (x[i] - theta[0]) / rho, (y[i] - theta[1]) / rho
+            N[0, 0] += w * a * a
+            N[1, 0] += w * a * b
+            N[1, 1] += w * b * b
+            N[2, 0] += w * a
+            N[2, 1] += w * b
+            N[2, 2] += w
+            g[0] += w * a * e[i]
+            g[1] += w * b * e[i]
+            g[2] += w * e[i]
+        ok, change = solved(N, g, free)
+        if not ok:
+            return False, theta, N, 0.0, 0.0, inliers
+        for j in range(3):
+            new[j] = theta[j] + change[j]
+        if step > 2 and max(abs(change[0]), abs(change[1]), abs(change[2])) < settled:
+            break
+    psi2 = slope = squares = 0.0
+    count = 0
+    N = np.zeros((3, 3))
+    for i in range(n):
+        rho = e[i] + theta[2]
+        a, b = (x[i] - theta[0]) / rho, (y[i] - theta[1]) / rho
+        N[0, 0] += a * a
+        N[1, 0] += a * b
+        N[1, 1] += b * b
+        N[2, 0] += a
+        N[2, 1] += b
+        inside = 1.0 - t2[i]
+        if inside > 0.0:
+            inliers[i] = True
+            psi2 += (e[i] * inside * inside) ** 2
+            slope += inside * (1.0 - 5.0 * t2[i])
+            squares += e[i] * e[i]
+            count += 1
+    N[0, 1], N[0, 2], N[1, 2], N[2, 2] = N[1, 0], N[2, 0], N[2, 1], float(n)
+    variance = psi2 / max(n - 3, 1) / max(slope / n, 0.2) ** 2
+    return True, new, N, variance, np.sqrt(squares / max(count, 1)), inliers
+
+
 def _covariance(d: Array, rho: Array, e: Array, s: Array, scale: float, free: int) -> Array:
     """Sandwich covariance of an M-estimate (Huber 1981, eq. 7.6.2) with Tukey's psi; (3, 3), zero row for a fixed
     radius."""
-    t = e / (_TUKEY * scale)
+    t = e / (TUKEY * scale)
     inside = np.abs(t) < 1.0
     psi = np.where(inside, e * (1.0 - t**2) ** 2, 0.0)
     dpsi = np.where(inside, (1.0 - t**2) * (1.0 - 5.0 * t**2), 0.0)
@@ -171,7 +242,7 @@ def fuse(centers: list[Array], covariances: list[Array]) -> tuple[Array, Array]:
     """Covariance-weighted mean of concentric centres (k of (m,), (m, m)); inflated where they disagree beyond chance.
 
     Returns the fused centre (m,) and its covariance (m, m). The inflation is the Birge ratio (reduced chi-square, never
-    below one): two rims that are not concentric say how much a centre may be trusted.
+    below one): rims that are not concentric widen the covariance.
     """
     information = np.linalg.inv(np.array(covariances))
     total = np.linalg.inv(information.sum(axis=0))

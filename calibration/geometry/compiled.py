@@ -1,4 +1,4 @@
-"""Loops that no array operation can join, compiled by Numba on their first call and kept on disk for all later ones."""
+"""Decorator that compiles a loop with Numba on its first call and caches the machine code on disk."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ F = TypeVar("F", bound=Callable[..., object])
 
 
 def compiled(*, any_order: bool = False) -> Callable[[F], F]:
-    """Makes a function machine code; ``any_order`` lets its sums be taken in any order, and then it knows no NaN.
+    """Compile a function to machine code; ``any_order`` allows sums in any order and assumes no NaN (fastmath).
 
     The code is kept beside its module, else in the user's cache; where neither may be written, every process compiles it
     anew, some seconds each.

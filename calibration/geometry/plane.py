@@ -1,4 +1,4 @@
-"""Robust plane fit: local seeded hypotheses, then Tukey-weighted least squares."""
+"""Robust plane fits: seeded local hypotheses, Tukey-weighted least squares, and compiled fits for many points."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import PlaneFitError
+from weldcal.calibration.geometry.compiled import compiled
+from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
 
 Array = NDArray[np.float64]
+Single = NDArray[np.float32]
 
-_TUKEY = 4.685
-_MAD = 1.4826
 _FEW = 1200  # points that find the plane, before all of them make it precise
+_FEW_COMPILED = 600  # the same in the compiled fit
+_ONE, _ZERO = np.float32(1.0), np.float32(0.0)
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,8 @@ def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, no
         d = n @ q - float(n @ at)
         if k:
             few = np.abs(d[:: max(1, len(d) // _FEW)])
-            scale = max(_MAD * float(np.partition(few, len(few) // 2)[len(few) // 2]), noise_floor)
-            t = d * (1.0 / (_TUKEY * scale))
+            scale = max(MAD * float(np.partition(few, len(few) // 2)[len(few) // 2]), noise_floor)
+            t = d * (1.0 / (TUKEY * scale))
             w = np.maximum(1.0 - t * t, 0.0)
             w *= w
         else:
@@ -70,15 +73,105 @@ def fit_plane(points: Array, start: tuple[Array, Array], *, tolerance: float, no
         if settled or k == 4:
             q = everything  # a part of the points found the plane; all of them make it precise
     d = n @ everything - float(n @ at)
-    inside = np.abs(d) < _TUKEY * scale
+    inside = np.abs(d) < TUKEY * scale
     count = int(np.count_nonzero(inside))
     rms = float(np.sqrt((d * d * inside).sum() / max(count, 1)))
     normal_sigma = rms / np.sqrt(max(count - 3, 1)) * float(np.sqrt(0.5 / values[1] + 0.5 / values[2]))
     return PlaneFit(origin + at, n, rms, count, normal_sigma)
 
 
+@compiled(any_order=True)
+def weighted_moments(p: Single, d: Single, limit: float) -> tuple[float, Single, NDArray[np.float64]]:
+    """Tukey-weighted moments of points (3, N) m at distances (N,) m from a plane: the mean weight, the mean (3,) m and the
+    covariance (3, 3) m^2. ``limit`` m is where a point's weight ends. In single precision, so the points must be about their middle."""
+    n = p.shape[1]
+    k = np.float32(1.0 / limit)
+    s = sx = sy = sz = xx = xy = xz = yy = yz = zz = _ZERO
+    for i in range(n):
+        t = d[i] * k
+        w = max(_ONE - t * t, _ZERO)
+        w *= w
+        x, y, z = p[0, i], p[1, i], p[2, i]
+        wx, wy, wz = w * x, w * y, w * z
+        s += w
+        sx += wx
+        sy += wy
+        sz += wz
+        xx += wx * x
+        xy += wx * y
+        xz += wx * z
+        yy += wy * y
+        yz += wy * z
+        zz += wz * z
+    total = max(float(s), 1e-30)
+    a, b, c = float(sx) / total, float(sy) / total, float(sz) / total
+    moments = np.empty((3, 3))
+    moments[0, 0], moments[1, 1], moments[2, 2] = xx / total - a * a, yy / total - b * b, zz / total - c * c
+    moments[0, 1] = moments[1, 0] = xy / total - a * b
+    moments[0, 2] = moments[2, 0] = xz / total - a * c
+    moments[1, 2] = moments[2, 1] = yz / total - b * c
+    return float(s) / n, np.array([a, b, c], dtype=np.float32), moments
+
+
+@compiled()
+def plane_steps(p: Array, tolerance: float) -> tuple[bool, Array, Array, float, Array]:
+    """Fit the plane height = a + b x + c y to points (3, N) m with Tukey weights, starting at the median height.
+
+    Returns whether more than three points in ten agree, (a, b, c), the moments (3, 3) of (1, x, y) with those weights, the
+    residual beyond which a point says nothing and all residuals (N,).
+    """
+    n = p.shape[1]
+    few = max(1, n // _FEW_COMPILED)
+    size = np.empty((n + few - 1) // few)
+    for i in range(len(size)):
+        size[i] = p[2, i * few]
+    fit = np.array([middle(size), 0.0, 0.0])
+    limit = 2.0 * tolerance
+    M, e = np.zeros((3, 3)), np.empty(n)
+    for step in range(4):
+        stride = few if step < 2 else 1
+        used = 0
+        for i in range(0, n, stride):
+            e[used] = p[2, i] - (fit[0] + fit[1] * p[0, i] + fit[2] * p[1, i])
+            used += 1
+        if step:
+            skip = max(1, used // _FEW_COMPILED)
+            m = 0
+            for i in range(0, used, skip):
+                if m < len(size):
+                    size[m] = abs(e[i])
+                    m += 1
+            limit = TUKEY * max(MAD * middle(size[:m]), 2e-5)
+        k = 1.0 / limit
+        M, g = np.zeros((3, 3)), np.zeros(3)
+        for j in range(used):
+            i = j * stride
+            inside = max(1.0 - (e[j] * k) ** 2, 0.0)
+            wt = inside * inside
+            x, y, d = p[0, i], p[1, i], p[2, i]
+            wx, wy = wt * x, wt * y
+            M[0, 0] += wt
+            M[1, 0] += wx
+            M[2, 0] += wy
+            M[1, 1] += wx * x
+            M[2, 1] += wx * y
+            M[2, 2] += wy * y
+            g[0] += wt * d
+            g[1] += wx * d
+            g[2] += wy * d
+        M[0, 1], M[0, 2], M[1, 2] = M[1, 0], M[2, 0], M[2, 1]
+        if not M[0, 0] > 0.3 * used:
+            return False, fit, M, limit, e
+        ok, fit = solved(M, g, 3)
+        if not ok:
+            return False, fit, M, limit, e
+    for i in range(n):
+        e[i] = p[2, i] - (fit[0] + fit[1] * p[0, i] + fit[2] * p[1, i])
+    return True, fit, M, limit, e
+
+
 def shared_noise(e: Array, good: NDArray[np.bool_], at: NDArray[np.intp], shape: tuple[int, int]) -> float:
-    """How many readings of a grid tell only as much as one, because neighbours share their noise; at least 1.
+    """Number of grid readings per independent one, from the noise that neighbours share; at least 1.
 
     ``e`` (N,) are residuals at the flat indices ``at`` (N,) of an image of that ``shape``, 0 where not ``good`` (N,). The
     variance of sums over blocks of 10 x 10 pixels over what independent readings would have.

@@ -1,4 +1,4 @@
-"""Closed-form rigid transform between two point sets (and directions): the paper's Eq. (10) to (12)."""
+"""Closed-form rigid registration of two point sets or direction sets: the paper's Eq. (10) to (12)."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidT
 
 
 def fit_rigid_sets(p_B: Array, p_C: Array) -> tuple[Array, Array]:
-    """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid; collinear sets are left
-    out (k <= s)."""
+    """Rotations (k, 3, 3) and translations (k, 3) of k point sets (s, n, 3) at once, as fit_rigid; collinear sets are
+    omitted (k <= s)."""
     R, t, good = fit_all_rigid_sets(p_B, p_C)
     return R[good], t[good]
 
@@ -47,27 +47,3 @@ def fit_rotation(u_B: Array, u_C: Array) -> RotationMatrix:
     """R_BC minimising the sum of |u_B - R_BC u_C|^2 for vectors (N, 3); two that are not parallel suffice."""
     U, _, Vt = np.linalg.svd(u_B.T @ u_C)
     return RotationMatrix(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
-
-
-def rotation_vector(R: RotationMatrix) -> Array:
-    """Axis times angle (3,) rad of a rotation."""
-    aa = R.ToAngleAxis()
-    return np.asarray(aa.axis() * aa.angle(), dtype=float)
-
-
-def exp_rotation(vector: Array) -> RotationMatrix:
-    """Rotation of a vector axis times angle (3,) rad."""
-    from pydrake.common.eigen_geometry import AngleAxis
-
-    angle = float(np.linalg.norm(vector))
-    axis = np.array([0.0, 0.0, 1.0]) if angle < 1e-15 else np.asarray(vector) / angle
-    return RotationMatrix(AngleAxis(angle, axis))
-
-
-def skew(v: Array) -> Array:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
-    v = np.asarray(v, dtype=float)
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return out

@@ -1,17 +1,25 @@
-"""Rigid poses as stacks of 4 x 4 matrices: inverse, logarithm, small changes, means."""
+"""SE(3) on arrays: inverse, logarithm and exponential of rotations, small changes and means of 4 x 4 poses."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RotationMatrix
 from scipy.spatial.transform import Rotation
-
-from weldcal.calibration.geometry.rigid import skew
 
 Array = NDArray[np.float64]
 
 IDENTITY: Array = np.eye(4)
 IDENTITY.setflags(write=False)
+
+
+def skew(v: Array) -> Array:
+    """Cross-product matrices (..., 3, 3) of vectors (..., 3)."""
+    v = np.asarray(v, dtype=float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
 
 
 def inverse(X: Array) -> Array:
@@ -44,6 +52,12 @@ def log_rotation(R: Array) -> Array:
     if turned.any():
         w[turned] = Rotation.from_matrix(R[turned]).as_rotvec()
     return np.asarray(w)
+
+
+def rotation_vector(R: RotationMatrix) -> Array:
+    """Axis times angle (3,) rad of a rotation."""
+    aa = R.ToAngleAxis()
+    return np.asarray(aa.axis() * aa.angle(), dtype=float)
 
 
 def exp_rotation(w: Array) -> Array:

@@ -1,1 +1,1 @@
-"""Hand-eye calibration in every mounting: one equation F X G = Y H Z, solved from poses, points or points with normals."""
+"""Hand-eye calibration in every mounting: F X G = Y H Z from poses, points, or points with normals."""

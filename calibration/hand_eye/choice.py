@@ -1,4 +1,4 @@
-"""From sightings to the one fit to trust: starts, gross outliers, candidates, and the choice by errors left out."""
+"""Solves one hand-eye problem: starts, outlier rejection, candidate weightings, and the choice by held-out errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _SUBSETS = 60
 
 @dataclass(frozen=True)
 class Candidate:
-    """One way to weigh the sightings: the loss, and how much less than estimated the translations count."""
+    """A weighting of the observations: the loss, and how much less than estimated the translations count."""
 
     name: str
     loss: Loss
@@ -45,7 +45,7 @@ _LEVEL = 0.01  # of all paired t tests together (Bonferroni) at which candidates
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen answer, how it was found, and what the candidates reached: name -> (deg, length) rms of errors left out.
+    """The chosen answer, how it was found, and what the candidates reached: name -> (deg, length) rms of the held-out errors.
 
     ``covariance`` of the free poses, 6 each in the order X, Y, Z, in the tangent of se3.moved.
     """
@@ -69,9 +69,9 @@ def solve(
 ) -> Choice:
     """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
 
-    The candidate is chosen by errors left out of the fit: the one whose worse column (degrees or length, each relative
+    The candidate is chosen by held-out errors: the one whose worse column (degrees or length, each relative
     to the best candidate of that column) is best, so that neither is bought with the other. Raises InconsistentPoses
-    where no rigid poses explain enough sightings.
+    where no rigid poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
     w, d = residuals(problem, state)
@@ -80,7 +80,7 @@ def solve(
     tried_sets: set[bytes] = set()
     for _ in range(10):
         noise = noise_of(problem, w, d, keep) if base is None else base.noise
-        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2, left_out=False)
+        base = fit(problem, state, noise=noise, loss=Loss.HUBER, keep=keep, tolerance=1e-2, leave_one_out=False)
         state = base.state
         tried_sets.add(keep.tobytes())
         new = _within(problem, base)
@@ -120,7 +120,7 @@ def solve(
             hold_centre=bool(fits),
             begin=near.lin if np.array_equal(near.keep, keep) else None,
         )
-    squares = _left_out(fits)
+    squares = _held_out(fits)
     agreed = _alike(fits, squares)
     best = fits[agreed[0]]
     state, covariance = best.state, best.scaled.covariance()
@@ -137,7 +137,7 @@ def solve(
 
 
 def _gate(problem: Problem, w: Array, d: Array) -> Flags:
-    """Sightings (n,) whose residuals lie within the gate, the noise taken from the medians."""
+    """Observations (n,) whose residuals lie within the gate, the noise taken from the medians."""
     everything = np.ones(len(problem), dtype=bool)
     if len(problem) <= 4:
         return everything
@@ -218,8 +218,8 @@ def _clean(problem: Problem, state: State) -> bool:
     return few and np.sqrt(noise.translation) < 0.05 * problem.extent and bool(turned < 0.1)
 
 
-def _left_out(fits: dict[str, Fit]) -> dict[str, Array]:
-    """Squares (n, 2) of the errors left out, rotation and displacement, all at the noise centre of the first fit."""
+def _held_out(fits: dict[str, Fit]) -> dict[str, Array]:
+    """Squares (n, 2) of the held-out errors, rotation and displacement, all at the noise centre of the first fit."""
     centre = next(iter(fits.values())).centre
     out = {}
     for k, f in fits.items():
@@ -235,7 +235,7 @@ def _rms(squares: Array) -> tuple[float, float]:
 
 
 def _alike(fits: dict[str, Fit], squares: dict[str, Array]) -> list[str]:
-    """The candidate with the least regret, and those whose errors left out cannot be told apart from the best of either
+    """The candidate with the least regret, and those whose held-out errors cannot be told apart from the best of either
     column (paired t test of the squares)."""
     means = {k: s.mean(axis=0) for k, s in squares.items()}
     least = np.maximum(np.min(list(means.values()), axis=0), 1e-300)

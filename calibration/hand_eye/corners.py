@@ -1,4 +1,4 @@
-"""Board corners say more than board poses: the same poses by reprojection, and a principal point that is off."""
+"""Refines a hand-eye calibration by reprojection of board corners, with an optional shift of the principal point."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _COLUMN_LOSS = 0.01  # how much worse one column may get held out while the othe
 
 @dataclass(frozen=True)
 class CornerRefinement:
-    """What the corners add. ``shift_px``, ``sigma_px`` (2,): estimated shift of the principal point and its standard
+    """Result of the refinement by corners. ``shift_px``, ``sigma_px`` (2,): estimated shift of the principal point and its standard
     deviation; ``accepted``: applied in ``result`` (else ``result`` is that of the poses as given); ``sentence`` says why."""
 
     shift_px: Array
@@ -45,7 +45,7 @@ def poses_from_corners(pairs: PosePairs, shift_px: Array) -> Array:
     Raises DatasetError where the file has no corners, fewer than six in an image, or arrays that do not belong together.
     """
     if pairs.img is None or pairs.obj is None or pairs.K is None:
-        raise DatasetError(f"'{pairs.source}' holds no corners (img, obj, K): leave out --corners.")
+        raise DatasetError(f"'{pairs.source}' holds no corners (img, obj, K): omit --corners.")
     n, m = len(pairs.camera), len(pairs.obj)
     wanted = {"img": (n, m, 2), "obj": (m, 3), "K": (3, 3)}
     for name, array in (("img", pairs.img), ("obj", pairs.obj), ("K", pairs.K)):

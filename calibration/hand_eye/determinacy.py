@@ -1,4 +1,4 @@
-"""What the motion can tell and what it cannot: checks before solving, directions left open after it, by name."""
+"""Checks what the motion determines: diversity before the solution, unobservable directions after it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _distinct(stated: list[Array], extent: float) -> int:
 
 
 def check_poses(problem: Problem, *, allow_coplanar: bool = False) -> Diversity:
-    """Refuse what no estimator can solve, before any work.
+    """Refuse poses that do not determine a solution, before any work.
 
     Raises TooFewPoses (fewer equations than unknowns and three to spare), RepeatedPoses, PureTranslation, and
     CoplanarPoses for points alone in one plane or on one line.
@@ -159,7 +159,7 @@ def determinacy(
     noise_rad: float,
     labels: dict[str, str],
 ) -> Determinacy:
-    """Name the directions that the sightings leave open.
+    """Name the directions that the observations leave open.
 
     ``information`` and ``covariance`` (m, m) of the unknowns; ``length``: extent of the data; ``noise_rad``: per axis.
     A direction is open where the information vanishes, where its predicted standard deviation exceeds a tenth of a
@@ -193,13 +193,13 @@ def determinacy(
         part = np.abs(v / scale)
         turning = float(part.reshape(-1, 6)[:, :3].max()) > float(part.reshape(-1, 6)[:, 3:].max())
         much = f"{np.degrees(sigma):.2f} deg" if turning else f"{100.0 * sigma:.1f} % of the extent of the motion"
-        warnings.append(f"Known only to about {much} (1 sigma): {name}; more turn about other axes would help.")
+        warnings.append(f"Known only to about {much} (1 sigma): {name}; rotate more about other axes.")
     condition = float(np.sqrt(values[-1] / values[0])) if values[0] > RANK * values[-1] else float("inf")
     return Determinacy(tuple(directions), names, tuple(dict.fromkeys(warnings)), condition)
 
 
 def with_open_directions(covariance: Array, found: Determinacy, length: float) -> Array:
-    """Covariance (m, m) that is never sure of an open direction: ten radians or extents of standard deviation there."""
+    """Covariance (m, m) with unobservable directions widened: ten radians or extents of standard deviation there."""
     out = covariance.copy()
     scale = np.tile([1.0, 1.0, 1.0, length, length, length], len(out) // 6)
     for v in found.directions:
@@ -209,7 +209,7 @@ def with_open_directions(covariance: Array, found: Determinacy, length: float) -
 
 
 def without_drift(problem: Problem, state: State, found: Determinacy) -> State:
-    """The answer whose positions are shortest along directions that carry no information at all."""
+    """The solution with the shortest positions along directions that carry no information."""
     for v in found.directions:
         blocks = v.reshape(-1, 6)
         if float(np.abs(blocks[:, :3]).max()) > 1e-6 * float(np.abs(blocks[:, 3:]).max()):

@@ -1,4 +1,4 @@
-"""A hand-eye result as files that other programs read, each pose named by its parent and child."""
+"""Exports a hand-eye result to YAML, JSON, URDF, ROS 2, URScript and Drake directives."""
 
 from __future__ import annotations
 

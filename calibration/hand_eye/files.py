@@ -1,4 +1,4 @@
-"""Pose pairs from the files people have: npz, CSV, JSON, and the sample files of easy_handeye2 and MoveIt."""
+"""Reads pose pairs from npz, CSV and JSON files and from the samples of easy_handeye2 and MoveIt."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _FAR_M = 20.0  # no arm and no camera on one reach this far: the numbers are not
 
 @dataclass(frozen=True)
 class PosePairs:
-    """What a file holds, in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
+    """Pose pairs in metres: ``robot`` (n, 4, 4) = X_BF, ``camera`` (n, 4, 4) = X_CM, ``robot2`` (n, 4, 4) = X_DE
     of a second robot or None, ``link`` = X_BL of an eye on the arm or None, ``mode`` a mounting's name. ``X_true``: the
     published answer where there is one; ``img`` (n, m, 2), ``obj`` (m, 3), ``K``, ``dist``: corners of a board where
     given (NaN: not seen). ``q`` (n, joints) rad: joint angles of the robot that moved, where given."""
@@ -87,7 +87,7 @@ def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = 
     if not path.is_file():
         raise DatasetError(f"There is no file '{path}'.")
     if length is not None and length not in LENGTHS:
-        raise DatasetError(f"There is no unit '{length}'; say {', '.join(LENGTHS)}.")
+        raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
     ending = path.suffix.lower()
     if ending == ".npz":
         raw = _npz(path)
@@ -105,7 +105,9 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
     if said in ("eye_to_hand", "eye_on_hand"):  # other tools' words
         said = {"eye_to_hand": "eye_on_base", "eye_on_hand": "eye_in_hand"}[said]
     if said and mounting and said != mounting:
-        raise DatasetError(f"'{path.name}' says {said} and you say {mounting}; one of them is wrong.")
+        raise DatasetError(
+            f"'{path.name}' states the mounting {said}, and the command states {mounting}; correct one of them."
+        )
     mode = mounting or said or ("co_manipulation" if raw.get("robot2") is not None else None)
     if mode is None:
         raise DatasetError(
@@ -114,10 +116,12 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
     get_mounting(mode)
     unit = raw.get("unit") or None
     if unit and length and unit != length:
-        raise DatasetError(f"'{path.name}' says its lengths are {unit} and you say {length}; one of them is wrong.")
+        raise DatasetError(
+            f"'{path.name}' states lengths in {unit}, and the command states {length}; correct one of them."
+        )
     scale = LENGTHS.get(unit or length or "m")
     if scale is None:
-        raise DatasetError(f"'{path.name}' says its lengths are '{unit}'; say {', '.join(LENGTHS)}.")
+        raise DatasetError(f"'{path.name}' states lengths in '{unit}'; use {', '.join(LENGTHS)}.")
     poses: dict[str, Array | None] = {}
     for key, name in (("robot", "robot"), ("camera", "camera"), ("robot2", "second robot"), ("link", "arm link")):
         if raw.get(key) is None:
@@ -135,10 +139,10 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
     for name, distance in far.items():
         if distance > _FAR_M:
             other = min(far.values())
-            mend = f"the others {other:.2g} m: bring both to one unit"
+            action = f"the others {other:.2g} m: bring both to one unit"
             if other > 1e-2 * distance:
-                mend = "if they are millimetres, add --unit mm"
-            raise DatasetError(f"The {name} positions of '{path.name}' are {distance:.0f} m away, as metres; {mend}.")
+                action = "if they are millimetres, add --unit mm"
+            raise DatasetError(f"The {name} positions of '{path.name}' are {distance:.0f} m away, as metres; {action}.")
     if raw.get("inverted") and mode == "eye_on_base":  # easy_handeye2 then stores the base in the hand
         robot = inverse(robot)
     X_true = raw.get("X_true")
@@ -158,7 +162,7 @@ def _array(path: Path, name: str, value: Any) -> Array:
     try:
         out = np.asarray(value, dtype=float)
     except (TypeError, ValueError) as e:
-        raise DatasetError(f"'{name}' of '{path.name}' is no array of numbers.") from e
+        raise DatasetError(f"'{name}' of '{path.name}' is not an array of numbers.") from e
     if name != "img" and not np.isfinite(out).all():
         raise DatasetError(f"'{name}' of '{path.name}' holds numbers that are not finite.")
     return out

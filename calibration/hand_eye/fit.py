@@ -1,4 +1,4 @@
-"""Weighted least squares on SE(3): robust, rotation and translation each by the noise their own residuals admit."""
+"""Robust weighted least squares on SE(3); variances of rotation and translation come from the residuals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _NEAR = 1e-3  # changes (rad, or share of the extent) up to which derivatives taken once still predict
-_MANY = 50  # sightings from which on a prediction costs less than new derivatives
+_MANY = 50  # observations from which on a prediction costs less than new derivatives
 _FAR_APART = 1e-3  # how much smaller one kind of noise may start, rad against shares of the extent
 _LONGEST = 0.5  # step (rad, or share of the extent): beyond it the derivatives say nothing
 _STALE = 100.0  # steps (sigma) shorter than this many changes are decided by derivatives of the place itself
@@ -24,8 +24,8 @@ _HERE = 0.1  # share of the tolerance up to which derivatives are those of the p
 
 @dataclass(frozen=True)
 class Fit:
-    """A converged fit. ``left_w``, ``left_d`` (n, 3): residuals of each sighting under the fit without it; ``w``, ``d``
-    (n, 3): under the fit itself; ``scaled``, ``lin``: normal equations and derivatives of the sightings kept."""
+    """A converged fit. ``left_w``, ``left_d`` (n, 3): residuals of each observation under the fit without it; ``w``, ``d``
+    (n, 3): under the fit itself; ``scaled``, ``lin``: normal equations and derivatives of the observations kept."""
 
     state: State
     noise: Noise
@@ -43,7 +43,7 @@ class Fit:
 def descend(problem: Problem, state: State, iterations: int = 30, tolerance: float = 1e-6) -> tuple[State, float]:
     """Levenberg-Marquardt from a rough start with a bounded loss; returns the state and its cost.
 
-    Rotations in radians and lengths in units of the extent; each sighting's square s costs s / (1 + s) (Geman and
+    Rotations in radians and lengths in units of the extent; each observation's square s costs s / (1 + s) (Geman and
     McClure), so that a few gross ones do not pull.
     """
     length = problem.extent
@@ -114,7 +114,7 @@ def fit(
     begin: Linearised | None = None,
     iterations: int = 60,
     tolerance: float = 1e-6,
-    left_out: bool = True,
+    leave_one_out: bool = True,
 ) -> Fit:
     """Newton's method on the robust cost from a good start; the variances are re-estimated at every step.
 
@@ -122,13 +122,13 @@ def fit(
     an unknown like the others (starting at ``centre``, else at the target's origin): the point of the target whose
     displacement is least, since a camera errs about the middle of a board and not about the origin someone gave it; so the
     answer moves with any choice of frames. It stays zero where full poses are too few, or exact. ``hold_centre``: keep it,
-    and count it only as something else that is uncertain. ``keep`` (n,): sightings that count; the others get residuals
+    and count it only as something else that is uncertain. ``keep`` (n,): observations that count; the others get residuals
     only. ``begin``: the derivatives at the start, where known. ``tolerance``: of what is left, in standard deviations.
     """
     sub = problem if keep.all() else problem.pick(keep)
     floor = sub.extent**2 * TINY
     centre = np.zeros(3) if centre is None else centre
-    # three more unknowns need some sightings to spare
+    # three more unknowns need some observations to spare
     loose = int(sub.full.sum()) >= 5 + len(sub.blocks)
 
     def taken(state: State, centre: Array) -> Linearised:
@@ -173,9 +173,9 @@ def fit(
         if done:
             break
         before = leap
-    # every sighting, at the same state
+    # every observation, at the same state
     w, d = (lin.w, lin.d) if sub is problem else residuals(problem, state, centre)
     left_w, left_d = w.copy(), d.copy()
-    if left_out:
+    if leave_one_out:
         left_w[keep], left_d[keep] = s.leave_one_out(lin)
     return Fit(state, noise, centre, loss, keep, s, lin, left_w, left_d, w, d)

@@ -1,4 +1,4 @@
-"""Joint angles say more than flange poses: joint offsets and link errors found together with the camera, if that helps."""
+"""Estimates joint offsets and link errors together with the camera, applied where held-out errors fall."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ _STEP = 1e-3  # of the prior's standard deviation, for the differences by the ro
 _STEPS = 25
 _SETTLED = 1e-7
 _SAME_M, _SAME_RAD = 5e-3, float(np.radians(0.5))  # a factory calibration moves the flange by no more
-_CHANCE = 2.6  # standard errors by which the errors left out must fall: 1 in 200 by chance
+_CHANCE = 2.6  # standard errors by which held-out errors must fall: 1 in 200 by chance
 _COLUMN_LOSS = 0.01  # how much worse one column may get while the other gets better
 _SHOWN = 0.8  # of the prior: below it the poses have said something
 
 
 @dataclass(frozen=True)
 class JointPrior:
-    """What is believed of a robot before it is measured: standard deviations of the zero of a joint, of the turn of a joint's
+    """Prior of a robot's errors: standard deviations of the zero of a joint, of the turn of a joint's
     axis, and of its place."""
 
     offset_rad: float = float(np.radians(0.3))
@@ -50,7 +50,7 @@ class JointPrior:
 
 @dataclass(frozen=True)
 class JointRefinement:
-    """What the joint angles add. ``names``, ``values``, ``sigma`` (k,): errors of the robot (rad or m) with their standard
+    """Result of the refinement by joint angles. ``names``, ``values``, ``sigma`` (k,): errors of the robot (rad or m) with their standard
     deviations; ``accepted``: applied in ``result`` (else ``result`` is that of the poses as given); ``sentence``: why."""
 
     names: tuple[str, ...]
@@ -123,8 +123,8 @@ def refine_joints(
     """Estimate joint offsets (``kind`` "joints") or all errors of the links ("links": six numbers a joint) with the camera.
 
     Maximum a posteriori: the prior keeps what the poses do not show at zero. What only moves the base or the flange as a
-    whole is no error of the robot and is left out (all of the first joint; turn and shift of the last one about and along
-    its axis). Applied only if errors left out of the fit fall, in a paired test on five folds, and not one column at the cost of
+    whole is no error of the robot and is omitted (all of the first joint; turn and shift of the last one about and along
+    its axis). Applied only if held-out errors fall, in a paired test on five folds, and not one column at the cost of
     the other; otherwise the sentence says that it does not help. ``plain`` is the result of the poses as given.
     Raises DatasetError without joint angles, InputError where they do not belong to the arm or the mounting.
     """
@@ -148,7 +148,7 @@ def refine_joints(
     state = _state_of(plain)
     try:
         found = _fit(robot.pick(keep), state, k, plain.noise_centre)
-        errors = {m: _left_out(robot, state, keep, m, plain.noise_centre, config.folds or 5) for m in (0, k)}
+        errors = {m: _held_out(robot, state, keep, m, plain.noise_centre, config.folds or 5) for m in (0, k)}
     except (WeldcalError, np.linalg.LinAlgError):
         return refused("no calibration agrees with them")
     sigma = np.sqrt(np.diag(found.V)[-k:])
@@ -178,7 +178,7 @@ def refine_joints(
         if u < _SHOWN
     )
     said = (
-        f"Robot errors applied ({told}); {change}. The answer belongs to the robot so corrected: enter these errors in its "
+        f"Robot errors applied ({told}); {change}. The result applies to the robot with these corrections: enter them in its "
         "kinematics, or calibrate without them."
     )
     return JointRefinement(names, values, sigma * robot.scale, True, better, said)
@@ -192,7 +192,7 @@ def _number(value: float, sigma: float, name: str) -> str:
 
 def _robot(pairs: PosePairs, arm: Chain, kind: str, prior: JointPrior) -> tuple[_Robot, tuple[str, ...]]:
     if pairs.q is None:
-        raise DatasetError(f"'{pairs.source}' holds no joint angles (q, radians): leave out --refine.")
+        raise DatasetError(f"'{pairs.source}' holds no joint angles (q, radians): omit --refine.")
     if pairs.mode not in ("eye_in_hand", "eye_on_base"):
         raise InputError("Robot errors are refined where one robot's flange moves: eye_in_hand or eye_on_base.")
     if pairs.q.shape != (len(pairs.robot), arm.n):
@@ -288,7 +288,7 @@ def _by_errors(robot: _Robot, state: State, k: int, centre: Array, u: Array) -> 
     return Jw, Jd
 
 
-def _left_out(
+def _held_out(
     robot: _Robot, state: State, keep: NDArray[np.bool_], k: int, centre: Array, folds: int
 ) -> tuple[Array, Array]:
     """Errors (n,), (n,) of every pose under a fit with ``k`` robot errors that never saw its fold."""

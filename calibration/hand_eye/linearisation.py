@@ -1,4 +1,4 @@
-"""One linearisation in units of its noise: normal equations, robust weights, covariance, errors left out."""
+"""Whitened linearisation of a hand-eye problem: normal equations, robust weights, covariance, leave-one-out errors."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ Array = NDArray[np.float64]
 _HUBER = 2.0  # in sigma per axis
 _STUDENT = 5.0  # degrees of freedom of the heavy-tailed loss
 TINY = 1e-24  # of the squared extent: exact data have no noise to estimate
-RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the sightings do not fix
+RANK = 1e-11  # eigenvalues below this share of the largest count as zero: a direction the observations do not fix
 _VARIANCE_STEPS = 2
 _SURE = 1e-7  # a matrix with no eigenvalue below this share needs no look at its eigenvalues
 
 
 class Loss(Enum):
-    """How much a sighting's own residual may cost."""
+    """Robust loss of an observation's residual."""
 
     SQUARES = "least squares"
     HUBER = "Huber"
@@ -31,7 +31,7 @@ class Loss(Enum):
 
 @dataclass(frozen=True)
 class Noise:
-    """Variances per axis beyond the sightings' own covariances: rotation rad^2 and translation of the noise centre.
+    """Variances per axis beyond the observations' own covariances: rotation rad^2 and translation of the noise centre.
 
     ``ratio``: factor on the translation's sigma in the weights only: > 1 lets the rotations decide the rotations.
     """
@@ -42,7 +42,7 @@ class Noise:
 
 
 class Scaled:
-    """The sightings of a linearisation, weighed. ``lin`` may hold three more columns than the problem has unknowns: those of
+    """The observations of a linearisation, weighed. ``lin`` may hold three more columns than the problem has unknowns: those of
     the noise centre."""
 
     def __init__(self, problem: Problem, lin: Linearised, noise: Noise, loss: Loss) -> None:
@@ -54,7 +54,7 @@ class Scaled:
         self.m_w = np.maximum(self.numbers_w, 1.0)
         self.inflate = noise.ratio**2
         self.root: Array | None = None
-        self.share_w: Array | float = 1.0  # how much of each sighting's variance is the common one
+        self.share_w: Array | float = 1.0  # how much of each observation's variance is the common one
         self.share_d: Array | float = 1.0
         if problem.covariance is None:
             self._unit, self._a, self._b = lin, 1.0 / noise.rotation, 1.0 / noise.translation
@@ -156,7 +156,7 @@ class Scaled:
         return replace(noise, rotation=rotation, translation=translation)
 
     def unsettled(self, new: Noise) -> float:
-        """How much of the sightings' variances would change, as a share of them, with other common ones."""
+        """How much of the observations' variances would change, as a share of them, with other common ones."""
         change_w = abs(new.rotation / self.noise.rotation - 1.0) * float(np.mean(self.share_w))
         return change_w + abs(new.translation / self.noise.translation - 1.0) * float(np.mean(self.share_d))
 
@@ -165,7 +165,7 @@ class Scaled:
         return self.cross_covariance(self)
 
     def cross_covariance(self, other: Scaled) -> Array:
-        """Covariance between the unknowns of two fits of the same sightings, each with its own weights."""
+        """Covariance between the unknowns of two fits of the same observations, each with its own weights."""
         cross_w = float((self.ww * other.ww * (self.ew * other.ew).sum(axis=1)).sum()) / self.free_w
         cross_d = float((self.wd * other.wd * (self.ed * other.ed).sum(axis=1)).sum()) / self.free_d
         k, m = self.Jw.shape[2], other.Jw.shape[2]
@@ -181,7 +181,7 @@ class Scaled:
         return np.asarray(N[:m, :m] - N[:m, m:] @ np.linalg.pinv(N[m:, m:], rcond=1e-10, hermitian=True) @ N[m:, :m])
 
     def leave_one_out(self, lin: Linearised) -> tuple[Array, Array]:
-        """Residuals (n, 3), (n, 3) of each sighting under the fit without it (exact where linear: PRESS, Allen 1974)."""
+        """Residuals (n, 3), (n, 3) of each observation under the fit without it (exact where linear: PRESS, Allen 1974)."""
         J = np.concatenate([self.Jw, self.Jd], axis=1)
         m = self.size
         u = np.repeat(np.column_stack([self.ww, self.wd / self.inflate]), 3, axis=1)
@@ -208,7 +208,7 @@ def weigh(q: Array, m: Array, loss: Loss) -> tuple[Array, Array]:
 
 def _growth(q: Array, m: Array, loss: Loss, redundancy: float, share: Array | float) -> float:
     """Factor on a variance: squares over redundancy, to the power that makes the step a Newton step. ``share`` (n,): how
-    much of each sighting's variance it is."""
+    much of each observation's variance it is."""
     w, _ = weigh(q, m, loss)
     total = float((w * q).sum())
     if loss is Loss.STUDENT:
@@ -223,7 +223,7 @@ def _growth(q: Array, m: Array, loss: Loss, redundancy: float, share: Array | fl
 
 
 def _total(problem: Problem, noise: Noise) -> Array:
-    """Covariances (n, 6, 6): the sightings' own plus the common ones; numbers that are not known stand alone."""
+    """Covariances (n, 6, 6): the observations' own plus the common ones; numbers that are not known stand alone."""
     C = np.array(problem.covariance)
     unknown = np.zeros((len(problem), 6), dtype=bool)
     unknown[:, :3] = ~problem.full[:, None]

@@ -1,4 +1,4 @@
-"""The usual mistakes in a file of poses: each undone in turn, and named where the poses then agree far better."""
+"""Detects usual mistakes in pose files: applies each correction and names the one that makes the poses agree."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class _Trial:
 
 
 def likely_mistake(pairs: PosePairs, given: HandEyeResult | None, config: HandEyeConfig) -> str | None:
-    """The one correction of the input under which the poses agree, and far better than in ``given`` (None: where they do not
+    """Find the one correction of the input under which the poses agree far better than in ``given`` (None: where they do not
     agree at all as they stand); None where no correction does. One robot only.
 
     With both lists inverted the equation holds as well, camera and target exchanged: no data can tell.
@@ -96,7 +96,7 @@ def scale_warning(problem: Problem, result: HandEyeResult) -> str | None:
     # the positions fit when multiplied by 1 + s
     return (
         f"The camera's distances seem {abs(100 * s):.1f} % (+- {100 * sigma:.1f}) too {'short' if s > 0.0 else 'long'} for the "
-        "robot's motion; check the size of the target and the camera's focal length, for an error there shifts the answer."
+        "robot's motion; check the size of the target and the camera's focal length: an error of either shifts the result."
     )
 
 

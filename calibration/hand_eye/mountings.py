@@ -1,4 +1,4 @@
-"""Every mounting by its name: which frames its equation ties, what its unknowns are called, and a sketch of them."""
+"""The supported mountings: the frames of each equation, the names of its unknowns, and a sketch."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
-from weldcal.calibration.hand_eye.problem import Problem, State
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.calibration.hand_eye.problem import Problem
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -29,7 +28,7 @@ class Unknown:
 
     @property
     def sentence(self) -> str:
-        """What the result prints before the numbers."""
+        """Description of the pose for printed results."""
         return f"pose of the {self.child_words} in the {self.parent_words} frame: {self.symbol}"
 
 
@@ -117,8 +116,8 @@ MOUNTINGS: dict[str, Mounting] = {
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """One sample. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
+class TargetObservation:
+    """One observation of the target. ``X_BF``: flange in base (of the robot with the camera where there are two); ``X_BL``: the link that
     carries the camera (eye_on_arm only); ``X_DE``: the second robot's flange in its base (co_manipulation only).
 
     Measured: ``p_CM`` (3,) always, with ``n_CM`` (3,) the unit z axis of the target (its normal) or ``R_CM`` all of its
@@ -159,16 +158,18 @@ def chain(mounting: Mounting, X_BF: Array, X_BL: Array | None = None, X_DE: Arra
     return (X_BL, H) if mounting.name == "eye_on_arm_target_on_base" else (inverse(X_BF) @ X_BL, H)
 
 
-def problem_of(mounting: Mounting, sightings: Sequence[Sighting], known: dict[str, RigidTransform]) -> Problem:
-    """The equation of these sightings. ``known``: letters of unknowns that are given (a flange as target: Y or Z)."""
-    X_BF = np.array([s.X_BF.GetAsMatrix4() for s in sightings]).reshape(-1, 4, 4)
-    links = [s.X_BL for s in sightings]
-    others = [s.X_DE for s in sightings]
+def problem_of(
+    mounting: Mounting, observations: Sequence[TargetObservation], known: dict[str, RigidTransform]
+) -> Problem:
+    """The equation of these observations. ``known``: letters of unknowns that are given (a flange as target: Y or Z)."""
+    X_BF = np.array([s.X_BF.GetAsMatrix4() for s in observations]).reshape(-1, 4, 4)
+    links = [s.X_BL for s in observations]
+    others = [s.X_DE for s in observations]
     X_BL = None if any(x is None for x in links) else np.array([x.GetAsMatrix4() for x in links if x is not None])
     X_DE = None if any(x is None for x in others) else np.array([x.GetAsMatrix4() for x in others if x is not None])
     F, H = chain(mounting, X_BF, X_BL, X_DE)
-    G = np.broadcast_to(IDENTITY, (len(sightings), 4, 4)).copy()
-    for i, s in enumerate(sightings):
+    G = np.broadcast_to(IDENTITY, (len(observations), 4, 4)).copy()
+    for i, s in enumerate(observations):
         G[i, :3, 3] = s.p_CM
         if s.R_CM is not None:
             G[i, :3, :3] = s.R_CM.matrix()
@@ -176,9 +177,9 @@ def problem_of(mounting: Mounting, sightings: Sequence[Sighting], known: dict[st
             G[i, :3, :3] = _frame_with_z(np.asarray(s.n_CM, dtype=float))
     if not (np.isfinite(F).all() and np.isfinite(G).all() and np.isfinite(H).all()):
         raise InputError("A sample holds numbers that are not finite.")
-    full = np.array([s.R_CM is not None for s in sightings], dtype=bool)
-    normal = np.array([s.R_CM is None and s.n_CM is not None for s in sightings], dtype=bool)
-    stated = [s.covariance for s in sightings]
+    full = np.array([s.R_CM is not None for s in observations], dtype=bool)
+    normal = np.array([s.R_CM is None and s.n_CM is not None for s in observations], dtype=bool)
+    stated = [s.covariance for s in observations]
     covariance = None
     if any(c is not None for c in stated):
         if any(c is None for c in stated):
@@ -186,29 +187,6 @@ def problem_of(mounting: Mounting, sightings: Sequence[Sighting], known: dict[st
         covariance = np.array([c for c in stated if c is not None], dtype=float)
     free = tuple(k in mounting.unknowns and k not in known for k in "XYZ")
     return Problem(F, G, H, full, normal, covariance, (free[0], free[1], free[2]))
-
-
-def calibrate_mounting(
-    configuration: str,
-    sightings: Sequence[Sighting],
-    *,
-    known: dict[str, RigidTransform] | None = None,
-    config: HandEyeConfig | None = None,
-) -> HandEyeResult:
-    """Calibrate a mounting from sightings of any kind together: points, points with normals, full poses.
-
-    ``known``: letters (Y, Z) of poses that are given rather than sought; the paper's method takes the flange or the circle
-    of the base mounting as the target, whose place the robot's drawing states. Raises as solve_problem, and InputError.
-    """
-    mounting = get_mounting(configuration)
-    known = known or {}
-    for k in known:
-        if k not in mounting.unknowns:
-            raise InputError(f"{configuration} has no unknown '{k}'; it has {', '.join(mounting.unknowns)}.")
-    problem = problem_of(mounting, sightings, known)
-    given = [np.asarray(known[k].GetAsMatrix4()) if k in known else IDENTITY for k in "XYZ"]
-    state: State = (given[0], given[1], given[2])
-    return solve_problem(problem, state, config=config, equation=mounting.equation, labels=mounting.labels)
 
 
 def _frame_with_z(z: Array) -> Array:

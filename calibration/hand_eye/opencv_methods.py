@@ -1,4 +1,4 @@
-"""OpenCV's seven hand-eye methods on the same sightings, for comparison: they fail without a word, so we say it."""
+"""Runs OpenCV's hand-eye methods on the same observations, for comparison."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One equation for every mounting, F_i X G_i = Y H_i Z, with residuals and their derivatives."""
+"""The equation F_i X G_i = Y H_i Z of every mounting, with residuals and analytic derivatives."""
 
 from __future__ import annotations
 
@@ -8,14 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.geometry.se3 import (
-    IDENTITY,
-    inverse,
-    left_jacobian_inverse,
-    log_rotation,
-    moved,
-)
+from weldcal.calibration.geometry.se3 import IDENTITY, inverse, left_jacobian_inverse, log_rotation, moved, skew
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -27,10 +20,10 @@ NAMES = ("X", "Y", "Z")
 
 @dataclass(frozen=True)
 class Problem:
-    """Sightings of one equation F_i X G_i = Y H_i Z (metres or any other unit of length).
+    """Observations of one equation F_i X G_i = Y H_i Z (metres or any other unit of length).
 
     ``F``, ``H`` (n, 4, 4): poses the robots state; ``G`` (n, 4, 4): what the camera measured of the target. The
-    residual of a sighting is D_i = (Y H_i Z)^-1 F_i X G_i, seen in the frame of the target T: a rotation vector and
+    residual of an observation is D_i = (Y H_i Z)^-1 F_i X G_i, seen in the frame of the target T: a rotation vector and
     the displacement of a point of the target. ``full`` (n,): all three rotations of G known; ``normal`` (n,): only the
     direction of the z axis of T; neither: only the point at the origin of T. ``covariance`` (n, 6, 6) [rotation;
     translation] in T of the measurement, or None. ``free``: which of X, Y, Z are unknown; the others stay at the
@@ -57,12 +50,12 @@ class Problem:
 
     @cached_property
     def numbers_w(self) -> Array:
-        """How many numbers (n,) of each sighting speak of rotation: 3, 2 or 0."""
+        """How many numbers (n,) of each observation speak of rotation: 3, 2 or 0."""
         return np.where(self.full, 3.0, np.where(self.normal, 2.0, 0.0))
 
     @cached_property
     def all_full(self) -> bool:
-        """Whether every sighting is a full pose."""
+        """Whether every observation is a full pose."""
         return bool(self.full.all())
 
     @property
@@ -76,7 +69,7 @@ class Problem:
         return (0,) if self.tied else tuple(k for k in range(3) if self.free[k])
 
     def pick(self, rows: Flags | NDArray[np.int64]) -> Problem:
-        """The same equation with some of the sightings."""
+        """The same equation with some of the observations."""
         return replace(
             self,
             F=self.F[rows],
@@ -99,7 +92,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals and derivatives of all sightings at one state.
+    """Residuals and derivatives of all observations at one state.
 
     ``w`` (n, 3) rad: rotation vector of D (zero where unknown; two numbers where only a normal is known). ``d`` (n, 3):
     displacement of the noise centre (full poses) or of the measured point. ``Jw``, ``Jd`` (n, 3, m).
@@ -129,7 +122,7 @@ class Linearised:
 
 
 def residuals(problem: Problem, state: State, centre: Array | None = None) -> tuple[Array, Array]:
-    """Rotations (n, 3) rad and displacements (n, 3) of all sightings in the frame of the target."""
+    """Rotations (n, 3) rad and displacements (n, 3) of all observations in the frame of the target."""
     w, d, *_ = _evaluate(problem, state, np.zeros(3) if centre is None else centre, slopes=False)
     return w, d
 
@@ -215,7 +208,7 @@ def full_problem(
     tied: bool = False,
     covariance: Array | None = None,
 ) -> Problem:
-    """A problem whose sightings are all full poses."""
+    """A problem whose observations are all full poses."""
     n = len(F)
     H = np.broadcast_to(IDENTITY, (n, 4, 4)) if H is None else H
     return Problem(F, G, H, np.ones(n, dtype=bool), np.zeros(n, dtype=bool), covariance, free, tied)

@@ -1,4 +1,4 @@
-"""Hand-eye calibration: AX = XB, AX = YB and AXB = YCZ, with what is known, how well, and what is not."""
+"""Solves AX = XB, AX = YB and AXB = YCZ, with covariance, held-out errors and unobservable directions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import f as fisher
 
 from weldcal.calibration.errors import UndeterminedPoses
-from weldcal.calibration.geometry.se3 import IDENTITY, inverse
+from weldcal.calibration.geometry.se3 import IDENTITY, difference, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES, Candidate, solve
 from weldcal.calibration.hand_eye.determinacy import (
     Diversity,
@@ -31,7 +31,7 @@ _SPARE = 2.5  # numbers per unknown below which an answer cannot be checked
 
 @dataclass(frozen=True)
 class HandEyeConfig:
-    """Knobs. ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive;
+    """Settings. ``folds``: of the held-out errors (0: none); ``max_outliers``: share of gross ones to survive;
     ``allow_open``: give an answer even where more than one direction of translation stays open."""
 
     seed: int = 0
@@ -63,15 +63,15 @@ class HandEyeHeldOut:
 
 @dataclass(frozen=True)
 class HandEyeResult:
-    """The unknown poses and what is known of them.
+    """The unknown poses with their covariances, residuals and held-out errors.
 
     ``poses``: X, Y, Z as far as they were unknown. ``covariance`` (6, 6) each, [rotation; translation]: X = (exp(a) R,
     p + b), a (rad) a rotation on the parent's side about the child's origin, b the displacement of that origin, both in
     the parent's axes; open directions carry a standard deviation of ten (rad, or extents of the motion).
     ``joint_covariance`` (m, m): all of them, in the order of ``poses``. ``rotation_rad`` (n,) (NaN where none was seen)
-    and ``translation`` (n,): residuals of all sightings at the origin of the target. ``left_out``: their linearised
-    errors when left out one by one. ``sigma_rotation_rad``, ``sigma_translation``: noise per axis beyond the sightings'
-    own; ``noise_centre`` (3,): the point of the target where it holds. Lengths are in the unit of the data.
+    and ``translation`` (n,): residuals of all observations at the origin of the target. ``sigma_rotation_rad``,
+    ``sigma_translation``: noise per axis beyond the observations' own; ``noise_centre`` (3,): the point of the target where it
+    holds. Lengths are in the unit of the data.
     """
 
     equation: str
@@ -121,8 +121,6 @@ class HandEyeResult:
 
 def pose_difference(estimate: RigidTransform, truth: RigidTransform) -> Array:
     """Change (6,) [rotation; translation] on the parent's side that moves the estimate to the truth."""
-    from weldcal.calibration.geometry.se3 import difference
-
     return difference(np.asarray(estimate.GetAsMatrix4()), np.asarray(truth.GetAsMatrix4()))
 
 
@@ -195,7 +193,7 @@ def solve_problem(
     """Solve F_i X G_i = Y H_i Z for the free poses; ``known`` holds the others (Y and Z may carry a known feature).
 
     Raises TooFewPoses, RepeatedPoses, PureTranslation, CoplanarPoses before any work, InconsistentPoses where no rigid
-    poses explain the sightings, and UndeterminedPoses where more than one translation or any rotation of the camera
+    poses explain the observations, and UndeterminedPoses where more than one translation or any rotation of the camera
     stays open (unless ``config.allow_open``).
     """
     config = config or HandEyeConfig()
@@ -229,12 +227,12 @@ def solve_problem(
     if numbers < _SPARE * problem.size:
         warnings.append(
             f"{len(used)} {'motions' if problem.tied else 'poses'} are {numbers:.0f} numbers for {problem.size} unknowns: "
-            "a wrong sample or a wrong convention would hardly show; add some before trusting the answer."
+            "a wrong sample or convention is hard to detect; add samples before you rely on the result."
         )
     if not keep.all():
         names = ", ".join(str(i) for i in np.nonzero(~keep)[0])
         warnings.insert(
-            0, f"{int((~keep).sum())} of {len(keep)} poses disagree with the rest and were left out: {names}."
+            0, f"{int((~keep).sum())} of {len(keep)} poses disagree with the rest and were excluded: {names}."
         )
     blocks = {NAMES[k]: slice(6 * row, 6 * row + 6) for row, k in enumerate(problem.blocks)}
     return HandEyeResult(

@@ -1,4 +1,4 @@
-"""Closed-form answers to start from: quaternions, Kronecker products, dual quaternions, logarithms, or a grid of turns."""
+"""Closed-form initial estimates: quaternions, Kronecker products, dual quaternions, logarithms, a rotation grid."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def with_positions(problem: Problem, rotations: Rotations, state: State) -> Stat
 
 
 def closed_forms(problem: Problem, state: State) -> Iterator[tuple[str, State]]:
-    """The closed-form starts that fit the unknowns and the kind of sightings, with their names, one after the other.
+    """The closed-form starts that fit the unknowns and the kind of observations, with their names, one after the other.
 
     ``state`` holds the known poses (identity where unknown).
     """
@@ -178,7 +178,7 @@ def closed_forms(problem: Problem, state: State) -> Iterator[tuple[str, State]]:
 
 
 def grid(problem: Problem, state: State, rng: np.random.Generator, n: int = 24) -> list[tuple[str, State]]:
-    """Turns of the cube, seen from a random side, for X; the rotations of the other unknowns follow from the sightings
+    """Turns of the cube, seen from a random side, for X; the rotations of the other unknowns follow from the observations
     where these are poses, or stay as they are."""
     tilt = np.asarray(Rotation.random(rng=rng).as_matrix())
     out = []

@@ -1,4 +1,4 @@
-"""How sure a hand-eye result is where every sighting states its own covariance: never surer than those say."""
+"""Covariance of a hand-eye result whose observations state their own covariances."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def with_stated_noise(problem: Problem, known: State, result: HandEyeResult) -> 
     poses by a factor of three. ``known`` holds the poses that were given. Raises InputError without covariances.
     """
     if problem.covariance is None:
-        raise InputError("Every sighting must state its covariance.")
+        raise InputError("Every observation must state its covariance.")
     used = problem.pick(result.inliers)
     parts = [np.asarray(result.poses[k].GetAsMatrix4()) if k in result.poses else known[i] for i, k in enumerate(NAMES)]
     state = parts[0], parts[1], parts[2]
@@ -50,7 +50,7 @@ def with_stated_noise(problem: Problem, known: State, result: HandEyeResult) -> 
 
 
 def information_of(problem: Problem, state: State) -> tuple[Array, float, int]:
-    """Information (m, m) of sightings with stated covariances, their chi-square, and how many numbers were measured."""
+    """Information (m, m) of observations with stated covariances, their chi-square, and how many numbers were measured."""
     assert problem.covariance is not None
     lin = linearise(problem, state, np.zeros(3))
     N, chi2, numbers = np.zeros((problem.size, problem.size)), 0.0, 0

@@ -1,1 +1,1 @@
-"""Which poses to visit: reach, clearance, sight, observability and the next best pose."""
+"""Plans poses: reach, clearance, visibility, observability and the next best pose."""

@@ -1,4 +1,4 @@
-"""Which flange poses to scan: reachable, clear, in view, and the ones that tell most about where the camera is."""
+"""Plans flange poses for eye-on-base calibration: reachable, clear, visible and D-optimal."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
@@ -77,7 +77,7 @@ def plan_calibration_poses(
     config: PlannerConfig | None = None,
     tool: Sequence[Capsule] = (),
 ) -> list[PlannedPose]:
-    """Plan ``n`` (>= 4) flange poses, most telling first: greedy D-optimal on the information of X_BC about the work
+    """Plan ``n`` (>= 4) flange poses, most informative first: greedy D-optimal on the information of X_BC about the work
     point.
 
     A constant bias of the feature in the flange counts as unknown too, so tilts and turns of the flange are valued.
@@ -89,7 +89,7 @@ def plan_calibration_poses(
         raise InputError("A calibration needs at least 4 poses: ask for 4 or more.")
     config = config or PlannerConfig()
     pool, why = _candidates(arm, X_FR, X_BC_guess, scanner, q_start, config, tool)
-    chosen = _greedy(pool, [], n, X_BC_guess, config)
+    chosen = _greedy(pool, n, X_BC_guess, config)
     if len(chosen) < n:
         raise UnreachableScanner(_explain(why, len(chosen), n))
     p = np.array([c.X_BR.translation() for c in chosen])
@@ -98,27 +98,6 @@ def plan_calibration_poses(
             "The poses that the arm can take before the scanner lie in one plane; move the scanner closer to the arm."
         )
     return chosen
-
-
-def next_best_pose(
-    arm: ArmModel,
-    X_FR: RigidTransform,
-    X_BC: RigidTransform,
-    scanner: ScannerPreset,
-    taken: Sequence[RigidTransform],
-    *,
-    q_start: Array,
-    config: PlannerConfig | None = None,
-    tool: Sequence[Capsule] = (),
-) -> PlannedPose:
-    """The pose that adds most to the feature poses X_BR already scanned (``taken``); same limits and errors
-    as above."""
-    config = config or PlannerConfig()
-    pool, why = _candidates(arm, X_FR, X_BC, scanner, q_start, config, tool)
-    chosen = _greedy(pool, list(taken), 1, X_BC, config)
-    if not chosen:
-        raise UnreachableScanner(_explain(why, 0, 1))
-    return chosen[0]
 
 
 def predicted_sigma(
@@ -197,8 +176,8 @@ def _random_feature(
     # uniform over the cap of directions within theta_max of the line of sight
     tilt = float(np.arccos(rng.uniform(np.cos(config.theta_max_rad), 1.0)))
     side = np.cross(sight, [1.0, 0.0, 0.0])
-    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight).matrix() @ (side / np.linalg.norm(side))
-    normal = exp_rotation(tilt * side).matrix() @ sight
+    side = exp_rotation(rng.uniform(0.0, 2.0 * np.pi) * sight) @ (side / np.linalg.norm(side))
+    normal = exp_rotation(tilt * side) @ sight
     x = np.cross([0.0, 1.0, 0.0], normal)
     x /= np.linalg.norm(x)
     R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal])) @ RotationMatrix.MakeZRotation(
@@ -236,7 +215,7 @@ def _refuse(
 
 
 def _information(X_BR: RigidTransform, X_BC: RigidTransform, work: Array, config: PlannerConfig) -> Array:
-    """Information (9, 9) of one sighting on [rotation about the work point; translation; centre bias in R]."""
+    """Information (9, 9) of one observation on [rotation about the work point; translation; centre bias in R]."""
     lever = X_BR.translation() - work
     R = X_BR.rotation().matrix()
     J_p = np.hstack([-skew(lever), np.eye(3), -R])
@@ -257,18 +236,16 @@ def _sigma_at_work(information: Array) -> float:
     return float(np.sqrt(np.trace(np.linalg.inv(information)[3:6, 3:6])))
 
 
-def _greedy(
-    pool: list[PlannedPose], taken: list[RigidTransform], n: int, X_BC: RigidTransform, config: PlannerConfig
-) -> list[PlannedPose]:
+def _greedy(pool: list[PlannedPose], n: int, X_BC: RigidTransform, config: PlannerConfig) -> list[PlannedPose]:
+    """The ``n`` poses of the pool that in turn add most to the log determinant of the information, apart from each other."""
     if not pool:
         return []
-    work = _work_point(config, X_BC, taken + [c.X_BR for c in pool])
+    work = _work_point(config, X_BC, [c.X_BR for c in pool])
     # what is believed before the first scan: weak, so that four poses already span space; the bias is known to about 1
     # mm
-    prior = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
-    total = prior + sum((_information(X, X_BC, work, config) for X in taken), np.zeros((9, 9)))
+    total = np.diag([1.0 / 0.1**2] * 3 + [1.0 / 0.1**2] * 3 + [1.0 / 0.001**2] * 3)
     gains = [_information(c.X_BR, X_BC, work, config) for c in pool]
-    places = [np.asarray(X.translation()) for X in taken]
+    places: list[Array] = []
     chosen: list[PlannedPose] = []
     free = set(range(len(pool)))
     while len(chosen) < n and free:

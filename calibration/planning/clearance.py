@@ -1,4 +1,4 @@
-"""Capsules of the arm against the table, against itself, and against the scanner's line of sight."""
+"""Clearance of the arm's capsules from the table, from itself and from the scanner's line of sight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Poses for a calibration in any mounting: within reach, in sight, clear, and the ones that tell most about the unknowns."""
+"""Plans poses for calibration in any mounting: reachable, visible, clear and D-optimal in the unknowns."""
 
 from __future__ import annotations
 
@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
-from weldcal.calibration.geometry.rigid import skew
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.problem import linearise
 from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
@@ -61,10 +59,10 @@ class MountingPose:
     via_home: bool = False
 
 
-def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
-    """Plan ``n`` poses, most telling first (greedy, D-optimal in the unknowns), then ``kept_aside`` drawn at random, then all
-    others that would do. Each of the first n + kept_aside has a free way from home, the second arm going first, and is
-    reached on it or from the pose before (the first one kept aside from home). Deterministic for ``plan.seed``.
+def plan_mounting_poses(scene: MountingScene, n: int, held_out: int, plan: MountingPlan) -> tuple[MountingPose, ...]:
+    """Plan ``n`` poses, most informative first (greedy, D-optimal in the unknowns), then ``held_out`` drawn at random, then all
+    others that would do. Each of the first n + held_out has a free way from home, the second arm going first, and is
+    reached on it or from the pose before (the first held-out one from home). Deterministic for ``plan.seed``.
 
     Raises:
         UnreachableScanner: one sentence that names the commonest obstacle.
@@ -75,11 +73,11 @@ def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: Mou
     order = _greedy(scene, pool, plan)
     chosen = _chain(bodies, [pool[i] for i in order], n, plan)
     rest = [pool[i] for i in order if not any(pool[i].q is c.q for c in chosen)]
-    aside = _chain(bodies, [rest[i] for i in rng.permutation(len(rest))], kept_aside, plan)
-    if len(chosen) < n or len(aside) < kept_aside:
+    aside = _chain(bodies, [rest[i] for i in rng.permutation(len(rest))], held_out, plan)
+    if len(chosen) < n or len(aside) < held_out:
         reason = why.most_common(1)[0][0] if why else "the poses found lie too close together"
         raise UnreachableScanner(
-            f"Only {len(chosen) + len(aside)} of {n + kept_aside} poses show the circle to the scanner, most often because "
+            f"Only {len(chosen) + len(aside)} of {n + held_out} poses show the circle to the scanner, most often because "
             f"{reason}; mount the scanner elsewhere, correct its guessed pose, or choose another home_deg."
         )
     others = [p for p in rest if not any(p.q is a.q for a in aside)]
@@ -87,11 +85,13 @@ def plan_mounting_poses(scene: MountingScene, n: int, kept_aside: int, plan: Mou
 
 
 def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Array | float, sigma_rad: float) -> Array:
-    """What sightings of the circle at some poses would tell (k, m + 3, m + 3): of the free unknowns, in the order of the
+    """Information of observations of the circle at some poses (k, m + 3, m + 3): of the free unknowns, in the order of the
     solver, and of a constant bias of the centre in its own frame. ``sigma_m``: of the centre, one for all or (3,) along the
     circle's own axes."""
-    sightings = [scene.sighting(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses]
-    lin = linearise(scene.problem(sightings), scene.state, np.zeros(3))
+    observations = [
+        scene.observation(p.q, p.q_2, p.X_CR.translation(), p.X_CR.rotation().matrix()[:, 2]) for p in poses
+    ]
+    lin = linearise(scene.problem(observations), scene.state, np.zeros(3))
     Jd = np.concatenate([lin.Jd, np.broadcast_to(np.eye(3), (len(poses), 3, 3))], axis=2)
     Jd = Jd / np.broadcast_to(sigma_m, (3,))[:, None]
     Jw = np.concatenate([lin.Jw, np.zeros((len(poses), 3, 3))], axis=2) / sigma_rad
@@ -99,17 +99,10 @@ def information(scene: MountingScene, poses: Sequence[MountingPose], sigma_m: Ar
 
 
 def prior(scene: MountingScene) -> Array:
-    """What is believed before the first scan (m + 3, m + 3)."""
+    """Prior information (m + 3, m + 3)."""
     unknowns = len(scene.mounting.unknowns) - len(scene.known)
     each = [1.0 / _PRIOR[0] ** 2] * 3 + [1.0 / _PRIOR[1] ** 2] * 3
     return np.diag(each * unknowns + [1.0 / _BIAS_M**2] * 3)
-
-
-def sigma_at_work(scene: MountingScene, total: Array) -> float:
-    """Predicted standard deviation (3-D, m) of a point at the scanner's best distance, in the frame that carries it."""
-    C = inverse_information(total)[:6, :6]
-    J = np.hstack([-skew(scene.X_LC.rotation().matrix() @ work_point(scene)), np.eye(3)])
-    return float(np.sqrt(max(float(np.trace(J @ C @ J.T)), 0.0)))
 
 
 def work_point(scene: MountingScene) -> Array:

@@ -1,4 +1,4 @@
-"""A mounting as it is believed to stand: who carries the scanner, who carries the circle it looks at, and what may touch."""
+"""The scene of a mounting as estimated: carriers of scanner and circle, and the bodies that may collide."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from scipy.spatial.distance import cdist
 
 from weldcal.calibration.geometry.se3 import IDENTITY
-from weldcal.calibration.hand_eye.mountings import Mounting, Sighting, get_mounting, problem_of
+from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
 from weldcal.models.arms.kinematics import ArmModel, link_frames
@@ -29,7 +29,7 @@ _ALONG = np.linspace(0.0, 1.0, 9)[:, None]
 
 @dataclass(frozen=True, eq=False)
 class MountingScene:
-    """What is believed before and while the poses are planned.
+    """The estimated scene during planning.
 
     ``link``: place in link_frames of what carries the scanner (0 base, 6 flange), ``X_LC`` the scanner there. ``X_HR``: the
     circle on what carries it: in the base, on the flange, or on the second arm's flange. ``radius_m``: its outer edge.
@@ -51,7 +51,7 @@ class MountingScene:
 
     @property
     def mounting(self) -> Mounting:
-        """Its equation and words."""
+        """The mounting of this configuration."""
         return get_mounting(self.configuration)
 
     @property
@@ -75,7 +75,7 @@ class MountingScene:
 
     @property
     def state(self) -> State:
-        """The belief as the solver's start."""
+        """The estimate as the solver's start."""
         X, target = np.asarray(self.X_LC.GetAsMatrix4()), np.asarray(self.X_HR.GetAsMatrix4())
         if self.X_BD is None:
             return X, target, IDENTITY
@@ -104,22 +104,22 @@ class MountingScene:
         on_base = self.configuration in ("eye_in_hand", "eye_on_arm_target_on_base")
         return self.X_HR if on_base else frames[FLANGE] @ self.X_HR
 
-    def sighting(
+    def observation(
         self, q: Array, q_2: Array | None, p_CR: Array, n_CR: Array, covariance: Array | None = None
-    ) -> Sighting:
+    ) -> TargetObservation:
         """A circle seen with the arms at q and q_2, as the solver takes it."""
         frames = self.frames(q)
         X_DE = None if self.arm_2 is None or q_2 is None else link_frames(self.arm_2, q_2)[FLANGE]
         X_BL = frames[self.link] if "arm" in self.configuration else None
-        return Sighting(frames[FLANGE], p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
+        return TargetObservation(frames[FLANGE], p_CR, n_CM=n_CR, covariance=covariance, X_BL=X_BL, X_DE=X_DE)
 
-    def problem(self, sightings: Sequence[Sighting]) -> Problem:
-        """The equation of some sightings."""
-        return problem_of(self.mounting, sightings, self.known)
+    def problem(self, observations: Sequence[TargetObservation]) -> Problem:
+        """The equation of some observations."""
+        return problem_of(self.mounting, observations, self.known)
 
 
 class Bodies:
-    """What may touch or hide: arms, the scanner where an arm carries it; each capsule is nine points with a radius."""
+    """Bodies that may collide or occlude: arms, the scanner where an arm carries it; each capsule is nine points with a radius."""
 
     def __init__(self, scene: MountingScene) -> None:
         self.scene = scene

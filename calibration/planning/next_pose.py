@@ -1,4 +1,4 @@
-"""Which pose to add: the one that would shrink the uncertainty at the work point most, reachable and visible."""
+"""Chooses the next hand-eye pose: the reachable, visible one that reduces the uncertainty at the work point most."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.geometry.rigid import skew
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, log_rotation, skew
 from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.problem import Problem, State, linearise
@@ -48,7 +47,7 @@ class NextPose:
     checked: str = ""
 
     def sentence(self) -> str:
-        """What to do, for a person."""
+        """Instruction for the operator."""
         a = "(" + ", ".join(f"{v + 0.0:+.2f}" for v in self.axis_C) + ")"
         before = "open" if not np.isfinite(self.sigma_before) else f"{1e3 * self.sigma_before:.2f} mm"
         where = ""
@@ -76,7 +75,7 @@ def next_pose(
     arm: Chain | None = None,
     view: View | None = None,
 ) -> NextPose | None:
-    """The most telling of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
+    """Choose the most informative of poses like the samples, the target turned by 20, 40 or 60 degrees and seen there or elsewhere.
 
     Visible: inside ``view``, by default where the target has been seen so far. Reachable: ``arm`` has joint angles for it
     within its limits; where none is named, or where it does not even reach the poses so far (another base or tool frame), the

@@ -1,4 +1,4 @@
-"""What a set of poses can and cannot tell: diversity the solution needs, and errors that would stay hidden in it."""
+"""Checks the diversity of a set of poses and names the errors that they cannot show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
-from weldcal.calibration.geometry.rigid import rotation_vector, skew
+from weldcal.calibration.geometry.se3 import rotation_vector, skew
 
 Array = NDArray[np.float64]
 
@@ -92,9 +92,9 @@ def turn_deg(poses: list[RigidTransform]) -> float:
 
 
 def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float, normals: bool) -> tuple[str, ...]:
-    """Sentences naming the errors that these poses cannot show; empty when there are none worth naming."""
+    """Sentences that name the errors these poses cannot show; empty where there are none."""
     if len(poses) < 2:
-        return ("Everything but the flange itself: one pose gives no second look.",)
+        return ("All errors except those of the flange itself: one pose has nothing to compare with.",)
     # a calibration that fits to a few micrometres still cannot see a bias with a lever of a few degrees
     sigma = hidden_bias_sigma(poses, max(sigma_position_m, 5e-5))
     axes = [name for name, s in zip("xyz", sigma, strict=True) if not s < HIDDEN_BIAS_M]
@@ -108,7 +108,7 @@ def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float,
     elif axes:
         out.append(
             f"A constant bias of the flange centre in the flange frame along {', '.join(axes)} (equally a TCP offset): "
-            f"the flange turned by only {turn_deg(poses):.1f} degrees between poses, so it would pass as a shift of "
+            f"the flange turned by only {turn_deg(poses):.1f} degrees between poses, so it looks like a shift of "
             "the camera."
         )
     out.append("A rotation of the flange about its own axis: a circle does not show it.")

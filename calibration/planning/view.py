@@ -1,4 +1,4 @@
-"""What a camera can see of a target: field of view, distances, and how steeply it may look at it."""
+"""Field of view, working distance and largest viewing angle of a camera."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _STEEPEST_RAD = float(np.radians(60.0))
 
 @dataclass(frozen=True)
 class View:
-    """``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data; ``tilt_rad``:
-    largest angle between the target's normal and the line of sight; ``source``: words for a person."""
+    """Visible volume. ``tan_x``, ``tan_y``: half field of view; ``near``, ``far``: along the optical axis, in the unit of the data; ``tilt_rad``:
+    largest angle between the target's normal and the line of sight; ``source``: its description for messages."""
 
     tan_x: float
     tan_y: float
@@ -45,7 +45,7 @@ def tilt(G: Array) -> Array:
 
 
 def view_of(seen: Array, K: Array | None = None, scanner: ScannerPreset | None = None) -> View:
-    """The view of a scanner by name, else of a camera matrix ``K`` (picture centred on its principal point), else of what was
+    """View of a scanner preset, else of a camera matrix ``K`` (picture centred on its principal point), else of what was
     ``seen`` (n, 4, 4) so far, a little wider. Distances of a camera matrix are those seen, too."""
     steep = max(_STEEPEST_RAD, float(np.quantile(tilt(seen), 0.9)))
     if scanner is not None:

@@ -1,1 +1,1 @@
-"""Laser profilers: a scanner of one plane, calibrated on the flange by straight edges, by spheres and by touches."""
+"""Calibrates laser profilers on the flange by straight edges, spheres and touches."""

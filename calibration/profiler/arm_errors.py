@@ -1,4 +1,4 @@
-"""A robot that is a little other than its drawing: joint offsets, sag, lengths and twists, as a calibration may estimate them."""
+"""Kinematic errors of an arm: joint offsets, sag, lengths and twists, and their effect on the flange pose."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class DhArm:
         return DhArm(rows)
 
     def with_errors(self, q: Floats, errors: ArmErrors, loads: Floats) -> FlangePoses:
-        """Flange poses of the arm as it is."""
+        """Flange poses of the arm with its errors."""
         return self.changed(errors.table).poses(q, errors.offsets, errors.sag, loads)
 
     def twists(self, q: Floats, errors: ArmErrors, loads: Floats) -> tuple[Floats, Floats]:

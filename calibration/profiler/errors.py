@@ -1,4 +1,4 @@
-"""Named refusals of the profiler's calibration: each says in one sentence what to change."""
+"""Exceptions of the profiler calibration; each message names what to change."""
 
 from __future__ import annotations
 

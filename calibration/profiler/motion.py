@@ -1,4 +1,4 @@
-"""The robot's side of a profiler's calibration: flange poses as arrays, checked once, and what their motion lacks."""
+"""Flange poses of a profiler calibration as arrays, with checks of their motion."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.errors import InputError
 
 Floats = NDArray[np.float64]
@@ -93,15 +94,6 @@ def rotation_axes_spread(rotation: Floats) -> float:
 
 def _axis_times_sine(R: Floats) -> Floats:
     return 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-
-
-def skew(v: Floats) -> Floats:
-    """Cross product matrices (..., 3, 3) of vectors (..., 3)."""
-    out = np.zeros((*v.shape[:-1], 3, 3))
-    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
-    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
-    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
-    return out
 
 
 def turned(R: Floats, w: Floats) -> Floats:

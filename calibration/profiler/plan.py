@@ -1,4 +1,4 @@
-"""Which poses to add next: those that make the calibrated profiler surest where it measures, one after the other.
+"""Plans profiler poses that reduce the uncertainty in the measuring field most, one after the other.
 
 The measure is the mapped covariance: how uncertain a profile point's place in the flange is, averaged over the field of
 view, by what the poses so far and the ones chosen tell together (docs/profiler.md).
@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.model import EdgeState, measurement_covariance, predicted, whitened
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
 
@@ -57,7 +58,7 @@ def plan_edge_poses(
     sigma_xz_m: ArrayLike,
     field: Field | None = None,
 ) -> PosePlan:
-    """The candidates to add to an edge's scans; those from which the edge is not seen in the field are left out.
+    """Choose candidates to add to an edge's scans; those from which the edge is not seen in the field are excluded.
 
     Raises:
         InputError: no candidate sees the edge, or fewer than asked for.
@@ -93,7 +94,7 @@ def plan_sphere_poses(
     sigmas: SphereSigmas | None = None,
     field: Field | None = None,
 ) -> PosePlan:
-    """The candidates to add to a sphere's scans, with the sensor's scale and shear unknown as their prior says.
+    """Choose candidates to add to a sphere's scans, with the sensor's scale and shear unknown as their prior says.
 
     Args:
         rotation, translation: R_FS and p_FS (3,) m as far as they are known; center: (3,) m in B.

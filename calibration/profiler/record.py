@@ -1,4 +1,4 @@
-"""A profiler's calibration as a file, profiler.yaml: pose, covariance, sensor and arm corrections, from which data; and back."""
+"""Reads and writes profiler.yaml: pose, covariance, sensor and arm corrections, and the hashes of the data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JSON_FILE = "X_FS.json"
 
 @dataclass(frozen=True, eq=False)
 class ProfilerRecord:
-    """All that is needed to bring a profile point into the base frame, and how well it is known.
+    """Calibration that maps a profile point into the base frame, with its uncertainty.
 
     Attributes:
         rotation (3, 3), translation (3,) m: X_FS; covariance (6, 6) [rotation in F; translation] or None (paper's methods).

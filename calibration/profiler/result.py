@@ -1,4 +1,4 @@
-"""What every calibration of a profiler returns: X_FS with its covariance, its residuals, and what it cannot know."""
+"""The result of a profiler calibration: X_FS, its covariance and residuals, and its least certain direction."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.profiler.errors import DegenerateMotion
-from weldcal.calibration.profiler.motion import Floats, skew
+from weldcal.calibration.profiler.motion import Floats
 
 VAGUE_M = 0.02  # one sigma of a direction from which on there is no calibration
 LEVER_M = 0.1  # a turn is weighed against a shift at this distance from the flange
@@ -42,14 +42,9 @@ class ProfilerEstimate:
         """The same as a transform."""
         return RigidTransform(RotationMatrix(self.rotation), self.translation)
 
-    def mapped_covariance(self, x_m: float, z_m: float) -> Floats:
-        """Covariance (3, 3) m^2 in F of where a profile point (x, z) lies, by the calibration's own uncertainty alone."""
-        J = np.hstack([-skew(self.rotation @ np.array([x_m, 0.0, z_m])), np.eye(3)])
-        return np.asarray(J @ self.covariance @ J.T)
-
 
 def worst_direction(normal_matrix: Floats) -> str:
-    """In words, what a motion leaves open: the part of [rotation; translation] (6, 6, in F) with the least information."""
+    """Description of the direction that a motion determines least: the part of [rotation; translation] (6, 6, in F) with the least information."""
     unit = np.diag([1.0 / LEVER_M] * 3 + [1.0] * 3)
     values, vectors = np.linalg.eigh(unit @ normal_matrix @ unit)
     v = vectors[:, int(np.argmin(values))]
@@ -60,7 +55,7 @@ def worst_direction(normal_matrix: Floats) -> str:
 
 
 def believed_covariance(estimate: ProfilerEstimate) -> Floats:
-    """The covariance (6, 6) that an estimate's residuals speak for, where they are larger than the sigmas stated.
+    """Covariance (6, 6) of an estimate, scaled by the reduced chi-square where the residuals exceed the stated sigmas.
 
     Raises:
         DegenerateMotion: a direction is so open that this is no calibration, though the motion is not quite degenerate.

@@ -1,1 +1,1 @@
-"""The flange paper's methods by name: circle, segmentation, Algorithm 1 and its ICP figure."""
+"""The methods of the flange paper: segmentation, circle search, Algorithm 1 and its ICP figure."""

@@ -1,4 +1,4 @@
-"""Algorithm 1 as published: a pool of four pairs, improved one scan at a time by its own verification figure."""
+"""Algorithm 1 of the flange paper: a pool of four pairs, improved scan by scan by its verification figure."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ POOL_SIZE = 4
 
 
 def translation_cost(error: Array) -> float:
-    """Norm of the translation of the error (6,), m: the paper's plain choice."""
+    """Norm of the translation of the error (6,), m: the paper's default."""
     return float(np.linalg.norm(error[3:]))
 
 
@@ -78,7 +78,7 @@ def named_cost(name: str, work_radius_m: float = 0.2, axes: Sequence[str] = COST
 
 @dataclass(frozen=True)
 class Algorithm1State:
-    """What Algorithm 1 knows after k new scans; nothing in it is ever changed, a step makes the next one.
+    """State of Algorithm 1 after k new scans; immutable, each step returns the next one.
 
     ``pool``: up to four pairs; ``X_BC`` and ``error`` are H_optimal and e_optimal, ``cost`` its cost (m), infinite
     until a registration succeeds; ``history`` has one (scans used, cost) entry per scan from the fourth on.

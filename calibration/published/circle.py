@@ -1,4 +1,4 @@
-"""The paper's circle: the best of 10 000 random triples of face points, by the number of points at its radius."""
+"""The paper's circle search: of 10 000 random triples of face points the one with the most points at its radius."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def search_circle(points_C: Array, parameters: CircleParameters | None = None, *
     Source: paper, section 2.1.4, second step, numbers of section 3.2.2. As published: no plane is fitted, "on the circle" is
     a distance from the centre within e_d of the radius (a shell), the winner is not refined, and inner points of the face
     draw as often as points of its edge. The authors' search has no seed: the centre it gives for the same cloud repeats
-    to a few tenths of a millimetre only, which ``seed`` hides but does not mend. Raises FlangeNotFound when no triple
+    to a few tenths of a millimetre only, which ``seed`` hides but does not correct. Raises FlangeNotFound when no triple
     passes the check of the radius.
     """
     p = parameters or CircleParameters()

@@ -1,4 +1,4 @@
-"""Algorithm 1's own figure: an ICP of one flange against its model (Eq. 13), and how much of a real error it sees."""
+"""Algorithm 1's verification figure: ICP of a flange against its model (Eq. 13), and the share of an error it shows."""
 
 from __future__ import annotations
 
@@ -8,12 +8,18 @@ from typing import Literal, Protocol
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.flange.unobservable import COMPONENTS, blind_components, information, sigmas, surface_normals
-from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
+from weldcal.calibration.flange.surface_information import (
+    COMPONENTS,
+    information,
+    sigmas,
+    surface_normals,
+    unobservable_components,
+)
+from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 
@@ -21,26 +27,26 @@ Array = NDArray[np.float64]
 Method = Literal["point_to_point", "point_to_plane"]
 
 _MIN_FITNESS = 0.3
-_BLIND = 0.5  # a component of which less than half shows is called unseen
+_UNSEEN_SHARE = 0.5  # a component of which less than half shows is called unseen
 
 
 @dataclass(frozen=True)
 class VerificationError:
-    """Where a calibration puts the verification flange, relative to where the robot says it is.
+    """Pose error of the verification flange under a calibration, relative to the robot's pose of it.
 
     ``value`` (6,): rotation vector (rad) and displacement of the flange centre (m), both in the axes of the feature
     frame R; all infinite where the registration failed. ``X_CpC`` is Eq. (21)'s e, camera in the calculated camera, or
-    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance. ``blind`` names the
+    None. ``fitness`` (0..1) is the share of points that found a partner, ``rmse_m`` their distance. ``unobservable`` names the
     components (of COMPONENTS) for which nothing was seen that could show them: they count as zero in ``value`` and in
     ``X_CpC``, and `components` gives no number for them. ``sigma`` (6,) rad and m is what noise alone does to each,
-    infinite where blind.
+    infinite where unobservable.
     """
 
     value: Array
     X_CpC: RigidTransform | None
     fitness: float
     rmse_m: float
-    blind: tuple[str, ...] = ()
+    unobservable: tuple[str, ...] = ()
     sigma: Array | None = None
 
     @property
@@ -52,7 +58,7 @@ class VerificationError:
     def components(self) -> tuple[tuple[str, float, bool], ...]:
         """(name, value in rad or m, whether it could be seen) of each degree of freedom, at the flange centre; NaN where it
         could not."""
-        seen = [n not in self.blind for n in COMPONENTS]
+        seen = [n not in self.unobservable for n in COMPONENTS]
         return tuple(
             (n, float(v) if s else float("nan"), s) for n, v, s in zip(COMPONENTS, self.value, seen, strict=True)
         )
@@ -73,7 +79,7 @@ class Verifier(Protocol):
 class Verification:
     """A verification scan: face points (N, 3) m in C, the feature's pose X_BR, and the model in R (points, normals).
 
-    ``standard`` is what the model was made from; without it the blind components are judged by the model's normals.
+    ``standard`` is what the model was made from; without it the unobservable components are judged by the model's normals.
     """
 
     points_C: Array
@@ -150,7 +156,7 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     Iterations and stop rule are Open3D's defaults (30, relative change 1e-6), as in the paper's code. A registration
     that matches less than 30 % of the points has failed: the error is then infinite, never the identity. The six
     numbers are taken at the flange centre, not at the camera origin, where rotation and translation mix over the
-    working distance. A component along which the matched surface does not change is named blind, from the information
+    working distance. A component along which the matched surface does not change is named unobservable, from the information
     that the points carry along its normals: the turn about the flange's axis always (the model is one of revolution but for
     its holes), the plane of a face whose chamfers were not scanned. Point-to-point registration sees less than that:
     `sight` measures how much.
@@ -177,13 +183,13 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     matrix = information(matched, normals)
     off = ((matched - verification.model_R[pairs[:, 1]]) * verification.model_normals_R[pairs[:, 1]]).sum(axis=1)
     noise = 1.4826 * float(np.median(np.abs(off)))
-    blind = blind_components(matrix)
+    unobservable = unobservable_components(matrix)
     seen = E_R.inverse()
     value = np.concatenate([rotation_vector(seen.rotation()), seen.translation()])
-    value[[name in blind for name in COMPONENTS]] = 0.0
-    correction = X_RC.inverse() @ RigidTransform(exp_rotation(value[:3]), value[3:]).inverse() @ X_RC
+    value[[name in unobservable for name in COMPONENTS]] = 0.0
+    correction = X_RC.inverse() @ RigidTransform(RotationMatrix(exp_rotation(value[:3])), value[3:]).inverse() @ X_RC
     fitness, rmse = float(result.fitness), float(result.inlier_rmse)
-    return VerificationError(value, correction, fitness, rmse, blind, sigmas(matrix, noise))
+    return VerificationError(value, correction, fitness, rmse, unobservable, sigmas(matrix, noise))
 
 
 @dataclass(frozen=True)
@@ -195,13 +201,13 @@ class Sight:
     @property
     def unseen(self) -> tuple[str, ...]:
         """Names of the components of which less than half shows."""
-        return tuple(name for name, s in zip(COMPONENTS, self.share, strict=True) if s < _BLIND)
+        return tuple(name for name, s in zip(COMPONENTS, self.share, strict=True) if s < _UNSEEN_SHARE)
 
 
 def sight(
     X_BC: RigidTransform, verification: Verification, *, shift_m: float = 3e-4, turn_rad: float = float(np.radians(0.3))
 ) -> Sight:
-    """Displace a good calibration by known small errors at the flange and see what the registration reports of them.
+    """Measure the share of known small errors at the flange that the registration reports.
 
     0.3 mm and 0.3 degrees are sizes worth seeing; both signs are tried and averaged.
     """
@@ -212,7 +218,7 @@ def sight(
         for sign in (1.0, -1.0):
             d = np.zeros(6)
             d[k] = sign * size
-            D_R = RigidTransform(exp_rotation(d[:3]), d[3:])
+            D_R = RigidTransform(RotationMatrix(exp_rotation(d[:3])), d[3:])
             moved = verification.X_BR @ D_R @ verification.X_BR.inverse() @ X_BC
             reported.append(icp_error(moved, verification).value[k])
         share[k] = (reported[0] - reported[1]) / (2.0 * size)

@@ -1,4 +1,4 @@
-"""The paper's calibration by name: scene, circle, Eq. (9)-(12), Algorithm 1 by the ICP of Eq. (13), Eq. (21)."""
+"""The paper's calibration pipeline: segmentation, circle, Eq. (9)-(12), Algorithm 1 with the ICP of Eq. (13)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import fit_rigid, rotation_vector
+from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.published.algorithm1 import (
     Algorithm1State,
     Cost,
@@ -24,7 +25,6 @@ from weldcal.calibration.published.algorithm1 import (
 from weldcal.calibration.published.circle import CircleParameters, PublishedCircle, search_circle
 from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
 from weldcal.calibration.published.segmentation import SegmentationParameters, segment_flange
-from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ Method = Literal["point_to_point", "point_to_plane"]
 
 @dataclass(frozen=True)
 class PublishedParameters:
-    """Everything the pipeline is told: segmentation, circle, and the registration.
+    """Parameters of the pipeline: segmentation, circle, and registration.
 
     Partners at most 1 mm apart, Open3D's iterations and its stop rule 1e-6 on numbers of ``unit_m`` (the authors' clouds
     are in mm, the AUBO's in m, which stops a thousand times earlier) and the program's point-to-plane or the
@@ -65,23 +65,6 @@ class PublishedVerification:
     def __call__(self, X_BC: RigidTransform) -> VerificationError:
         """See published_icp."""
         return published_icp(X_BC, self)
-
-
-@dataclass(frozen=True, eq=False)
-class PublishedCalibration:
-    """What the pipeline gives: H of all pairs and its e_icp (Table 1), the end of Algorithm 1 (Fig. 11), H compensated
-    (Eq. (21)), the circle of each scan, and scans refused by name."""
-
-    X_BC_all: RigidTransform
-    error_all: VerificationError
-    algorithm1: Algorithm1State
-    circles: dict[str, PublishedCircle]
-    refused: tuple[tuple[str, str], ...]
-
-    @property
-    def X_BC_compensated(self) -> RigidTransform | None:
-        """Eq. (21)."""
-        return self.algorithm1.X_BC_compensated
 
 
 def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0) -> tuple[Array, Array]:
@@ -159,40 +142,8 @@ def published_pairs(circles: Mapping[str, PublishedCircle], poses: Mapping[str, 
     return [Observation(id, poses[id], circle.center_C) for id, circle in circles.items()]
 
 
-def published_calibration(
-    clouds_C: Mapping[str, Array],
-    poses: Mapping[str, RigidTransform],
-    standard: FlangeStandard,
-    verification_id: str,
-    *,
-    parameters: PublishedParameters | None = None,
-    cost: Cost = translation_cost,
-    segmented: bool = False,
-    seed: int = 0,
-) -> PublishedCalibration:
-    """The whole of sections 2.1.3 and 2.1.4 on scans (N, 3) m in C with poses X_BF, by id, in a seeded order.
-
-    ``verification_id`` names the scan of the ICP figure; it is no pair. Raises InputError when it shows no flange or when
-    fewer than four others do.
-    """
-    p = parameters or PublishedParameters()
-    circles, faces, refused = find_centres(clouds_C, p, segmented=segmented, seed=seed)
-    if verification_id not in faces:
-        raise InputError(f"The verification scan '{verification_id}' shows no flange to the published method.")
-    pairs = [o for o in published_pairs(circles, poses) if o.id != verification_id]
-    if len(pairs) < 4:
-        raise InputError(f"The published method found {len(pairs)} flanges; it needs at least four.")
-    verifier = PublishedVerification(
-        faces[verification_id], poses[verification_id], *published_model(standard), p.method, p.max_distance_m, p.unit_m
-    )
-    X_all = all_pairs(pairs)
-    order = np.random.default_rng(seed).permutation(len(pairs))
-    state = run_published([pairs[i] for i in order], verifier, p, cost)
-    return PublishedCalibration(X_all, verifier(X_all), state, circles, refused)
-
-
 def all_pairs(pairs: Sequence[Observation]) -> RigidTransform:
-    """Eq. (10)-(12) on every pair, without weights and without a look for outliers: Table 1's calibration."""
+    """Eq. (10)-(12) on every pair, without weights or outlier rejection: Table 1's calibration."""
     return fit_rigid(np.array([o.p_BR for o in pairs]), np.array([o.p_CR for o in pairs]))
 
 
@@ -204,20 +155,6 @@ def run_published(
     for o in pairs:
         state = algorithm1_step(state, o, verifier, cost, as_printed=True)
     return state
-
-
-def equation_10_as_printed(p_B: Array, p_C: Array) -> tuple[Array, Array]:
-    """R (3, 3) and t (3,) m of Eq. (10)-(12) read literally, c included, from pairs (n, 3) m; for comparison only.
-
-    Printed: c = (1/n) sum |p_C - mu_C|^2, the variance of the camera points, in square metres, and t = mu_B - c R mu_C. With
-    points within 0.2 m of each other c is about 0.02, and t forgets nearly all of R mu_C. Umeyama's (1991) scale is
-    tr(D S) divided by that variance; the authors' program takes c = 1, and so does rigid.fit_rigid.
-    """
-    mean_B, mean_C = p_B.mean(axis=0), p_C.mean(axis=0)
-    c = float(((p_C - mean_C) ** 2).sum(axis=1).mean())
-    X = fit_rigid(p_B, p_C)
-    R = X.rotation().matrix()
-    return R, np.asarray(mean_B - c * R @ mean_C)
 
 
 def at_flange(error: VerificationError, X_BC: RigidTransform, X_BF: RigidTransform) -> Array:

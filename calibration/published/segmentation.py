@@ -1,4 +1,4 @@
-"""The paper's way from a scene to the flange face: pass-through, statistical outlier removal, clusters, one plane."""
+"""The paper's segmentation of a flange face: pass-through, statistical outlier removal, clustering, dominant plane."""
 
 from __future__ import annotations
 

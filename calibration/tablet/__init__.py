@@ -1,1 +1,1 @@
-"""A tablet as the calibration target: a camera sees its dots, the robot's pen touches them."""
+"""Calibrates a camera and a pen on the robot with a tablet as the target."""

@@ -1,4 +1,4 @@
-"""The tablet's landmarks in a camera image: rings, or dots of a single pixel, in the page's own order."""
+"""Detects the tablet's landmarks in a camera image, rings or single-pixel dots, in the order of the page."""
 
 from __future__ import annotations
 
@@ -161,7 +161,7 @@ def _as_grid(points: Array, columns: int, rows: int) -> Array | None:
     """The points (n, 2) that make a grid, row by row from some corner; None where no choice of them does.
 
     Every four points that could be the corners give a homography, and it must lead to a point of its own for every
-    landmark: so that something else of the same look is left out.
+    landmark: so that something else of the same look is excluded.
     """
     square = np.array([[i, j] for j in range(rows) for i in range(columns)], dtype=np.float32)
     corners = np.array([[0, 0], [columns - 1, 0], [columns - 1, rows - 1], [0, rows - 1]], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""A camera's numbers from YAML: fx, fy, cx, cy by name, or the camera matrix as ROS and OpenCV write it."""
+"""Reads camera intrinsics from YAML: fx, fy, cx, cy, or the camera matrix as ROS and OpenCV write it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def load_intrinsics(path: Path) -> Intrinsics:
         counts = ", ".join(map(str, _COUNTS))
         raise TabletDataError(f"'{path.name}': distortion holds {distortion.size} numbers; OpenCV knows {counts}.")
     if not np.isfinite([*numbers, *distortion]).all() or min(numbers[:2]) <= 0.0:
-        raise TabletDataError(f"'{path.name}' holds a focal length that is not positive, or a value that is no number.")
+        raise TabletDataError(
+            f"'{path.name}' holds a focal length that is not positive, or a value that is not a number."
+        )
     return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
 
 

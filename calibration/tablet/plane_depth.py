@@ -1,4 +1,4 @@
-"""Depth of the landmarks by the tablet's plane: one plane through thousands of noisy pixels instead of nine single ones."""
+"""Depth of the landmarks from a plane fitted to the tablet's pixels of a depth image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the tablet lies before the camera (PnP with intrinsics), and which point of it a pixel shows."""
+"""Pose of the tablet in the camera (PnP with intrinsics), and the tablet point that a pixel shows."""
 
 from __future__ import annotations
 

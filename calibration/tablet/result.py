@@ -1,4 +1,4 @@
-"""A tablet calibration as files: tablet.yaml, tablet.json, and where the camera sits on the flange for other tools."""
+"""Reads and writes a tablet calibration: tablet.yaml, tablet.json, and exports of the camera's pose on the flange."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ PARENT, CHILD = "flange", "camera_optical_frame"
 
 @dataclass(frozen=True)
 class TabletResult:
-    """All that tablet.yaml holds.
+    """Contents of tablet.yaml.
 
     ``model``: closed_form, pnp, pnp_free_scale (planar, an upright pen) or wrist (full poses); ``parameters`` by name, m and
-    rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be left out. Only for wrist:
+    rad, and their ``covariance`` in that order. ``leave_one_out_mm`` is empty where nothing could be held out. Only for wrist:
     ``X_FC`` and its covariance (6, 6) ([rotation; translation] on the flange side about the camera's origin), ``p_FP_m`` and
     its covariance (3, 3).
     """
@@ -111,5 +111,5 @@ def load_tablet_result(path: Path) -> TabletResult:
         )  # fmt: skip
     except Exception as error:
         raise InputError(
-            f"'{path.name}' is no tablet calibration of schema 1; run 'weldcal tablet calibrate'."
+            f"'{path.name}' is not a tablet calibration of schema 1; run 'weldcal tablet calibrate'."
         ) from error

@@ -1,4 +1,4 @@
-"""The tablet's CSV tables: the columns that must be there, and their cells as numbers."""
+"""Reads the tablet's CSV tables: required columns and numeric cells."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def number(row: Row, column: str, path: Path) -> float:
     except ValueError:
         value = float("nan")
     if not math.isfinite(value):
-        raise TabletDataError(f"'{path.name}': '{row[column]}' in the column {column} is no number.")
+        raise TabletDataError(f"'{path.name}': '{row[column]}' in the column {column} is not a number.")
     return value
 
 

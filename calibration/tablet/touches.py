@@ -1,4 +1,4 @@
-"""What one visit to the tablet leaves: where the camera saw each dot, where the hand stood to touch it, and what the tablet felt."""
+"""The measurements of one tablet visit: pixels of the landmarks, hand positions, and touching errors."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class TabletTouches:
             if value.shape != shape:
                 raise TabletDataError(f"'{name}' must have the shape {shape}, and it has {value.shape}.")
             if not np.isfinite(value).all():
-                raise TabletDataError(f"'{name}' holds a value that is no finite number; remove that landmark.")
+                raise TabletDataError(f"'{name}' holds a value that is not finite; remove that landmark.")
             object.__setattr__(self, name, value)
         if not (np.isfinite(self.pitch_m) and self.pitch_m > 0.0):
             raise TabletDataError("The tablet's pixel pitch must be positive; check its pixels per inch.")

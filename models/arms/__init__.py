@@ -1,1 +1,1 @@
-"""Robot arms as numbers: kinematics, limits and masses."""
+"""Robot arms: kinematics, limits and masses."""

@@ -1,4 +1,4 @@
-"""Any serial arm of turning joints as numbers: forward kinematics, Jacobian, and joint angles found step by step."""
+"""A serial arm of revolute joints: forward kinematics, Jacobian, and iterative inverse kinematics."""
 
 from __future__ import annotations
 

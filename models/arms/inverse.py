@@ -1,4 +1,4 @@
-"""Joint angles from a flange pose: all closed-form branches of a UR arm, made exact on the robot's own kinematics."""
+"""Inverse kinematics of UR arms: all closed-form branches, refined on the robot's calibrated kinematics."""
 
 from __future__ import annotations
 

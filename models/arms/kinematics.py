@@ -1,4 +1,4 @@
-"""An arm as numbers: Universal Robots' link transforms, limits and masses, and what follows from them at 500 Hz.
+"""Universal Robots' link transforms, limits and masses, with forward kinematics and Jacobians.
 
 Frames: B robot base as the controller means it (ROS `base_link` turned by pi about z), L_i the six link frames, F the
 flange (DH frame 6, z out of the flange), which is the last link frame. A link transform is the pose of link i's joint

@@ -1,4 +1,4 @@
-"""An arm for Drake: URDF text with masses, limits, actuators and a plain body, and capsules around that body.
+"""Builds an arm's URDF for Drake, with masses, limits, actuators and a simple body, and the capsules around it.
 
 Shapes are drawn in the link frames from the nominal lengths and stop 6 mm short of the flange plane: the flange disc
 itself is a mesh of its own, because calibration measures it. They are visual only; the capsules serve planning.

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
-from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection, correction_from_document
+from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
@@ -133,7 +133,7 @@ def verify_dataset(
     if not seen.observations:
         first, reason = seen.refused[0]
         raise InputError(f"None of the {len(seen.refused)} scans can be judged; for the first, {first}: {reason}")
-    observations = tuple(o if correction is None else correction.observation(o) for o in seen.observations)
+    observations = tuple(o if correction is None else corrected_observation(correction, o) for o in seen.observations)
     poses = _judge(calibration, data, observations)
     uncorrected = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
     warnings = (

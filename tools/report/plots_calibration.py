@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose
 from weldcal.calibration.eye_on_base.solve import point_error_covariance
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.tools.report.flange_features import HEADER, feature_table
 from weldcal.tools.report.pictures import OURS, error_bars, error_field, svg
 from weldcal.tools.report.plots_advice import knowledge_map

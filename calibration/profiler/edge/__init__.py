@@ -1,1 +1,1 @@
-"""A laser profiler calibrated by a straight edge."""
+"""Calibrates a laser profiler by a straight edge."""

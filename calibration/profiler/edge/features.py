@@ -1,4 +1,4 @@
-"""The point of a raw profile at which a straight edge lies: end of a bar or of a step, or the apex of a blade."""
+"""Extracts the point of a straight edge from a raw profile: end of a bar or step, or apex of a blade."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""X_FS from one straight edge seen in any poses: one least-squares problem, no grid, no initial guess.
+"""Estimates X_FS from one straight edge seen in any poses, in one least-squares problem without an initial guess.
 
 Every measured profile point is compared with where the edge crosses the scan plane, in units of its own sigma (sensor and
 robot), with a Cauchy loss that keeps 95 % of what least squares would get; the covariance is the Cramer-Rao bound over that

@@ -1,4 +1,4 @@
-"""The straight-edge paper's own method: X_FS in two linear steps from a grid of rotations and translations.
+"""The straight-edge paper's method: X_FS in two linear steps from a grid of rotations and translations.
 
 As published it answers some degenerate motions with confident nonsense (collinear translations: 93 degrees off), because the
 rank of its matrix does not show them in noise; here these motions are named and refused. Kept beside edge_joint to compare.
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.errors import DegenerateMotion, InconsistentData, TooFewRotations, TooFewTranslations
 from weldcal.calibration.profiler.motion import (
     FlangePoses,
@@ -18,7 +19,6 @@ from weldcal.calibration.profiler.motion import (
     checked_points,
     rotation_axes_spread,
     rotation_groups,
-    skew,
 )
 from weldcal.models.errors import InputError
 

@@ -1,4 +1,4 @@
-"""Where a straight edge meets the scan plane: the predicted profile point, its derivatives and its covariance.
+"""Predicts where a straight edge meets the scan plane, with derivatives and covariance.
 
 Frames: B robot base, F flange, S scan plane (a profile point [x, z] is p_S = (x, 0, z)). Derivation in docs/profiler.md.
 """

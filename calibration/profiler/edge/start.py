@@ -1,4 +1,4 @@
-"""Where the edge problem may start: point-to-line least squares from the 24 orientations of a cube, all at once.
+"""Initial estimates of the edge problem: point-to-line least squares from the 24 orientations of a cube.
 
 The distance of a point to a line has no division by the angle between edge and scan plane, so that this converges from any
 orientation, where the reprojection of edge_joint would not.
@@ -10,8 +10,9 @@ import itertools
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.model import EdgeState
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew, turned
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, turned
 
 ITERATIONS = 60
 SETTLED = 1e-6  # of the cost, in one step: the reprojection goes on from there

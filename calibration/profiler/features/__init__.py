@@ -1,1 +1,1 @@
-"""Features that a calibrated profiler measures: V-grooves and frustums."""
+"""Features measured by a calibrated profiler: V-grooves and frustums."""

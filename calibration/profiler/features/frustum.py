@@ -1,4 +1,4 @@
-"""A square boss (frustum) from its point cloud: six planes, the slanted edges where they meet, and the angles between them."""
+"""Fits a square frustum to a point cloud: six planes, the slanted edges between them, and their angles."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ class Frustum:
 
 
 def fit_frustum(points: ArrayLike) -> Frustum:
-    """The boss in a cloud (n, 3) m that shows its base plate, its top and its four sides, whatever its orientation.
+    """Fit the frustum in a cloud (n, 3) m that shows its base plate, its top and its four sides, whatever its orientation.
 
     Raises:
-        FeatureNotFound: fewer planes, or not like a boss. InputError: not a cloud.
+        FeatureNotFound: fewer planes, or not like a frustum. InputError: not a cloud.
 
     Source: sphere and touch paper, section 3.3 and Table 3.
     """
@@ -54,7 +54,9 @@ def fit_frustum(points: ArrayLike) -> Frustum:
     if p.ndim != 2 or p.shape[1] != 3:
         raise InputError(f"A cloud is an array (n, 3), not {p.shape}.")
     if not np.isfinite(p).all() or len(p) < 6 * MINIMUM_POINTS:
-        raise InputError(f"The boss needs {6 * MINIMUM_POINTS} finite points or more: leave out what did not return.")
+        raise InputError(
+            f"The frustum needs {6 * MINIMUM_POINTS} finite points or more: remove samples that did not return."
+        )
     n_p = _normals(p)
     up = _main_direction(n_p)
     labels = _split(p, n_p, up)
@@ -85,7 +87,7 @@ def _main_direction(normals: Floats) -> Floats:
         near = normals[np.abs(normals @ up) > SIDE_COSINE]
         if len(near) < 2 * MINIMUM_POINTS:
             raise FeatureNotFound(
-                "The cloud shows no base and top: scan the whole boss and some of the plate around it."
+                "The cloud shows no base and top: scan the whole frustum and some of the plate around it."
             )
         _, vectors = np.linalg.eigh(near.T @ near)
         up = vectors[:, 2]
@@ -111,7 +113,7 @@ def _split(p: Floats, normals: Floats, up: Floats) -> NDArray[np.intp]:
     ]
     base, top = (0, 1) if spread[0] > spread[1] else (1, 0)
     if abs(two[1] - two[0]) < 2e-3:
-        raise FeatureNotFound("Base and top of the boss lie at one height: scan the whole boss.")
+        raise FeatureNotFound("Base and top of the frustum lie at one height: scan the whole frustum.")
     for label, which in ((0, base), (1, top)):
         labels[flat & (np.abs(height - two[which]) < 0.1 * abs(two[1] - two[0]))] = label
     away = up * np.sign(two[top] - two[base])
@@ -125,7 +127,7 @@ def _split(p: Floats, normals: Floats, up: Floats) -> NDArray[np.intp]:
     labels[np.flatnonzero(steep)[clear]] = 2 + sector[clear]
     counts = [(labels == k).sum() for k in range(6)]
     if min(counts) < MINIMUM_POINTS:
-        raise FeatureNotFound("The cloud does not show the boss's six planes: scan all four sides, top and plate.")
+        raise FeatureNotFound("The cloud does not show the frustum's six planes: scan all four sides, top and plate.")
     return labels
 
 
@@ -150,7 +152,7 @@ def _refined(p: Floats, labels: NDArray[np.intp]) -> list[Floats]:
 
 def _plane(p: Floats) -> Floats:
     if len(p) < MINIMUM_POINTS:
-        raise FeatureNotFound("A plane of the boss has too few points: scan it more densely.")
+        raise FeatureNotFound("A plane of the frustum has too few points: scan it more densely.")
     weight = np.ones(len(p))
     for _ in range(ROUNDS):
         mean = weight @ p / weight.sum()
@@ -178,7 +180,7 @@ def _measured(p: Floats, labels: NDArray[np.intp], planes: Floats) -> Frustum:
         for corners, face in ((top, 1), (base, 0)):
             A = n[[a, b, face]]
             if np.linalg.cond(A) > 1e3:
-                raise FeatureNotFound("Two sides of the boss came out parallel: scan all four sides.")
+                raise FeatureNotFound("Two sides of the frustum came out parallel: scan all four sides.")
             corners.append(np.asarray(np.linalg.solve(A, d[[a, b, face]]), float))
     corners_top, corners_base = np.array(top), np.array(base)
     slopes = np.arccos(np.clip(n[2:] @ n[1], -1.0, 1.0))

@@ -1,4 +1,4 @@
-"""The three features of a V-groove in a raw profile: both upper edges and the root, as intersections of four robust lines.
+"""Extracts the edges and the root of a V-groove from a raw profile, as intersections of four robust lines.
 
 Where the seam turns under the laser line its walls are curved in the profile: a bend that the samples show is followed, and one
 that they may hide is in the sigmas.

@@ -1,1 +1,1 @@
-"""A laser profiler calibrated by a sphere, with touches where there are any."""
+"""Calibrates a laser profiler by a sphere, with or without touches."""

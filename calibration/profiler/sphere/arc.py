@@ -1,4 +1,4 @@
-"""The arc that a sphere leaves in a profile: its samples found among others, and the circle through them."""
+"""Finds the arc of a sphere in a profile and fits its circle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""X_FS from a sphere in any poses, by its raw profile points and touches of it: one problem, no circles, no sides, no roots.
+"""Estimates X_FS from raw profiles of a sphere in any poses, and from touches, in one least-squares problem.
 
 Every profile point lies on the sphere, and so does the tip at every touch. The sensor's scale and shear in its plane and,
 where the joint angles are given, the arm's offsets and sag may be estimated with it, each held by a prior.
@@ -26,7 +26,7 @@ MINIMUM_POSES = 5
 SINGULAR = 1e-5
 WRONG_POSE = 5.0  # times the others' residual (its mean, or its rms) at which a scan is named
 ARM_ALLOWED = 1.1  # times the best leave-one-out error
-MOST_WRONG = 0.25  # of the scans may be left out as wrong
+MOST_WRONG = 0.25  # of the scans may be excluded as wrong
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
 APART_RAD, OPEN_RAD = np.radians(1.0), np.radians(5.0)
 
@@ -156,13 +156,13 @@ def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> tuple[
     """The model with the least leave-one-scan-out error (rms m of each is returned); the simpler one where they are equal.
 
     The arm's own errors show where the arm goes afterwards and hardly in scans of one sphere. Their priors keep them from
-    explaining noise: the model that has them is taken unless it foretells scans left out clearly worse.
+    explaining noise: the model that has them is taken unless it predicts held-out scans clearly worse.
     """
     names: list[Model] = ["rigid", "affine"]
     if data.arm is not None:
         names.append("affine+joints")
     each = {name: leave_one_out_m(data, name, sigmas) for name in names}
-    # a wrong scan is foretold by no model
+    # no model predicts a wrong scan
     usual = each["rigid"] < WRONG_POSE * np.median(each["rigid"])
     errors = {name: float(np.sqrt(np.mean(e[usual] ** 2))) for name, e in each.items()}
     best = min(errors.values())
@@ -186,7 +186,7 @@ def _check(data: SphereData, model: Model) -> None:
         raise InputError("The model with joints needs the arm's table and its joints at every scan and touch.")
     for k, p in enumerate(data.profiles):
         if p.ndim != 2 or p.shape[1] != 2 or np.isfinite(p).all(axis=1).sum() < 5:
-            raise InputError(f"Profile {k} has fewer than five points of the sphere: leave that scan out.")
+            raise InputError(f"Profile {k} has fewer than five points of the sphere: exclude that scan.")
 
 
 def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:

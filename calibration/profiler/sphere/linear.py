@@ -1,4 +1,4 @@
-"""The sphere paper's own method: X_FS from sphere centres in two linear steps, then its compensation by touches.
+"""The sphere paper's method: X_FS from sphere centres in two linear steps, then compensation by touches.
 
 Kept as published, beside sphere_joint, which needs neither the side of the centre nor the pure translations.
 """
@@ -191,7 +191,7 @@ def fit_touch_sphere(
         J = np.asarray(found.jac)
         sigma = float(np.sqrt(np.linalg.pinv(J.T @ J)[-1, -1] * (found.fun @ found.fun) / freedom))
         if abs(r - radius_m) > max(4.0 * sigma, 1e-6):
-            text = f"The touches make a sphere of {1e3 * r:.3f} mm, not of {1e3 * radius_m:.3f} mm: check the radius and the tip."
+            text = f"The touches fit a sphere of {1e3 * r:.3f} mm, not of {1e3 * radius_m:.3f} mm: check the radius and the tip."
             raise RadiusError(text)
     return TouchSphere(np.asarray(center), np.asarray(t), float(r), rms)
 

@@ -1,4 +1,4 @@
-"""The sphere problem itself: its measurements, its unknowns, and the whitened residuals with their derivatives.
+"""The sphere problem: measurements, unknowns, and whitened residuals with derivatives.
 
 Every profile point lies on the sphere, and so does the tip at every touch. The error of the robot's position, which all
 points of a scan share, is taken out by whitening with it rather than by unknowns of its own; docs/profiler.md derives it.

@@ -1,4 +1,4 @@
-"""Where the sphere problem may start: radial least squares from the 24 orientations of a cube, all at once, on few points."""
+"""Initial estimates of the sphere problem: radial least squares from the 24 orientations of a cube."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.start import cube_rotations
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew, turned
+from weldcal.calibration.profiler.motion import FlangePoses, Floats, turned
 
 POINTS = 7  # of each profile
 ITERATIONS = 80

@@ -1,4 +1,4 @@
-"""Reading planar touches from an npz: one visit, or many of one rig, with queries that no fit sees where there are any."""
+"""Reads planar touches from an npz file: one visit or many of one rig, with optional queries that no fit uses."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class Queries:
 
 @dataclass(frozen=True)
 class PlanarVisit:
-    """One visit: its touches, its queries where it has any, the rows of its landmarks in the file, and rows left out."""
+    """One visit: its touches, its queries where it has any, the rows of its landmarks in the file, and the rows excluded."""
 
     name: str
     touches: TabletTouches
     queries: Queries | None = None
     rows: tuple[int, ...] = ()
-    left_out: tuple[int, ...] = ()
+    excluded: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def load_planar(path: Path) -> PlanarFile:
     mm_per_px, f (px; one number or two), c (2) px, hand_capture (3) mm; optionally uv_q (q, 2), theta_q (q) rad, hand_q
     (q, 2) mm. Where uv is (m, n, 2) there are m visits, and every other key may have that dimension in front, too.
 
-    A landmark with a value that is no number is left out; a depth that is missing (or the key) is the tablet's plane by PnP.
+    A landmark with a value that is not a number is excluded; a depth that is missing (or the key) is the tablet's plane by PnP.
     Raises TabletDataError: unreadable, a key missing, a shape that does not fit; and what refuses a visit where none is left:
     TooFewLandmarks, CollinearLandmarks, EqualRotations (radians for degrees), LandmarksNotFound.
     """
@@ -103,7 +103,7 @@ def _read(path: Path) -> dict[str, Array]:
         with np.load(path, allow_pickle=False) as archive:
             d = {key: np.asarray(archive[key], dtype=float) for key in wanted if key in archive.files}
     except Exception as error:  # NumPy, zipfile and zlib have errors of their own
-        raise TabletDataError(f"'{path.name}' is no npz file of numbers.") from error
+        raise TabletDataError(f"'{path.name}' is not an npz file of numbers.") from error
     missing = [key for key in DIMENSIONS if key not in d and key != "depth"]
     d.setdefault("depth", np.full(d["uv"].shape[:-1], np.nan) if "uv" in d else np.zeros(0))
     if missing:
@@ -182,7 +182,7 @@ def _queries(d: dict[str, Array], where: str) -> Queries | None:
     if uv.ndim != 2 or uv.shape[1] != 2 or theta.shape != (len(uv),) or hand.shape != uv.shape or len(uv) == 0:
         raise TabletDataError(f"{where}: uv_q (q, 2), theta_q (q) and hand_q (q, 2) must be as many.")
     if not (np.isfinite(uv).all() and np.isfinite(theta).all() and np.isfinite(hand).all()):
-        raise TabletDataError(f"{where}: uv_q, theta_q or hand_q holds a value that is no finite number.")
+        raise TabletDataError(f"{where}: uv_q, theta_q or hand_q holds a value that is not finite.")
     if np.abs(theta).max() > 2.5 * np.pi:
         raise TabletDataError(f"{where}: theta_q must be in radians, and it goes to {np.abs(theta).max():.0f}.")
     return Queries(uv, theta, 1e-3 * hand)

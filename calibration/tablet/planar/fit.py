@@ -1,4 +1,4 @@
-"""Camera and pen by the tablet's true size: PnP, then a rigid motion in the plane and the pen's offset."""
+"""Fits camera and pen by the tablet's known size: PnP, then a planar rigid motion and the pen offset."""
 
 from __future__ import annotations
 
@@ -47,11 +47,6 @@ class PlanarFit:
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
         """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
         return hand_over(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
-
-    def touch_covariance(self, rays: Array, theta_rad: Array) -> Array:
-        """Covariance (m, 2, 2) m^2 of those positions, of plane motion and pen."""
-        J = _jacobian(self.parameters, tablet_points(self.X_CT, rays), theta_rad)
-        return np.asarray(J @ self.covariance @ np.swapaxes(J, 1, 2))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Camera and pen from one linear least squares of six unknowns: a similarity of the image plane, and the pen's offset."""
+"""Fits camera and pen by linear least squares in six unknowns: an image-plane similarity and the pen offset."""
 
 from __future__ import annotations
 
@@ -53,11 +53,6 @@ class LinearFit:
     def hand_to_touch(self, rays: Array, theta_rad: Array) -> Array:
         """Hand positions (m, 2) m from which the pen touches what is seen along rays (m, 2), at turns (m,) rad."""
         return np.asarray((_design(rays.T, theta_rad) @ self.parameters).T)
-
-    def touch_covariance(self, rays: Array, theta_rad: Array) -> Array:
-        """Covariance (m, 2, 2) m^2 of those positions, of the calibration alone."""
-        A = np.swapaxes(_design(rays.T, theta_rad), 0, 1)
-        return np.asarray(A @ self.covariance @ np.swapaxes(A, 1, 2))
 
 
 def _design(rays: Array, theta_rad: Array) -> Array:
@@ -134,7 +129,7 @@ def fit_linear(touches: TabletTouches, sign: Sign = Sign.CORRECTED) -> LinearFit
 
 
 def _left_out_together(rays: Array, hand: Array, theta_rad: Array, number: NDArray[np.int64]) -> Array:
-    """Left-out errors (n, 2) m where all touches of a landmark are left out with it; NaN where what is left fixes nothing."""
+    """Leave-one-out errors (n, 2) m, all touches of a landmark held out together; NaN where the rest determines nothing."""
     errors = np.full((rays.shape[1], 2), np.nan)
     for k in range(number.max() + 1):
         keep, one = number != k, number == k

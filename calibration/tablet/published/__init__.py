@@ -1,1 +1,1 @@
-"""The tablet paper's two-stage calibration by name."""
+"""The two-stage calibration of the tablet paper."""

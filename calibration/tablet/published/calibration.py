@@ -1,4 +1,4 @@
-"""The paper's two-stage calibration from end to end: chain, affine pair, and the hand position it asks for."""
+"""The tablet paper's two-stage calibration: chain, affine pair, and the hand position for a pixel."""
 
 from __future__ import annotations
 

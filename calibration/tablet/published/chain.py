@@ -1,4 +1,4 @@
-"""The paper's two chains, from image and from tablet to the base: homogeneous transforms (HTM) and Denavit-Hartenberg (DH)."""
+"""The tablet paper's two chains to the base: homogeneous transforms (HTM) and Denavit-Hartenberg (DH)."""
 
 from __future__ import annotations
 
@@ -38,11 +38,6 @@ class Landmarks:
     shown: Array
     pen: Array
     correction: Array
-
-
-def parameter_names(model: Model) -> tuple[str, ...]:
-    """Names of a model's twelve parameters."""
-    return HTM_NAMES if model == "htm" else DH_NAMES
 
 
 def search_range(model: Model) -> Array:

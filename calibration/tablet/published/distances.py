@@ -1,4 +1,4 @@
-"""The smallest sum of mean distances: from least squares, through ever sharper smoothing, by SciPy's SLSQP."""
+"""Minimises the sum of mean distances: least squares, then smoothed distances of growing sharpness by SLSQP."""
 
 from __future__ import annotations
 

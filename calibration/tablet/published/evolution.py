@@ -1,4 +1,4 @@
-"""Differential evolution as the paper sets it (Table 4): DE/rand/1, binomial crossover, CR 0.9, F 0.5, by SciPy."""
+"""Differential evolution with the settings of the paper's Table 4: DE/rand/1, binomial crossover, CR 0.9, F 0.5."""
 
 from __future__ import annotations
 

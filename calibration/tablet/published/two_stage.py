@@ -1,4 +1,4 @@
-"""The paper's two fitness functions: mean distances after the chain (stage 1) and after an affine pair on top of it (stage 2)."""
+"""The tablet paper's two fitness functions: mean distances after the chain (stage 1) and the affine pair (stage 2)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CENTRE = 4  # the landmark that A_n turns about: "the fourth black dot", counted
 
 
 class Sign(IntEnum):
-    """Sign of the touching error in Eq. 20: as the paper prints it, left out, or as its own data want it."""
+    """Sign of the touching error in Eq. 20: as printed in the paper, omitted, or as the paper's data require."""
 
     PRINTED = -1
     NONE = 0

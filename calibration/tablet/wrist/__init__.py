@@ -1,1 +1,1 @@
-"""Tablet calibration from full robot poses of the wrist."""
+"""Calibrates camera and pen on the wrist from full robot poses."""

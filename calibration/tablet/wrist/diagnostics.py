@@ -1,4 +1,4 @@
-"""What looks wrong with touches from full robot poses: their size, one landmark, the order of numbers; told, never mended."""
+"""Diagnoses touches from full robot poses: scale, single wrong landmarks and wrong order; changes nothing."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LEAST_TO_DOUBT = 6  # landmarks
 _BETTER = 0.4  # what a change must leave of the residuals to be told
 
 
-def wrist_doubts(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> tuple[str, ...]:
+def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> tuple[str, ...]:
     """Sentences for the result's warnings; `names` of the landmarks."""
     found = []
     scale, deviation = touched_scale(data)
@@ -36,8 +36,8 @@ def wrist_doubts(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> t
     pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
     if pixel > _BAD_PIXEL:
         found.append(
-            f"The picture shows the landmarks {pixel:.1f} px from where the fit has them: check the camera's numbers, its distortion, "
-            "and that picture and page belong together."
+            f"The image shows the landmarks {pixel:.1f} px from the positions of the fit: check the camera's intrinsics, its distortion, "
+            "and that image and page belong together."
         )
     return tuple(found)
 
@@ -82,7 +82,9 @@ def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> s
         without = [_misfit(data.pick(np.arange(len(names)) != k)) for k in range(len(names))]
         worst = int(np.argmin(without))
         if without[worst] < min(_BETTER * left_m, _GOOD_TOUCH_M):  # else more than one of them is wrong
-            return f"{plain}, without landmark {names[worst]} to {1e3 * without[worst]:.2f}: touch it again, or leave it out."
+            return (
+                f"{plain}, without landmark {names[worst]} to {1e3 * without[worst]:.2f}: touch it again or exclude it."
+            )
     changed = {
         "the quaternions' w where z is written": tuple(_rolled(X, 1) for X in data.X_BF),
         "the quaternions' w where x is written": tuple(_rolled(X, -1) for X in data.X_BF),

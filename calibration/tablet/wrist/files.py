@@ -1,4 +1,4 @@
-"""Reading what a visit to the tablet left: the page's CSV with robot poses and an image."""
+"""Reads a tablet visit: the page's CSV, robot poses and an image."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _picture(path: Path) -> NDArray[np.uint8]:
         raise TabletDataError(f"There is no file '{path}'.")
     picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if picture is None:
-        raise TabletDataError(f"'{path.name}' is no image that can be read.")
+        raise TabletDataError(f"'{path.name}' is not a readable image.")
     return np.asarray(picture, dtype=np.uint8)
 
 
@@ -151,17 +151,17 @@ def _warnings(
 ) -> tuple[str, ...]:
     found = []
     if any(rows[k].get("size_checked", "1") == "0" for k in used):
-        found.append("The page's size was not checked with a card: lengths may be wrong by percents.")
+        found.append("The page's size was not checked with a card: lengths may be wrong by some per cent.")
     without = [k for k in sorted(rows) if k not in used]
     if without:
-        found.append(f"Left out, for want of a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
+        found.append(f"Excluded, without a pose in '{poses.name}': landmark {', '.join(map(str, without))}.")
     if picture is not None:
         size = np.array(picture.shape[::-1])
         off = np.abs(intrinsics.centre_px - 0.5 * (size - 1)) / size
         if off.max() > _OFF_CENTRE:
             found.append(
-                f"The picture has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at "
-                f"{intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these numbers seem to belong to pictures of another "
+                f"The image has {size[0]} by {size[1]} pixels, and the principal point of '{camera.name}' lies at "
+                f"{intrinsics.centre_px[0]:.0f}, {intrinsics.centre_px[1]:.0f}: these intrinsics seem to belong to images of another "
                 "size, or turned."
             )
     return tuple(found)

@@ -1,4 +1,4 @@
-"""Camera and pen on the wrist from full robot poses: touches fix tablet and pen, images fix the camera, all in one fit."""
+"""Fits tablet, pen and camera together from full robot poses, touches and images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import least_squares
 
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import check_layout, check_turns
@@ -212,7 +212,7 @@ def _refine(
 
 def _move(X: RigidTransform, x: Array) -> RigidTransform:
     """(exp(x_0..2) R, p + x_3..5)."""
-    return RigidTransform(exp_rotation(x[:3]) @ X.rotation(), X.translation() + x[3:])
+    return RigidTransform(RotationMatrix(exp_rotation(x[:3])) @ X.rotation(), X.translation() + x[3:])
 
 
 def _open_directions(p_FP: Array, pen_covariance: Array, spread: float) -> tuple[str, ...]:
@@ -225,9 +225,3 @@ def _open_directions(p_FP: Array, pen_covariance: Array, spread: float) -> tuple
         f"touches (the hand's axis tilts by {np.degrees(spread):.0f} deg): tilt the hand by 10 deg or more in some, or give the "
         "pen's length. Positions in the tablet's plane do not need it.",
     )
-
-
-def camera_error_covariance(fit: WristFit, p_FQ: Array) -> Array:
-    """Covariance (3, 3) m^2, in the flange's frame, of a point that the camera sees at ``p_FQ`` (3,) m."""
-    J = np.hstack([-skew(np.asarray(p_FQ, dtype=float) - fit.X_FC.translation()), np.eye(3)])
-    return np.asarray(J @ fit.covariance @ J.T)

@@ -1,4 +1,4 @@
-"""The page's grid from the landmarks that were touched: their numbers and coordinates tell columns, rows and spacing."""
+"""Derives the page's grid from the touched landmarks: columns, rows and spacing."""
 
 from __future__ import annotations
 

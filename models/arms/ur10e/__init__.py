@@ -1,1 +1,1 @@
-"""The UR10e: Universal Robots' published numbers."""
+"""Numbers of the UR10e as data files; read by `weldcal.models.arms.kinematics.load_arm`."""

@@ -16,7 +16,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.base_circle import fit_base_circle
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.geometry.rigid import skew
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.hand_eye.stated_noise import information_of, with_stated_noise
@@ -125,7 +125,7 @@ def digest(
     if job.purpose == "verify":
         return dc.replace(status, kept_aside=(*status.kept_aside, compare(job.label, fit, belief, q, q_2)))
     X_CR = belief.seen(q, q_2)
-    sighting = scene.sighting(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
+    sighting = scene.observation(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
     seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), sighting, fit.coverage)
     status = dc.replace(status, seen=(*status.seen, seen), message="")
     if len(status.seen) < fewest(scene):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.hand_eye.mountings import Sighting
+from weldcal.calibration.hand_eye.mountings import TargetObservation
 from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.calibration.planning.mounting_poses import MountingPose
 from weldcal.systems.messages import Message
@@ -39,7 +39,7 @@ class SeenCircle(Message):
 
     label: str
     pose: MountingPose
-    sighting: Sighting
+    sighting: TargetObservation
     coverage: float
 
 

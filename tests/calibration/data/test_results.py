@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.results import (
     CalibrationResult,
@@ -23,7 +23,7 @@ from weldcal.calibration.data.results import (
     save_result,
     write_atomically,
 )
-from weldcal.calibration.geometry.rigid import exp_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
 
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
@@ -74,7 +74,7 @@ def test_every_export_says_the_same_pose(result: CalibrationResult, tmp_path: Pa
     xyz, rpy = re.findall(rf'"({numbers} {numbers} {numbers})"', urdf)
     from_urdf = RigidTransform(RollPitchYaw(*map(float, rpy.split())), list(map(float, xyz.split())))
     ur = [float(v) for v in re.findall(numbers, export_ur_pose(X_BC))]
-    from_ur = RigidTransform(exp_rotation(np.array(ur[3:])), ur[:3])
+    from_ur = RigidTransform(RotationMatrix(exp_rotation(np.array(ur[3:]))), ur[:3])
     ros = dict(re.findall(rf"--(\S+) ({numbers})", export_ros2(X_BC)))
     # nine decimals
     assert np.allclose(from_urdf.GetAsMatrix34(), X_BC.GetAsMatrix34(), atol=1e-8)

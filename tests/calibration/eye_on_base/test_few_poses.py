@@ -18,7 +18,7 @@ X_BC = RigidTransform(RollPitchYaw(3.0, 0.1, 0.5), [-0.6, -0.2, 1.3])
 TURN = np.radians(0.9)
 
 
-def _sightings(n: int) -> tuple[list[Observation], dict[str, HolePattern]]:
+def _observations(n: int) -> tuple[list[Observation], dict[str, HolePattern]]:
     """Scans of a flange whose holes are drilled 0.9 degrees off the robot's flange frame."""
     rng = np.random.default_rng(2)
     observations, patterns = [], {}
@@ -38,7 +38,7 @@ def _sightings(n: int) -> tuple[list[Observation], dict[str, HolePattern]]:
 
 
 def test_one_scan_is_enough_where_the_turn_of_the_holes_is_known() -> None:
-    observations, patterns = _sightings(3)
+    observations, patterns = _observations(3)
     turn, spread = axis_turn(observations, patterns, X_BC)
     assert turn == pytest.approx(TURN, abs=np.radians(0.1))
     assert spread < np.radians(0.1)
@@ -52,6 +52,6 @@ def test_one_scan_is_enough_where_the_turn_of_the_holes_is_known() -> None:
 
 
 def test_scans_without_holes_are_refused() -> None:
-    observations, _ = _sightings(1)
+    observations, _ = _observations(1)
     with pytest.raises(TooFewPoses, match="holes"):
         estimate_from_whole_poses(observations, {})

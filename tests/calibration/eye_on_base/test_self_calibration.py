@@ -9,8 +9,8 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.stats import chi2
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.estimate import with_scanner
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.self_calibration import (
     SelfCalibration,
     apply_self_calibration,
@@ -21,7 +21,7 @@ from weldcal.calibration.eye_on_base.self_calibration import (
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 WRONG = ScannerCorrection(1.003, (0.015, -0.01))
@@ -33,7 +33,7 @@ NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4
 def _cell(
     needs: ScannerCorrection, *, n: int = 18, seed: int = 0, spread: float = 1.0
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """Sightings and hole circles by a scanner that needs a correction; the robot tells the truth."""
+    """Observations and hole circles by a scanner that needs a correction; the robot tells the truth."""
     rng = np.random.default_rng(seed)
     observations, patterns = [], {}
     for k in range(n):
@@ -75,7 +75,7 @@ def test_both_sources_find_the_error_and_it_is_corrected() -> None:
     assert s.accepted is not None
     assert s.accepted.scale == pytest.approx(WRONG.scale, abs=1e-3)
     assert s.sentence.startswith("The scanner is corrected")
-    # what is left of a held-out error is the noise of one sighting in 3-D, and what 18 of them cannot average out
+    # what is left of a held-out error is the noise of one observation in 3-D, and what 18 of them cannot average out
     assert float(np.sqrt(np.mean(s.held_out_m**2))) < 1.5 * np.sqrt(3.0) * NOISE_M
 
 

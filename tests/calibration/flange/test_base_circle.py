@@ -1,4 +1,4 @@
-"""The ring of a robot's foot is found in a scan where its column hides the far side, and nothing else passes for it."""
+"""The ring of a robot's base is found in a scan where its column hides the far side, and nothing else passes for it."""
 
 from __future__ import annotations
 

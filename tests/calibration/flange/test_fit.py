@@ -12,7 +12,7 @@ from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
 from weldcal.calibration.flange.fit import FlangeFit, FlangeGuess, fit_flange
 from weldcal.calibration.flange.observation import observation_from_fit
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.depth_noise import DepthNoise, noisy_depth
 from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.scanners import get_scanner

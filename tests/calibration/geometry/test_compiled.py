@@ -10,13 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ndtr
 
-from weldcal.calibration.flange.border_likelihood import WRONG, border_likelihood
-from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.calibration.flange.edge_labels import WRONG, border_likelihood
+from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import find_holes
-from weldcal.calibration.flange.track_loops import borders, near_edge, plane_steps, ring_points
+from weldcal.calibration.flange.track import borders, near_edge, ring_points
 from weldcal.calibration.flange.warm_up import warm_up
-from weldcal.calibration.geometry.circle_steps import circle_steps, middle, solved
-from weldcal.calibration.geometry.plane_moments import weighted_moments
+from weldcal.calibration.geometry.circle import circle_steps
+from weldcal.calibration.geometry.plane import plane_steps, weighted_moments
+from weldcal.calibration.geometry.robust import middle, solved
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.flange.frames import facing, flange_frame
@@ -80,7 +81,7 @@ def test_one_stray_point_in_five_moves_neither_a_circle_nor_a_plane() -> None:
 def test_the_machine_code_is_kept_for_the_next_process() -> None:
     middle(np.array([1.0]))
     kept = Path(middle.stats.cache_path)  # type: ignore[attr-defined]
-    assert list(kept.glob("circle_steps.middle-*.nbc"))
+    assert list(kept.glob("robust.middle-*.nbc"))
 
 
 def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
@@ -96,7 +97,7 @@ def test_what_a_live_calibration_runs_is_compiled_before_it_runs() -> None:
     X_CR = facing(np.array([0.0, 0.02, 0.8]), 0.2, 0.0, 0.0)
     scene = flange_frame(get_scanner("phoxi_m", 824), standard, np.random.default_rng(0), X_CR=X_CR).points_C
     found = fit_flange(scene, standard)
-    fit_flange(scene, standard, guess=FlangeGuess(found.center_C, 0.7 * standard.outer_m, found.normal_C))
+    fit_flange(scene, standard, guess=found)
     find_holes(scene, found, standard)
     fit_flange(scene[np.linalg.norm(scene - found.center_C, axis=2) < 0.6 * standard.outer_m], standard)
     assert compiled() == ready

@@ -1,4 +1,4 @@
-"""Made-up hand-eye sightings with known answers, for the tests of every mounting."""
+"""Made-up hand-eye observations with known answers, for the tests of every mounting."""
 
 from __future__ import annotations
 

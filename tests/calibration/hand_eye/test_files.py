@@ -108,7 +108,7 @@ def test_a_bad_file_is_named_in_a_sentence(tmp_path: Path, poses: tuple[Array, A
     with pytest.raises(DatasetError, match="no file"):
         read_pairs(tmp_path / "none.csv")
     path = write("npz", tmp_path, F, G)
-    with pytest.raises(DatasetError, match="one of them is wrong"):
+    with pytest.raises(DatasetError, match="correct one of them"):
         read_pairs(path, mounting="eye_on_base")
 
 

@@ -116,7 +116,7 @@ def test_thirty_percent_of_gross_outliers_are_flagged_and_cost_little() -> None:
         # the target's bound: 1.2 times the clean fit, whose answer it is here
         for a, b in zip(errors(dirty, {"X": X, "Y": Y}), errors(clean, {"X": X, "Y": Y}), strict=True):
             assert a <= 1.2 * b
-        assert "left out" in dirty.warnings[0]
+        assert "excluded" in dirty.warnings[0]
 
 
 def test_a_half_turn_camera_and_a_half_turn_hand_are_no_trouble() -> None:
@@ -263,7 +263,7 @@ def test_points_in_one_plane_or_on_one_line_are_refused() -> None:
 def test_stated_covariances_are_believed() -> None:
     rng = np.random.default_rng(13)
     F, G, X, Y = eye_in_hand(30, rng)
-    sigma = np.where(np.arange(30) < 15, 1e-5, 2e-3)  # half of the sightings are two hundred times worse
+    sigma = np.where(np.arange(30) < 15, 1e-5, 2e-3)  # half of the observations are two hundred times worse
     G = G @ pose(exp_rotation(rng.normal(size=(30, 3)) * sigma[:, None]), rng.normal(size=(30, 3)) * sigma[:, None])
     C = np.eye(6) * sigma[:, None, None] ** 2
     plain = solve_ax_yb(inverse(F), G, QUICK)

@@ -1,4 +1,4 @@
-"""A hand-eye result is never surer than its sightings say they are, however well a few of them happen to agree."""
+"""A hand-eye result is never surer than its observations say they are, however well a few of them happen to agree."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform
 from tests.calibration.hand_eye.poses import random_poses
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse
 from weldcal.calibration.hand_eye.choice import CANDIDATES
-from weldcal.calibration.hand_eye.mountings import Sighting, get_mounting, problem_of
+from weldcal.calibration.hand_eye.mountings import TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, as_transform, solve_problem
 from weldcal.calibration.hand_eye.stated_noise import with_stated_noise
@@ -28,7 +28,9 @@ def calibrated(n: int, seed: int, stated: float = 1.0) -> tuple[Problem, State, 
     G[:, :3, 3] += SHIFT * rng.normal(size=(n, 3))
     G[:, :3, :3] = G[:, :3, :3] @ exp_rotation(TURN * rng.normal(size=(n, 3)))
     C = stated**2 * np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
-    seen = [Sighting(as_transform(f), g[:3, 3], n_CM=g[:3, 2], covariance=C) for f, g in zip(F, G, strict=True)]
+    seen = [
+        TargetObservation(as_transform(f), g[:3, 3], n_CM=g[:3, 2], covariance=C) for f, g in zip(F, G, strict=True)
+    ]
     known: State = (X, Y, IDENTITY)
     problem = problem_of(get_mounting("eye_in_hand"), seen, {"Y": as_transform(Y)})
     return (
@@ -65,7 +67,9 @@ def test_an_open_direction_stays_open() -> None:
     F, (X, Y) = random_poses(8, rng), random_poses(2, rng, 1.5)
     G = inverse(F @ X) @ Y
     C = np.diag([TURN**2] * 3 + [SHIFT**2] * 3)
-    seen = [Sighting(as_transform(f), g[:3, 3], n_CM=g[:3, 2], covariance=C) for f, g in zip(F, G, strict=True)]
+    seen = [
+        TargetObservation(as_transform(f), g[:3, 3], n_CM=g[:3, 2], covariance=C) for f, g in zip(F, G, strict=True)
+    ]
     problem = problem_of(get_mounting("eye_in_hand"), seen, {})
     known: State = (X, Y, IDENTITY)
     result = with_stated_noise(problem, known, solve_problem(problem, known, config=QUICK, starts=(known,)))
@@ -76,7 +80,7 @@ def test_an_open_direction_stays_open() -> None:
     assert np.trace(result.covariance["X"][:3, :3]) < 1e-6
 
 
-def test_sightings_that_state_nothing_are_refused() -> None:
+def test_observations_that_state_nothing_are_refused() -> None:
     problem, known, result, _ = calibrated(5, 0)
     bare = Problem(problem.F, problem.G, problem.H, problem.full, problem.normal, None, problem.free)
     with pytest.raises(InputError, match="state its covariance"):

@@ -12,7 +12,6 @@ from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import (
     PlannedPose,
     PlannerConfig,
-    next_best_pose,
     plan_calibration_poses,
     predicted_sigma,
 )
@@ -91,13 +90,6 @@ def test_a_plan_tells_more_than_poses_taken_at_random(planned: list[PlannedPose]
         for pose in [planned[0]] * 10
     ]
     assert predicted_sigma([pose.X_BR for pose in planned], X_BC, config) < 0.3 * predicted_sigma(crowd, X_BC, config)
-
-
-def test_next_pose_keeps_away_from_those_taken(planned: list[PlannedPose]) -> None:
-    taken = [pose.X_BR for pose in planned[:4]]
-    pose = next_best_pose(ARM, X_FR, X_BC, SCANNER, taken, q_start=planned[3].q)
-    assert pose.gain > 0.0
-    assert min(np.linalg.norm(pose.X_BR.translation() - X.translation()) for X in taken) >= CONFIG.min_spacing_m
 
 
 def test_a_scanner_out_of_reach_is_named() -> None:

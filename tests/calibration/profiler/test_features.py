@@ -1,4 +1,4 @@
-"""What a calibrated profiler is used for: a V-groove's three features in a raw profile, and a boss put together from many."""
+"""What a calibrated profiler is used for: a V-groove's three features in a raw profile, and a frustum put together from many."""
 
 from __future__ import annotations
 
@@ -88,8 +88,8 @@ def test_where_there_is_no_groove_it_says_so(spoilt: object, text: str) -> None:
         groove_features(np.zeros((5, 3)))
 
 
-def boss(rng: np.random.Generator, *, hip_m: float = 0.05, noise_m: float = 0.05 * MM) -> np.ndarray:
-    """Points (n, 3) of a boss with a top of 40 mm on its plate, turned in space."""
+def frustum_points(rng: np.random.Generator, *, hip_m: float = 0.05, noise_m: float = 0.05 * MM) -> np.ndarray:
+    """Points (n, 3) of a frustum with a top of 40 mm on its plate, turned in space."""
     k = hip_m / np.sqrt(34.0)
     half_base, height = 0.02 + 3 * k, 4 * k
     g = np.arange(-0.07, 0.07, 0.0011)
@@ -101,18 +101,18 @@ def boss(rng: np.random.Generator, *, hip_m: float = 0.05, noise_m: float = 0.05
     return np.asarray(p @ Q.T + [0.4, -0.2, 0.3])
 
 
-def test_a_boss_is_measured_in_any_orientation() -> None:
+def test_a_frustum_is_measured_in_any_orientation() -> None:
     rng = np.random.default_rng(13)
     for _ in range(2):
-        f = fit_frustum(boss(rng))
+        f = fit_frustum(frustum_points(rng))
         assert f.hips_m == pytest.approx(0.05, abs=0.03 * MM)
         assert np.degrees(f.dihedrals_rad) == pytest.approx(np.degrees(np.arctan2(4, 3)), abs=0.05)
         assert f.rms_m == pytest.approx(0.05 * MM, rel=0.15)
 
 
-def test_half_a_boss_is_none() -> None:
+def test_half_a_frustum_is_refused() -> None:
     rng = np.random.default_rng(14)
-    p = boss(rng)
+    p = frustum_points(rng)
     flat = p[
         np.argsort(np.abs((p - p.mean(axis=0)) @ np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][2]))[:6000]
     ]
@@ -165,7 +165,7 @@ def test_on_the_fixed_files_the_seam_is_where_the_torch_finds_it() -> None:
 
 
 @needs_data
-def test_on_the_fixed_files_the_boss_has_its_size() -> None:
+def test_on_the_fixed_files_the_frustum_has_its_size() -> None:
     b = np.load(DATA / "boss.npz")
     for w in range(2):
         X, e = flange(w, b["q"][w]), calibrated(w)[1]

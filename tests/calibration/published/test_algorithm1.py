@@ -27,7 +27,7 @@ from weldcal.models.errors import InputError
 X_BC = RigidTransform(RollPitchYaw(3.0, 0.2, 0.7), [-0.6, -0.3, 1.1])
 
 
-def sightings(n: int, seed: int, sigma: float = 5e-4) -> list[Observation]:
+def make_observations(n: int, seed: int, sigma: float = 5e-4) -> list[Observation]:
     rng = np.random.default_rng(seed)
     out = []
     for k in range(n):
@@ -38,7 +38,7 @@ def sightings(n: int, seed: int, sigma: float = 5e-4) -> list[Observation]:
 
 
 def test_the_first_four_fill_the_pool_and_a_step_changes_nothing_before_it() -> None:
-    *first, held = sightings(5, 0)
+    *first, held = make_observations(5, 0)
     empty = algorithm1_start(1e-6, 10)
     state = empty
     for o in first:
@@ -50,7 +50,7 @@ def test_the_first_four_fill_the_pool_and_a_step_changes_nothing_before_it() -> 
 
 
 def test_the_cost_never_rises_and_the_pool_stays_four_different_pairs() -> None:
-    *scans, held = sightings(25, 1)
+    *scans, held = make_observations(25, 1)
     state = algorithm1_start(1e-9, 100)
     costs = []
     for o in scans:
@@ -62,7 +62,7 @@ def test_the_cost_never_rises_and_the_pool_stays_four_different_pairs() -> None:
 
 
 def test_it_stops_at_the_required_error_or_when_the_scans_are_used_up() -> None:
-    *scans, held = sightings(20, 2)
+    *scans, held = make_observations(20, 2)
     generous, short = algorithm1_start(0.1, 100), algorithm1_start(1e-12, 3)
     for o in scans:
         generous = algorithm1_step(generous, o, CentreVerification(held))
@@ -74,7 +74,7 @@ def test_it_stops_at_the_required_error_or_when_the_scans_are_used_up() -> None:
 
 
 def test_a_failed_registration_costs_infinity_and_the_next_one_replaces_it() -> None:
-    *scans, held = sightings(8, 3)
+    *scans, held = make_observations(8, 3)
     calls = iter(range(100))
 
     def unlucky(X: RigidTransform) -> VerificationError:
@@ -89,7 +89,7 @@ def test_a_failed_registration_costs_infinity_and_the_next_one_replaces_it() -> 
 
 
 def test_compensation_makes_its_own_figure_zero() -> None:
-    *scans, held = sightings(10, 4)
+    *scans, held = make_observations(10, 4)
     run = run_algorithm1(scans, CentreVerification(held))
     assert run is not None
     assert run.error.X_CpC is not None
@@ -100,8 +100,8 @@ def test_compensation_makes_its_own_figure_zero() -> None:
 def test_its_own_figure_is_smaller_than_its_true_error_and_all_data_do_better() -> None:
     figure, true, ours = [], [], []
     for seed in range(6):
-        *scans, held = sightings(20, 10 + seed)
-        fresh = sightings(50, 100 + seed, sigma=0.0)
+        *scans, held = make_observations(20, 10 + seed)
+        fresh = make_observations(50, 100 + seed, sigma=0.0)
         run = run_algorithm1(scans, CentreVerification(held))
         assert run is not None
         figure.append(run.cost)
@@ -126,7 +126,7 @@ def test_required_error_must_be_positive() -> None:
 
 
 def test_folds_and_convergence_repeat_bit_for_bit_and_judge_every_pose() -> None:
-    observations = sightings(15, 5)
+    observations = make_observations(15, 5)
     a, b = (k_fold(observations, folds=5, repeats=2, seed=3) for _ in range(2))
     assert a.shape == (2, 15)
     assert np.isfinite(a).all()

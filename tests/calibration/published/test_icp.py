@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.published.icp import CentreVerification, Verification, icp_error, make_verification, sight
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import face_points, get_flange
@@ -31,7 +31,7 @@ def verification() -> Verification:
 def displaced(component: int, size: float) -> RigidTransform:
     d = np.zeros(6)
     d[component] = size
-    return X_BR @ RigidTransform(exp_rotation(d[:3]), d[3:]) @ X_BR.inverse() @ X_BC
+    return X_BR @ RigidTransform(RotationMatrix(exp_rotation(d[:3])), d[3:]) @ X_BR.inverse() @ X_BC
 
 
 def test_a_true_calibration_has_a_figure_near_zero(verification: Verification) -> None:

@@ -20,7 +20,7 @@ from tests.calibration.tablet.image import grid, picture, project
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
-from weldcal.calibration.tablet.wrist.diagnostics import wrist_doubts
+from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
@@ -147,16 +147,16 @@ def test_positions_in_the_image_do_as_well_as_the_image(visit: Path, tmp_path: P
             lambda f: (f / "poses.csv").write_text("landmark,x\n0,1\n"),
             "'poses.csv' lacks the columns y, z, qw, qx, qy, qz.",
         ),
-        (lambda f: _edit(f / "poses.csv", "camera", "photo"), "is no number|lacks the row 'camera'"),
+        (lambda f: _edit(f / "poses.csv", "camera", "photo"), "is not a number|lacks the row 'camera'"),
         (lambda f: (f / "camera.yaml").write_text("fx: 600\n"), "must hold fx, fy, cx and cy"),
         (
             lambda f: (f / "camera.yaml").write_text("fx: -1\nfy: 1\ncx: 1\ncy: 1\n"),
             "focal length that is not positive",
         ),
         (lambda f: _edit(f / "touches.csv", "0.125", "0.126", 1), "mixes sizes"),
-        (lambda f: _edit(f / "touches.csv", "0.125", "nan", 1), "'nan' in the column mm_per_px is no number"),
+        (lambda f: _edit(f / "touches.csv", "0.125", "nan", 1), "'nan' in the column mm_per_px is not a number"),
         (lambda f: (f / "touches.csv").unlink(), "There is no file"),
-        (lambda f: (f / "picture.png").write_bytes(b"no picture"), "'picture.png' is no image"),
+        (lambda f: (f / "picture.png").write_bytes(b"no picture"), "'picture.png' is not a readable image"),
         (lambda f: cv2.imwrite(str(f / "picture.png"), np.full((480, 640), 200, np.uint8)), "0 of 9 landmarks"),
         (lambda f: _millimetres(f / "poses.csv"), "must be in metres"),
     ],
@@ -202,7 +202,7 @@ def test_options_that_do_not_belong_together_are_told(npz: Path, visit: Path, tm
 def test_an_npz_that_is_none_is_told(tmp_path: Path, npz: Path) -> None:
     broken = tmp_path / "broken.npz"
     broken.write_bytes(npz.read_bytes()[:500])
-    with pytest.raises(TabletDataError, match="no npz file"):
+    with pytest.raises(TabletDataError, match="not an npz file"):
         load_planar(broken)
     np.savez(tmp_path / "part.npz", uv=np.zeros((4, 2)))
     with pytest.raises(TabletDataError, match="lacks hand, theta_deg"):
@@ -213,7 +213,7 @@ def test_a_result_that_is_none_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no tablet calibration at"):
         load_tablet_result(tmp_path)
     (tmp_path / "tablet.yaml").write_text("schema: 7\n")
-    with pytest.raises(InputError, match="no tablet calibration of schema 1"):
+    with pytest.raises(InputError, match="not a tablet calibration of schema 1"):
         load_tablet_result(tmp_path)
 
 
@@ -307,7 +307,7 @@ def _shifted(folder: Path, column: str, by: float) -> None:
         (lambda f: _edit(f / "camera.yaml", "cx: 316.5", "cx: 200.0"), "principal point of 'camera.yaml'"),
         (
             lambda f: write(f / "poses.csv", [r for r in _rows(f / "poses.csv") if r["landmark"] != "2"]),
-            "for want of a pose",
+            "without a pose in",
         ),
     ],
 )
@@ -318,7 +318,10 @@ def test_what_looks_wrong_with_full_poses_is_told(visit: Path, tmp_path: Path, c
     loaded = _loaded(
         folder, **({"image": folder / "picture.png"} if "principal" in warning else {"seen": folder / "seen.csv"})
     )
-    told = (*loaded.warnings, *wrist_doubts(loaded.data, fit_wrist(loaded.data, leave_one_out=False), loaded.names))
+    told = (
+        *loaded.warnings,
+        *wrist_diagnostics(loaded.data, fit_wrist(loaded.data, leave_one_out=False), loaded.names),
+    )
     assert re.search(warning, " ".join(told)), told
 
 

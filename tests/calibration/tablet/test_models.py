@@ -119,7 +119,7 @@ def test_the_closed_forms_covariance_is_that_of_its_scatter() -> None:
         fit_linear(replace(level, hand_m=hand + rng.normal(0.0, fit.sigma_m, hand.shape))).parameters
         for _ in range(300)
     ]
-    # the sample deviation of 300 is good to 4 %; the design moves a little with the touching errors left out
+    # the sample deviation of 300 is good to 4 %; the design moves a little with the touching errors held out
     np.testing.assert_allclose(np.std(found, axis=0), np.sqrt(np.diag(fit.covariance)), rtol=0.15)
 
 

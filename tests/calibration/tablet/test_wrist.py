@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.wrist.fit import WristTouches, fit_wrist, seen_point
 

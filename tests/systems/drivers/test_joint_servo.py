@@ -7,7 +7,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.systems.cells import Q_HOME, Drive, the_arm
-from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice

@@ -15,7 +15,7 @@ from weldcal.calibration.tablet.published.chain import HTM_NAMES
 from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES, Sign
 from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.wrist.diagnostics import wrist_doubts
+from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import file_hash, load_visit
 from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
@@ -182,7 +182,7 @@ def _wrist(inputs: TabletInputs) -> TabletCalibration:
         p_FP_m=fit.p_FP.tolist(),
         p_FP_covariance=fit.pen_covariance.tolist(),
         unobservable=fit.unobservable,
-        warnings=(*visit.warnings, *wrist_doubts(visit.data, fit, visit.names)),
+        warnings=(*visit.warnings, *wrist_diagnostics(visit.data, fit, visit.names)),
         data_sha256={path.name: file_hash(path) for path in files if path is not None},
     )
     return TabletCalibration(result, shown, fit)

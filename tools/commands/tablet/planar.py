@@ -78,8 +78,8 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
             f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
             "page's size with a card, or the tablet's pixels per inch."
         )
-    if visit.left_out:
-        rows = ", ".join(map(str, visit.left_out))
+    if visit.excluded:
+        rows = ", ".join(map(str, visit.excluded))
         warnings.append(f"Left out, for want of finite numbers: landmark {rows}.")
     odd = _other_signs(touches, sign, planar.sigma_m) + _odd_landmarks(visit, planar, config)
     if not odd:

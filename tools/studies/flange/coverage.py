@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.stats import binom, chi2
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import CoplanarPoses
 from weldcal.calibration.eye_on_base.estimate import with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation, rotation_vector
+from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.pictures import svg
@@ -76,7 +76,7 @@ def _simulated_sighting(
     seen = p + A @ rng.standard_normal(3) + sigma_m * rng.standard_normal(3)
     z = X_CR.rotation().matrix()[:, 2]
     lean = float(np.hypot(sigma_rad, normal_sigma)) * rng.standard_normal(3)
-    normal = exp_rotation(lean - z * float(z @ lean)).matrix() @ z
+    normal = exp_rotation(lean - z * float(z @ lean)) @ z
     return Observation(id, X_BC @ X_CR, seen, normal, covariance, normal_sigma)
 
 

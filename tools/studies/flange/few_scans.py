@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
@@ -77,7 +77,7 @@ def study_few_scans(
                 X, correction = _calibrated(used, seen.patterns, turn, seed)
             except InputError:
                 continue
-            judged = [correction.observation(o) for o in kept]
+            judged = [corrected_observation(correction, o) for o in kept]
             errors.append(float(np.median(position_errors(X, judged))))
             tilt = tilt_errors(X, judged)
             tilts.append(float(np.median(tilt[np.isfinite(tilt)])) if np.isfinite(tilt).any() else float("nan"))

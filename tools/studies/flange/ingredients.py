@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi
 
 from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
-from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.self_calibration import held_out_errors
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
@@ -105,8 +105,8 @@ def _holes_alone(good: Sequence[Observation], patterns: Mapping[str, HolePattern
         rest = [p for p in good if p is not o]
         found = from_holes(rest, patterns)
         correction = ScannerCorrection() if found is None else found.correction
-        e = estimate_eye_on_base([correction.observation(p) for p in rest], config)
-        seen = [correction.observation(o)]
+        e = estimate_eye_on_base([corrected_observation(correction, p) for p in rest], config)
+        seen = [corrected_observation(correction, o)]
         errors[k], tilts[k] = float(position_errors(e.X_BC, seen)[0]), float(tilt_errors(e.X_BC, seen)[0])
         sigma += e.sigma_position_m / len(good)
     return Ingredient("scale and gradient, hole circle alone", errors, tilts, _floor(sigma))

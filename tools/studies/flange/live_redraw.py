@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.rigid import exp_rotation, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.tools.outcomes.weld import calibration_error
@@ -115,7 +115,7 @@ def _sighting(o: Observation, q: Array, station: Station, rng: np.random.Generat
         p = p + rng.multivariate_normal(np.zeros(3), o.center_covariance)
     if o.normal_sigma is not None:
         lean = o.normal_sigma * rng.standard_normal(3)
-        n = exp_rotation(lean - z * float(z @ lean)).matrix() @ z
+        n = exp_rotation(lean - z * float(z @ lean)) @ z
     return replace(o, p_CR=p, n_C=None if o.n_C is None else n)
 
 

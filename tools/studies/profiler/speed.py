@@ -12,11 +12,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.edge.joint import edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.edge.start import edge_starts
-from weldcal.calibration.profiler.motion import FlangePoses, Floats, skew
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress, plain
 from weldcal.tools.report.render import write_atomic

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
-from weldcal.calibration.eye_on_base.observations import Sightings, see_flanges
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
@@ -109,7 +109,7 @@ class Material:
 
     data: Dataset
     standard: FlangeStandard
-    seen: Sightings
+    seen: FlangeObservations
     faces: dict[str, Array]
     circles: list[Observation]
     good: dict[str, Observation]
@@ -215,7 +215,7 @@ def split_once(material: Material, fit: list[str], seed: int) -> Mapping[str, tu
     out["rigid"] = (position_errors(estimate.X_BC, rest), float(np.median(estimate.held_out.position_m)))
     scanner, _, corrected = apply_self_calibration(ours, estimate, material.seen.patterns, seed=seed)
     accepted = ScannerCorrection() if scanner is None or scanner.accepted is None else scanner.accepted
-    errors = position_errors(corrected.X_BC, [accepted.observation(o) for o in rest])
+    errors = position_errors(corrected.X_BC, [corrected_observation(accepted, o) for o in rest])
     out["ours"] = (errors, float(np.median(corrected.held_out.position_m)))
     return {name: out[name] for name in METHODS}
 
@@ -276,7 +276,7 @@ def _sights(material: Material, held: str) -> tuple[SightRow, ...]:
     rows = []
     for title, v in kinds:
         error = icp_error(X, v)
-        rows.append(SightRow(title, error.value, sight(X, v).share, error.blind))
+        rows.append(SightRow(title, error.value, sight(X, v).share, error.unobservable))
     return tuple(rows)
 
 

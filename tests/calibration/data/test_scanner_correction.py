@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection, correction_from_document
+from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 
@@ -55,13 +56,13 @@ def test_the_normal_stays_upright_on_the_corrected_face() -> None:
     assert np.degrees(np.arccos(min(1.0, float(seen @ n)))) > 0.1  # it does turn
 
 
-def test_a_sighting_is_corrected_whole() -> None:
+def test_an_observation_is_corrected_whole() -> None:
     o = Observation("a", RigidTransform(), np.array([0.1, 0.0, 0.5]), np.array([0.0, 0.0, -1.0]))
-    c = CORRECTION.observation(o)
+    c = corrected_observation(CORRECTION, o)
     assert np.allclose(c.p_CR, CORRECTION.points(o.p_CR))
     assert c.n_C is not None
     assert np.allclose(c.n_C, CORRECTION.normals(o.p_CR, np.array([0.0, 0.0, -1.0])))
-    assert CORRECTION.observation(Observation("b", RigidTransform(), o.p_CR)).n_C is None
+    assert corrected_observation(CORRECTION, Observation("b", RigidTransform(), o.p_CR)).n_C is None
 
 
 def test_it_is_written_and_read_back() -> None:

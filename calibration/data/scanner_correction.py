@@ -1,15 +1,14 @@
-"""A scanner's own error of scale, and how it changes across the image: one factor for every point."""
+"""Correction of a scanner's scale error: a polynomial factor over the image that multiplies every point."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 
 Array = NDArray[np.float64]
@@ -40,7 +39,7 @@ class ScannerCorrection:
     def __post_init__(self) -> None:
         values = np.array([self.scale, *self.gradient_per_m, *self.bend, *(self.field_m or ())])
         if not np.isfinite(values).all() or abs(self.scale - 1.0) > _LARGEST or len(self.values) not in TERMS.values():
-            raise InputError("The scanner correction is not usable: its scale must lie within 5 % of 1.")
+            raise InputError("The scanner correction is invalid: its scale must lie within 5 % of 1.")
 
     @property
     def values(self) -> Array:
@@ -111,14 +110,8 @@ class ScannerCorrection:
         ]
         return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
 
-    def observation(self, o: Observation) -> Observation:
-        """The sighting as a scanner without this error would have made it."""
-        return replace(
-            o, p_CR=self.points(o.p_CR), n_C=None if o.n_C is None else self.normals(np.asarray(o.p_CR), o.n_C)
-        )
-
     def document(self) -> dict[str, Any]:
-        """As calibration.yaml and the JSON object hold it; bends only where there are any."""
+        """The correction as plain types for calibration.yaml and JSON; bends only where there are any."""
         out: dict[str, Any] = {"scale": float(self.scale), "gradient_per_m": [float(v) for v in self.gradient_per_m]}
         if self.bend:
             out["bend_per_m2"] = [float(v) for v in self.bend[:3]]
@@ -128,7 +121,7 @@ class ScannerCorrection:
 
     @property
     def formula(self) -> str:
-        """The factor as one who has only a pocket calculator needs it."""
+        """The factor as a formula in x and y (m)."""
         names = ("", "x", "y", "x^2", "x y", "y^2", "x^3", "x^2 y", "x y^2", "y^3")
         text = " ".join(f"{v:+.7f} {n}".strip() for v, n in zip(self.values, names, strict=False)).lstrip("+")
         if self.field_m is None or not self.bend:
@@ -141,7 +134,7 @@ class ScannerCorrection:
 
 
 def correction_from_document(document: dict[str, Any] | None) -> ScannerCorrection | None:
-    """Read it back; None where a result has none. Raises InputError where it is not one."""
+    """Read a correction from its document; None for None. Raises InputError where it is malformed."""
     if document is None:
         return None
     try:

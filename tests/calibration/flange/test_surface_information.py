@@ -7,7 +7,13 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.flange.unobservable import COMPONENTS, blind_components, information, sigmas, surface_normals
+from weldcal.calibration.flange.surface_information import (
+    COMPONENTS,
+    information,
+    sigmas,
+    surface_normals,
+    unobservable_components,
+)
 from weldcal.calibration.published.icp import CentreVerification, icp_error, make_verification
 from weldcal.models.flanges import face_points, flange_mesh, get_flange
 
@@ -34,7 +40,7 @@ def test_normals_are_those_of_face_and_chamfers() -> None:
 def test_a_face_without_chamfers_hides_its_plane_and_its_turn() -> None:
     points = scanned(False)
     matrix = information(points, surface_normals(points, STANDARD))
-    assert blind_components(matrix) == COMPONENTS[2:5]
+    assert unobservable_components(matrix) == COMPONENTS[2:5]
     assert np.isinf(sigmas(matrix, 1e-4)[2:5]).all()
     # along the normal N points of 0.1 mm average to 0.1 mm over the root of N
     assert sigmas(matrix, 1e-4)[5] == pytest.approx(1e-4 / np.sqrt(len(points)), rel=1e-3)
@@ -43,7 +49,7 @@ def test_a_face_without_chamfers_hides_its_plane_and_its_turn() -> None:
 def test_chamfers_show_the_plane_but_never_the_turn() -> None:
     points = scanned(True)
     matrix = information(points, surface_normals(points, STANDARD))
-    assert blind_components(matrix) == ("rotation about the flange axis",)
+    assert unobservable_components(matrix) == ("rotation about the flange axis",)
 
 
 @pytest.mark.parametrize("chamfers", [True, False])
@@ -54,8 +60,8 @@ def test_the_registration_gives_no_number_for_what_it_cannot_see(chamfers: bool)
     turned = v.X_BR @ RigidTransform(RollPitchYaw(0, 0, 0.05), [0, 0, 4e-4]) @ v.X_BR.inverse() @ X_BC
     error = icp_error(turned, v)
     named = {name: value for name, value, _seen in error.components}
-    assert "rotation about the flange axis" in error.blind
-    assert ("in the flange plane, x" in error.blind) is not chamfers
+    assert "rotation about the flange axis" in error.unobservable
+    assert ("in the flange plane, x" in error.unobservable) is not chamfers
     assert np.isnan(named["rotation about the flange axis"])
     assert error.value[2] == 0.0
     assert named["along the flange normal"] == pytest.approx(4e-4, abs=2e-5)
@@ -67,4 +73,4 @@ def test_the_registration_gives_no_number_for_what_it_cannot_see(chamfers: bool)
 
 def test_a_pair_without_a_cloud_is_blind_to_rotations() -> None:
     error = CentreVerification(Observation("v", X_BC @ X_CR, X_CR.translation()))(X_BC)
-    assert error.blind == COMPONENTS[:3]
+    assert error.unobservable == COMPONENTS[:3]

@@ -1,4 +1,4 @@
-"""What a patch of the flange's surface can show of an error at all: its information, and the directions it is blind to."""
+"""Information of a patch of the flange's surface on an error of its pose, and the components it leaves unobservable."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ COMPONENTS = (
 )
 """Names of the six components of an error at the flange, [rotation; translation] in frame R."""
 
-BLIND_SHARE = 0.01
-"""A component is called blind where less than one point in a hundred speaks for it: the chamfers of a whole ISO 9409-1-50
+UNOBSERVABLE_SHARE = 0.01
+"""A component is called unobservable where less than one point in a hundred speaks for it: the chamfers of a whole ISO 9409-1-50
 face hold one in six, at 45 degrees, and speak for a shift with 4 %; stray points at an edge make half a per cent."""
 
 
@@ -48,19 +48,19 @@ def information(points_R: Array, normals_R: Array) -> Array:
 
 
 def sigmas(matrix: Array, noise_m: float) -> Array:
-    """Standard deviation (6,), rad and m, of each component, the others unknown as well; infinite where it is blind."""
+    """Standard deviation (6,), rad and m, of each component, the others unknown as well; infinite where unobservable."""
     values, vectors = np.linalg.eigh(_scaled(matrix))
     variance = np.where(values > 1e-9 * max(float(values[-1]), 1e-30), 1.0 / np.maximum(values, 1e-30), np.inf)
     share = vectors**2
     with np.errstate(invalid="ignore"):
         total = np.where(share > 1e-9, share * variance, 0.0).sum(axis=1)
     out = noise_m * np.sqrt(total) / _units(matrix)
-    return np.asarray(np.where(_shares(matrix) < BLIND_SHARE, np.inf, out))
+    return np.asarray(np.where(_shares(matrix) < UNOBSERVABLE_SHARE, np.inf, out))
 
 
-def blind_components(matrix: Array) -> tuple[str, ...]:
-    """Names of the components that a displacement of the flange leaves (nearly) without a trace on the surface."""
-    return tuple(name for name, s in zip(COMPONENTS, _shares(matrix), strict=True) if s < BLIND_SHARE)
+def unobservable_components(matrix: Array) -> tuple[str, ...]:
+    """Names of the components along which a displacement of the flange changes the surface (nearly) not at all."""
+    return tuple(name for name, s in zip(COMPONENTS, _shares(matrix), strict=True) if s < UNOBSERVABLE_SHARE)
 
 
 def _shares(matrix: Array) -> Array:

@@ -1,0 +1,66 @@
+"""Robust statistics for compiled loops: Tukey's and the MAD's constants, a median, a small Cholesky solution."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.geometry.compiled import compiled
+
+Array = NDArray[np.float64]
+
+TUKEY = 4.685  # 95 % efficient on Gaussian noise
+MAD = 1.4826  # median absolute deviation -> standard deviation of a Gaussian
+_FLAT = 1e-9  # of a diagonal element, what earlier rows leave of it: less, and the matrix counts as singular
+
+
+@compiled()
+def middle(a: Array) -> float:
+    """Median of numbers (N,), the upper of two middle ones, by Hoare's selection; reorders its argument."""
+    low, high, k = 0, len(a) - 1, len(a) // 2
+    while low < high:
+        pivot, i, j = a[(low + high) // 2], low, high
+        while i <= j:
+            while a[i] < pivot:
+                i += 1
+            while a[j] > pivot:
+                j -= 1
+            if i <= j:
+                a[i], a[j] = a[j], a[i]
+                i += 1
+                j -= 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    return float(a[k])
+
+
+@compiled()
+def solved(N: Array, g: Array, free: int) -> tuple[bool, Array]:
+    """Solve N x = g for the leading ``free`` rows of a symmetric matrix (3, 3) by Cholesky; False where not positive definite."""
+    L, x = np.zeros((3, 3)), np.zeros(3)
+    for i in range(free):
+        for j in range(i + 1):
+            s = N[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                if not s > _FLAT * N[i, i]:
+                    return False, x
+                L[i, i] = np.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+    for i in range(free):
+        s = g[i]
+        for k in range(i):
+            s -= L[i, k] * x[k]
+        x[i] = s / L[i, i]
+    for i in range(free - 1, -1, -1):
+        s = x[i]
+        for k in range(i + 1, free):
+            s -= L[k, i] * x[k]
+        x[i] = s / L[i, i]
+    return True, x
