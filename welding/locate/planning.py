@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
-from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.locate.registration import register_workpiece
 

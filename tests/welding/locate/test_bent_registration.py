@@ -15,7 +15,7 @@ from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
 from weldcal.tools.studies.seam_planning.trials import sideways
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.find_workpiece import find_workpiece
-from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planning import PlanningMethod, plan_root
 from weldcal.welding.locate.registration import WorkpieceNotFound, register_workpiece
 

@@ -22,8 +22,8 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.tools.studies.seam_planning import benchmark as seam_planning
 from weldcal.tools.studies.seam_planning.scenes import Scene, box, cast, looking_at, scan_part, table
 from weldcal.tools.studies.seam_planning.trials import sideways
-from weldcal.welding.locate.groove_cloud import extract_groove
-from weldcal.welding.locate.groove_seam import (
+from weldcal.welding.locate.groove.extract import extract_groove
+from weldcal.welding.locate.groove.seam import (
     GrooveNotFound,
     GrooveSeam,
     GrooveTooNarrow,

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
-from weldcal.welding.locate.groove_search import SearchConfig
+from weldcal.welding.locate.groove.search import SearchConfig
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -52,6 +52,16 @@ class GrooveConfig:
     most_bridge_sigma_m: float = 0.0015
     steepest_wall_rad: float = math.radians(78.0)
     ground_reach_m: float = 0.009
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What a section is expected to look like: slopes of the walls and depth, and how far they may differ (1 sigma)."""
+
+    slopes: tuple[float, float]
+    depth: float
+    slope_sigma: float = 0.15  # relative
+    depth_sigma: float = 0.30
 
 
 @dataclass(frozen=True, eq=False)
