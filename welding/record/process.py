@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array
 
 _BAND = 0.25  # a travel speed beyond +-25 % is commonly taken as another welding procedure
 

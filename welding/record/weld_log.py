@@ -18,8 +18,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import WeldProcess
-from weldcal.welding.vectors import Array
 
 SCHEMA, VERSION = "weldcal weld log", 1
 CSV_NAME, HEADER_NAME = "weld.csv", "weld.json"

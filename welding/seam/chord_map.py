@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, dot, norm
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array, dot, norm
 
 
 @dataclass(frozen=True)

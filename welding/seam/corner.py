@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.vectors import Array, dot, norm, unit
+from weldcal.welding.numerics import Array, dot, norm, unit
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from scipy.interpolate import CubicSpline, make_smoothing_spline
 
 from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array
+from weldcal.welding.numerics import Array
 
 _REPEAT_M = 1e-6  # two neighbours closer than a micrometre are one point told twice
 _KNOT_M = 1e-3  # knots at most a millimetre apart: a 1 mm radius is still a curve

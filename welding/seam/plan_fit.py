@@ -8,8 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array, pose, unit
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array, pose, unit
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.corner import CornerConfig, fill_corner, is_jump
-from weldcal.welding.vectors import Array
 
 _EMPTY_POINTS = np.zeros((0, 3))
 _EMPTY_ARC = np.zeros(0)

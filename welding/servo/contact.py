@@ -6,12 +6,11 @@ import math
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, changed, clip, dot, finite, norm
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.plan_fit import add_point
 from weldcal.welding.seam.refinement import drop_pending, refine, tip_point
-from weldcal.welding.servo.evolve import changed
 from weldcal.welding.servo.state import Measurement, Phase, ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import Array, clip, dot, finite, norm
 
 
 def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:

@@ -7,13 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, changed, clip, dot
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import add_point
 from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 from weldcal.welding.servo.contact import contact_lost
-from weldcal.welding.servo.evolve import changed
 from weldcal.welding.servo.state import ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import Array, clip, dot
 
 BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH that are taken here
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array, dot, within
+from weldcal.welding.numerics import Array, dot, within
 
 
 class GuardError(InputError):

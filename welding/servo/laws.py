@@ -10,20 +10,24 @@ from typing import Literal
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array, clip, cross, dot, unit
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.refinement import RefinedSeam
-from weldcal.welding.servo.chord import UnknownLaw
 from weldcal.welding.servo.guards import seam_conditioning
 from weldcal.welding.servo.state import ServoConfig, WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.servo.track import Motion, TorchTarget, guarded_motion
-from weldcal.welding.vectors import Array, clip, cross, dot, unit
 
 _OMEGA_CEILING = 100.0  # rad/s; an unguarded law asks for thousands, no robot turns by more than this in a tick
 
 MotionLaw = Callable[
     [WeldingState, RigidTransform, SeamFrame, TorchTarget, tuple[float, float], ServoConfig, float], Motion
 ]
+
+
+class UnknownLaw(InputError):
+    """No steering law has this name."""
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.seam.plan_fit import PlanFit, PlanFitConfig
 from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam, RefinementConfig
 from weldcal.welding.servo.weave import WeaveConfig
-from weldcal.welding.vectors import Array
 
 
 class ServoConfigError(InputError):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, changed, clip, dot, finite
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
@@ -21,14 +22,12 @@ from weldcal.welding.servo.contact import (
     with_point,
     with_progress,
 )
-from weldcal.welding.servo.evolve import changed
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import touch_step
 from weldcal.welding.servo.track import TorchTarget, torch_target
 from weldcal.welding.servo.weave import weave_at
-from weldcal.welding.vectors import Array, clip, dot, finite
 
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array, clip, cross, dot, norm, unit
 from weldcal.welding.servo.state import ServoConfig
-from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 
 class ToolAxes(NamedTuple):

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import changed, clip, dot, pose, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.servo.contact import freshness
-from weldcal.welding.servo.evolve import changed
 from weldcal.welding.servo.state import GainFit, ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import clip, dot, pose, unit
 
 _TAG_SIGMA_M = 0.05e-3  # what a frame's deflection may be off while the gain is fitted
 _SEATED_FRAMES = 3

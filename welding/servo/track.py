@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array, box_least_squares, clip, cross, dot, norm, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.seam.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.servo.guards import SeamConditioning, seam_conditioning
-from weldcal.welding.servo.lsq import box_least_squares
 from weldcal.welding.servo.state import ServoConfig, WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
-from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
 _CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no point: too late to be confirmed

@@ -12,7 +12,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobia
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
-from weldcal.welding.vectors import within
+from weldcal.welding.numerics import within
 
 _LARGEST_MM = 1.0  # an arm that misses by more is broken, not unrepeatable
 

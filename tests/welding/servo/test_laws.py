@@ -11,10 +11,9 @@ from weldcal.tools.studies.weld.plant import simulate
 from weldcal.tools.studies.weld.rows import Case
 from weldcal.tools.studies.weld.seams import TrueSeam, arcs, corner
 from weldcal.tools.studies.weld.study import study_config
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.refinement import RefinedSeam
-from weldcal.welding.servo.chord import UnknownLaw
-from weldcal.welding.servo.laws import LAWS, get_law, literal_tangent
-from weldcal.welding.vectors import Array
+from weldcal.welding.servo.laws import LAWS, UnknownLaw, get_law, literal_tangent
 
 STRAIGHT = arcs((0.10, 0.0), spacing=2e-3)
 CORNER = corner(0.020, 90.0, 1.0, legs=0.07)
