@@ -37,7 +37,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.welding.servo.guards import SlewLimits
-from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
 
 AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 LOG_PERIOD_S = 0.008  # a row per servo tick
@@ -133,8 +133,9 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
         tool=geometry,
         touch=TouchConfig(zero_frames=ZERO_FRAMES),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
-        delta_d_m=welding.deflection_mm * 1e-3,
-        axial_d_m=welding.axial_deflection_mm * 1e-3,
+        deflection=DeflectionControl(
+            delta_d_m=welding.deflection_mm * 1e-3, axial_d_m=welding.axial_deflection_mm * 1e-3
+        ),
         law=welding.law,
     )
 

@@ -12,7 +12,8 @@ from weldcal.tools.studies.weld.plant import simulate
 from weldcal.tools.studies.weld.seams import TrueSeam, arcs, corner
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.state import Phase, ServoConfig, WeldingCommand, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase, WeldingCommand, WeldingState
 
 
 @dataclass(frozen=True)

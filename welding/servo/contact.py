@@ -10,7 +10,8 @@ from weldcal.welding.numerics import Array, changed, clip, dot, finite, norm
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.plan_fit import add_point
 from weldcal.welding.seam.refinement import drop_pending, refine, tip_point
-from weldcal.welding.servo.state import Measurement, Phase, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Measurement, Phase, ServoSample, WeldingState
 
 
 def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
@@ -74,6 +75,7 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
     A plan rounds its corners, and beside a rounded corner its tangent is wrong by half of the turn. The direction of
     the last points is noisier than the plan's, so that it is believed only where the two plainly differ.
     """
+    felt_path = config.felt_path
     seam = state.refined
     points = [point, *(q.point for q in reversed(seam.pending))]
     # Going over ground that was felt on the way back, the last points committed lie ahead.
@@ -84,7 +86,7 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
         back = earlier - point
         x.append(dot(back, at.tangent))
         y.append(dot(back, at.normal))
-        if len(x) >= config.felt_points and math.hypot(x[-1], y[-1]) >= config.felt_length_m:
+        if len(x) >= felt_path.points and math.hypot(x[-1], y[-1]) >= felt_path.length_m:
             break
     else:
         return 0.0
@@ -97,7 +99,7 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
     # The principal axis has no sense; the way from the earliest to the newest point has.
     if math.cos(angle) * x[-1] + math.sin(angle) * y[-1] > 0.0:
         angle = math.remainder(angle + math.pi, 2.0 * math.pi)
-    share = (abs(angle) - config.felt_dead_rad) / (config.felt_full_rad - config.felt_dead_rad)
+    share = (abs(angle) - felt_path.dead_rad) / (felt_path.full_rad - felt_path.dead_rad)
     return clip(angle, -0.5 * math.pi, 0.5 * math.pi) * clip(share, 0.0, 1.0)
 
 
@@ -109,19 +111,18 @@ def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoC
     plan that is ahead or behind at a corner, whose own tangent nearby then leaves no lean; or a wall where none is
     planned, to which the frame turns.
     """
+    steering = config.steering
     lean, delta_n = dot(delta, seam.tangent), dot(delta, seam.normal)
-    excess = max(0.0, abs(lean) - config.drag_m)
-    angle = -math.copysign(math.atan2(excess, max(delta_n, 0.5 * config.delta_d_m)), lean)
-    share = clip(
-        (abs(angle) - config.steering_dead_rad) / (config.steering_full_rad - config.steering_dead_rad), 0.0, 1.0
-    )
+    excess = max(0.0, abs(lean) - steering.drag_m)
+    angle = -math.copysign(math.atan2(excess, max(delta_n, 0.5 * config.deflection.delta_d_m)), lean)
+    share = clip((abs(angle) - steering.dead_rad) / (steering.full_rad - steering.dead_rad), 0.0, 1.0)
     if share == 0.0 or state.plan_fit is None:
         return 0.0
-    curve, s, reach = state.plan_fit.curve, state.s_tip, config.steering_reach_m
+    curve, s, reach = state.plan_fit.curve, state.s_tip, steering.reach_m
     best = excess
     for k in (-8, -7, -6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6, 7, 8):
         there = curve.frame(s + k * reach / 8.0).tangent
-        cost = max(0.0, abs(dot(delta, there)) - config.drag_m) + 0.02 * reach * abs(k)
+        cost = max(0.0, abs(dot(delta, there)) - steering.drag_m) + 0.02 * reach * abs(k)
         if cost < best:
             best = cost
             angle = math.atan2(dot(there, seam.normal), dot(there, seam.tangent))
@@ -133,8 +134,8 @@ def beyond_limit(state: WeldingState, config: ServoConfig) -> bool:
     if state.measurement is None:
         return False
     lateral = math.sqrt(max(0.0, norm(state.measurement.delta) ** 2 - state.delta_axial**2))
-    limits = config.contact
-    return lateral > limits.limit_lateral_m or state.delta_axial > limits.limit_axial_m
+    limits = config.faults
+    return lateral > limits.lateral_m or state.delta_axial > limits.axial_m
 
 
 def contact_lost(before: WeldingState, now: WeldingState, config: ServoConfig) -> bool:
@@ -149,10 +150,11 @@ def contact_lost(before: WeldingState, now: WeldingState, config: ServoConfig) -
 
 def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     """The state with its newest tactile point queued, the oldest committed, and the plan moved onto the points."""
+    deflection = config.deflection
     assert state.measurement is not None
     assert state.plan_fit is not None
-    proven = state.proven or state.delta_n > 0.5 * config.delta_d_m
-    if not (proven or state.delta_axial > 0.33 * config.axial_d_m):
+    proven = state.proven or state.delta_n > 0.5 * deflection.delta_d_m
+    if not (proven or state.delta_axial > 0.33 * deflection.axial_d_m):
         return changed(state, refined=drop_pending(state.refined), proven=proven)
     arc = progress_at(state, state.measurement.capture_time)
     plan_fit, corner = state.plan_fit, config.refinement.corner

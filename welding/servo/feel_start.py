@@ -12,7 +12,8 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import add_point
 from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 from weldcal.welding.servo.contact import contact_lost
-from weldcal.welding.servo.state import ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import ServoSample, WeldingState
 
 BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH that are taken here
 
@@ -33,7 +34,7 @@ def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
     touch = config.touch
     if not touch.feel_start:
         return config
-    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.contact.end_window_m), touch.arc_m + 1e-6), 1e-3)
+    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.gap.end_window_m), touch.arc_m + 1e-6), 1e-3)
     turn = np.sum(plan.tangent(s - _BESIDE_M) * plan.tangent(s + _BESIDE_M), axis=1)
     straight = np.flatnonzero(turn > math.cos(_STRAIGHT_RAD))
     place = float(s[straight[0] if len(straight) else np.argmax(turn)])
@@ -56,6 +57,7 @@ def feel_start_step(
     Returns:
         (state, wanted speeds along, to the left and up m/s, fault sentence or None, whether the tip is ready to track).
     """
+    deflection = config.deflection
     assert state.plan_fit is not None
     assert state.measurement is not None
     curve, limits, t, last = state.plan_fit.curve, config.contact, state.touch, state.measurement
@@ -69,18 +71,18 @@ def feel_start_step(
         if is_new:
             point = PendingPoint(last.point, curve.nearest(last.point, s) - curve.nearest(last.p_BT, s))
             state = changed(state, touch=replace(t, felt=(*t.felt, point)))
-        if s < -limits.end_window_m:
+        if s < -config.gap.end_window_m:
             # Still in the groove: it begins before the plan does, and the weld begins where the plan says.
             return _ready(changed(state, proven=True), p_BT, config), (0.0, 0.0, 0.0), None, True
-        lateral = config.k_p * (config.delta_d_m - state.delta_n)
-        upward = config.k_z * (state.delta_axial - config.axial_d_m)
+        lateral = deflection.k_p * (deflection.delta_d_m - state.delta_n)
+        upward = deflection.k_z * (state.delta_axial - deflection.axial_d_m)
         return state, (-config.touch.search_m_s, lateral, upward), None, False
     # Out of the groove: centred and raised, so that it lifts the tip when it comes back, as after a gap.
     seam = curve.frame(s)
     gap = p_BT - seam.position
     side = state.residual_at_loss[0] - dot(gap, seam.normal)
-    height = state.residual_at_loss[1] - limits.hover_m - dot(gap, seam.up)
-    servo = (config.k_follow * side, config.k_follow * height)
+    height = state.residual_at_loss[1] - config.gap.hover_m - dot(gap, seam.up)
+    servo = (deflection.k_follow * side, deflection.k_follow * height)
     if t.step == "lift":
         settled = math.hypot(side, height) < _SETTLED_M and sample.time - t.since > limits.regain_after_s
         if settled:
@@ -137,7 +139,7 @@ def _ready(state: WeldingState, p_BT: Array, config: ServoConfig) -> WeldingStat
     s = curve.nearest(p_BT, state.s_tip, 0.02)
     start = state.start_point
     if start is not None:
-        reach = config.contact.end_window_m
+        reach = config.gap.end_window_m
         at = curve.nearest(start, 0.0, 0.02)
         start = start + (clip(at, -reach, reach) - at) * curve.frame(at).tangent
     return changed(state, plan_fit=plan_fit, refined=refined, s_tip=s, progress=s, start_point=start)

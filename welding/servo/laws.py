@@ -15,7 +15,8 @@ from weldcal.welding.numerics import Array, clip, cross, dot, unit
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.refinement import RefinedSeam
 from weldcal.welding.servo.guards import seam_conditioning
-from weldcal.welding.servo.state import ServoConfig, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.servo.track import Motion, TorchTarget, guarded_motion
 
@@ -112,6 +113,7 @@ def paper_motion(
 
     The paper is planar; as in the guarded law, pitch keeps the torch's height and roll the work angle.
     """
+    limits, torch = config.limits, config.torch
     axes = tool_axes(X_BT, tip.up, target.up, config)
     u, m, a, d = axes.along, axes.across, axes.yaw, axes.d
     n, t = target.normal, target.tangent
@@ -121,7 +123,7 @@ def paper_motion(
     v = config.weld_speed_m_s
     V_tip = v * tip.tangent + servo[0] * tip.normal + servo[1] * tip.up
     e = axes.torch - target.point
-    back = config.k_b * dot(e, n) if law.feedback else 0.0
+    back = torch.k_b * dot(e, n) if law.feedback else 0.0
     c = dot(m, n)
     wanted = law.sign * dot(V_tip, n) + back
     slope = c / (c * c + law.damping**2) if law.damping else 1.0 / math.copysign(max(abs(c), 1e-9), c)
@@ -129,9 +131,9 @@ def paper_motion(
 
     b = target.up
     flat = V_tip - d * omega * m
-    w_p = -(dot(flat, b) + config.k_h * clip(dot(e, b), -config.feedback_limit_m, config.feedback_limit_m))
+    w_p = -(dot(flat, b) + torch.k_h * clip(dot(e, b), -torch.feedback_limit_m, torch.feedback_limit_m))
     w_p /= d * height_share(axes, b)
-    w_p = clip(w_p, -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
+    w_p = clip(w_p, -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
     V = np.concatenate([omega * a + w_p * m + roll_rate(axes, b, config) * u, V_tip])
     return Motion(V, v, dot(flat, t), omega, seam_conditioning(u, tip.tangent, t))
 

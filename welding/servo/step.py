@@ -24,7 +24,8 @@ from weldcal.welding.servo.contact import (
 )
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.servo.laws import get_law, motion_law
-from weldcal.welding.servo.state import Diagnostics, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import touch_step
 from weldcal.welding.servo.track import TorchTarget, torch_target
 from weldcal.welding.servo.weave import weave_at
@@ -79,7 +80,7 @@ def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: Se
         tip_line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
         # Rest point and torch run beside the tip's line, lower by what the tip is pressed in.
         line = tip_line.raised(config.clearance_m) if config.clearance_m else tip_line
-        if tip_line.length < config.touch.arc_m + config.contact.end_window_m:
+        if tip_line.length < config.touch.arc_m + config.gap.end_window_m:
             return _fault(
                 state, sample.time, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short to be felt."
             )
@@ -105,9 +106,10 @@ def _fault(state: WeldingState, now: float, reason: str) -> WeldingState:
 
 def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
     """What stops a weld at any moment: a hidden tag, or a tip pushed too far."""
+    faults = config.faults
     if state.phase in (Phase.DONE, Phase.FAULT):
         return state
-    if state.stood > config.contact.hidden_s:
+    if state.stood > faults.hidden_s:
         # The arm goes on meanwhile, and by its clock no frame is ever late.
         text = f"The robot's clock has stood still for {state.stood:.2f} s; check the robot's connection."
         return _fault(state, sample.time, text)
@@ -116,11 +118,11 @@ def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Wel
         return _fault(state, sample.time, text)
     # Past the seam's end the tip has nothing more to say, and the tag is not needed.
     blind = sample.time - max(state.frame_time, state.started)
-    if state.phase != Phase.FINISH and blind > config.contact.hidden_s:
+    if state.phase != Phase.FINISH and blind > faults.hidden_s:
         text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
         return _fault(state, sample.time, text)
     # No two readings of a tag are alike to the last bit, unless they are of one picture told again with a new time.
-    if state.same_readings >= config.contact.frozen_frames:
+    if state.same_readings >= faults.frozen_frames:
         text = f"The finger camera repeats one picture ({state.same_readings} readings alike); restart the camera."
         return _fault(state, sample.time, text)
     return state
@@ -141,7 +143,7 @@ def _touch(
     if problem is not None:
         return _rest(_fault(state, sample.time, problem), sample, config)
     state = _slewed(state, lateral, upward, config, dt)
-    speed_up = config.tip_acceleration_m_s2 * dt
+    speed_up = config.limits.tip_acceleration_m_s2 * dt
     state = changed(state, v_tip=clip(along, state.v_tip - speed_up, state.v_tip + speed_up))
     V = np.concatenate([np.zeros(3), state.v_tip * seam.tangent + state.u_n * seam.normal + state.u_a * seam.up])
     if seated and feels_start:
@@ -161,7 +163,7 @@ def _touch(
 
 def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> WeldingState:
     """What a new frame means for the phase."""
-    limits = config.contact
+    limits, end_window = config.contact, config.gap.end_window_m
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
@@ -173,11 +175,11 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
         if not lost:
             return with_point(state, config)
         state = changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
-        if state.s_tip > state.s_end - limits.end_window_m:
+        if state.s_tip > state.s_end - end_window:
             assert before.measurement is not None
             assert state.plan_fit is not None
             last = state.plan_fit.curve.nearest(before.measurement.point, state.s_tip)
-            low, high = state.s_end - limits.end_window_m, state.s_end + limits.end_window_m
+            low, high = state.s_end - end_window, state.s_end + end_window
             return changed(_finish(state), s_end=clip(last, low, high))
         return changed(
             state,
@@ -229,12 +231,10 @@ def _weld(
     gap = p_BT - seam.position
     off = np.array((dot(gap, seam.normal), dot(gap, seam.up)))
     state = changed(state, s_tip=s_tip)
-    if state.phase == Phase.COAST and s_tip - state.lost_at > config.contact.coast_m:
-        text = (
-            f"Contact lost for {1e3 * config.contact.coast_m:.0f} mm in the middle of the seam; check the groove there."
-        )
+    if state.phase == Phase.COAST and s_tip - state.lost_at > config.gap.coast_m:
+        text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
         return _rest(_fault(state, sample.time, text), sample, config)
-    beyond = config.contact.end_window_m if state.phase == Phase.TRACK else 0.0
+    beyond = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0
     if law.guarded and state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
         # Still in contact so far beyond the plan's end: the seam ends no earlier than here.
         state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK else state)
@@ -265,11 +265,11 @@ def _weld(
     problem = problem or _angles(sample, target, config)
     if problem is not None and (state.torch_on or state.phase == Phase.COAST):
         return _rest(_fault(state, sample.time, problem), sample, config)
-    if state.torch_on and error > config.torch_error_max_m:
+    if state.torch_on and error > config.faults.torch_error_m:
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(_fault(state, sample.time, text), sample, config)
     # Once lit it burns to the end: the plan may still move back under a torch that has just passed its start.
-    lit = state.torch_on or (target.s >= _start_arc(state, curve) and error < config.ignition_error_m)
+    lit = state.torch_on or (target.s >= _start_arc(state, curve) and error < config.torch.ignition_error_m)
     burning = lit and target.s < state.s_end
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
     state = changed(state, torch_on=burning, lit_at=lit_at)
@@ -296,14 +296,15 @@ def _start_arc(state: WeldingState, curve: SeamCurve) -> float:
 
 def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfig) -> tuple[WeldingState, str | None]:
     """Whether the torch still comes along: half a millimetre in `stall_s`, or the weld is stopped."""
+    faults = config.faults
     since, s = state.advanced
     if abs(s_torch - s) > 0.5e-3:
         return changed(state, advanced=(now, s_torch)), None
-    if now - since <= config.stall_s:
+    if now - since <= faults.stall_s:
         return state, None
     return (
         state,
-        f"The torch has stood at {1e3 * s_torch:.0f} mm for {config.stall_s:.0f} s; check the seam's shape there.",
+        f"The torch has stood at {1e3 * s_torch:.0f} mm for {faults.stall_s:.0f} s; check the seam's shape there.",
     )
 
 
@@ -312,7 +313,7 @@ def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> st
     R = sample.X_BT.rotation().matrix()
     margin = math.radians(5.0)
     travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0))
-    work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.work_angle_rad
+    work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.torch.work_angle_rad
     for name, angle, limit in (
         ("travel", travel, config.windows.travel_rad),
         ("work", work, config.windows.work_rad),
@@ -327,26 +328,26 @@ def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> st
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
     """The tip's wanted lateral and upward speed, m/s: by feel in TRACK, by the moved plan in COAST and FINISH."""
+    deflection = config.deflection
     if state.phase == Phase.TRACK:
         # A late frame says where the tip was, not where it is: its correction fades out.
         fresh = freshness(state, sample.time)
-        seek = config.delta_d_m if state.delta_wanted is None else state.delta_wanted
-        lateral = config.k_p * (seek - state.delta_n)
+        seek = deflection.delta_d_m if state.delta_wanted is None else state.delta_wanted
+        lateral = deflection.k_p * (seek - state.delta_n)
         if state.sunk:
             return fresh * lateral, 0.0
-        return fresh * lateral, fresh * config.k_z * (state.delta_axial - config.axial_d_m)
-    wanted = (
-        state.residual_at_loss + np.array((0.0, -config.contact.hover_m)) if state.phase == Phase.COAST else state.hold
-    )
+        return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
+    wanted = state.residual_at_loss + np.array((0.0, -config.gap.hover_m)) if state.phase == Phase.COAST else state.hold
     gap = wanted - off
-    return config.k_follow * float(gap[0]), config.k_follow * float(gap[1])
+    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1])
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
     """The servo speeds within their limit and slew."""
+    deflection = config.deflection
     top, step = (
-        max(config.servo_speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
-        config.servo_slew_m_s2 * dt,
+        max(deflection.speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
+        deflection.slew_m_s2 * dt,
     )
     u_n = clip(clip(lateral, -top, top), state.u_n - step, state.u_n + step)
     u_a = clip(clip(upward, -top, top), state.u_a - step, state.u_a + step)
@@ -355,7 +356,7 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
 
 def _rest(state: WeldingState, sample: ServoSample, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
     """DONE and FAULT: the last motion fades to nothing; the arc is already off."""
-    share = clip(1.0 - (sample.time - state.stopped_at) / config.ramp_s, 0.0, 1.0)
+    share = clip(1.0 - (sample.time - state.stopped_at) / config.limits.ramp_s, 0.0, 1.0)
     return _answer(changed(state, torch_on=False), share * state.V_stop, config, Diagnostics())
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from pydrake.math import RigidTransform
 
 from weldcal.welding.numerics import Array, clip, cross, dot, norm, unit
-from weldcal.welding.servo.state import ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
 
 
 class ToolAxes(NamedTuple):
@@ -54,5 +54,6 @@ def height_share(axes: ToolAxes, torch_up: Array) -> float:
 
 def roll_rate(axes: ToolAxes, torch_up: Array, config: ServoConfig) -> float:
     """The rate rad/s about the chord that brings the lean across it to the wanted work angle."""
-    lean = math.asin(clip(dot(axes.left, torch_up), -1.0, 1.0)) - config.work_angle_rad
-    return clip(-config.k_roll * lean, -0.3, 0.3)
+    torch = config.torch
+    lean = math.asin(clip(dot(axes.left, torch_up), -1.0, 1.0)) - torch.work_angle_rad
+    return clip(-torch.k_roll * lean, -0.3, 0.3)

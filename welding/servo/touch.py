@@ -10,7 +10,8 @@ from pydrake.math import RigidTransform
 from weldcal.welding.numerics import changed, clip, dot, pose, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.servo.contact import freshness
-from weldcal.welding.servo.state import GainFit, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 
 _TAG_SIGMA_M = 0.05e-3  # what a frame's deflection may be off while the gain is fitted
 _SEATED_FRAMES = 3
@@ -46,13 +47,16 @@ def touch_step(
     Returns:
         (state, wanted lateral speed, wanted upward speed m/s, fault sentence or None, whether the tip is seated).
     """
+    deflection = config.deflection
     touch, t = config.touch, state.touch
     gap = sample.X_BT.translation() - seam.position
     left, height = dot(gap, seam.normal), dot(gap, seam.up)
     deep, fresh = state.delta_axial, freshness(state, sample.time)
-    depth_servo = fresh * clip(config.k_z * (deep - config.axial_d_m), -config.servo_speed_m_s, config.servo_speed_m_s)
+    depth_servo = fresh * clip(
+        deflection.k_z * (deep - deflection.axial_d_m), -deflection.speed_m_s, deflection.speed_m_s
+    )
     # Once it has met the face it may come down by the groove's depth more.
-    floor = (config.tool.tip_drop_m if t.step == "descend" else 0.0) - touch.depth_m - config.axial_d_m
+    floor = (config.tool.tip_drop_m if t.step == "descend" else 0.0) - touch.depth_m - deflection.axial_d_m
     if height < floor:
         return state, 0.0, 0.0, _no_work(state, sample, height, config), False
 
@@ -60,11 +64,11 @@ def touch_step(
         if state.zero is None and touch.zero_frames > 0:
             state, problem = _zeroed(state, sample, is_new, config)
             return state, 0.0, 0.0, problem, False
-        fast = height > config.tool.tip_drop_m + touch.slow_height_m and deep < 0.3 * config.axial_d_m
+        fast = height > config.tool.tip_drop_m + touch.slow_height_m and deep < 0.3 * deflection.axial_d_m
         speed = touch.fast_m_s if fast else touch.slow_m_s
-        if is_new and deep > 0.9 * config.axial_d_m:
+        if is_new and deep > 0.9 * deflection.axial_d_m:
             return _next(state, "settle", sample.time), 0.0, 0.0, None, False
-        down = min(speed, config.k_z * max(0.0, config.axial_d_m - deep) + 0.3e-3)
+        down = min(speed, deflection.k_z * max(0.0, deflection.axial_d_m - deep) + 0.3e-3)
         return state, 0.0, -fresh * down, None, False
 
     assert state.measurement is not None
@@ -123,13 +127,14 @@ def _search(
     config: ServoConfig,
     now: float,
 ) -> tuple[WeldingState, float, float, str | None, bool]:
+    deflection = config.deflection
     touch, t = config.touch, state.touch
     half_drop = 0.5 * config.tool.tip_drop_m
     dropped = tip_height < t.face_height - half_drop or tip_height < half_drop
-    leaning = state.delta_n > 0.9 * config.delta_d_m
+    leaning = state.delta_n > 0.9 * deflection.delta_d_m
     frames = t.seated_frames
     if is_new:
-        pressed = abs(state.delta_axial - config.axial_d_m) < 0.25 * config.axial_d_m
+        pressed = abs(state.delta_axial - deflection.axial_d_m) < 0.25 * deflection.axial_d_m
         frames = frames + 1 if leaning and (pressed or not dropped) else 0
         t = replace(t, seated_frames=frames)
         state = changed(state, touch=t)
@@ -149,8 +154,8 @@ def _search(
         text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the work again."
         return state, 0.0, 0.0, text, False
     # While the tip falls there is little holding it down: wait for the depth servo, or it climbs out over the far wall.
-    held = fresh * clip(2.0 * state.delta_axial / config.axial_d_m - 0.5, 0.0, 1.0)
-    lateral = clip(config.k_p * (config.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
+    held = fresh * clip(2.0 * state.delta_axial / deflection.axial_d_m - 0.5, 0.0, 1.0)
+    lateral = clip(deflection.k_p * (deflection.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
     return state, held * lateral, depth_servo, None, False
 
 
@@ -161,16 +166,17 @@ def _press(
     state: WeldingState, sample: ServoSample, is_new: bool, left: float, seam: SeamFrame, config: ServoConfig
 ) -> tuple[WeldingState, float, float, str | None, bool]:
     """Press against the seated tip and back: its wall does not move, so deflection per motion is the tag's gain."""
+    deflection = config.deflection
     touch, t = config.touch, state.touch
     following, sign = _LEGS[t.step]
     if is_new and state.measurement is not None and state.measurement.capture_time >= t.since - 1.0:
         x = dot(state.measurement.p_BT - seam.position, seam.normal)
         t = replace(t, gain_fit=_add(t.gain_fit, x, state.delta_n))
         state = changed(state, touch=t)
-    target = t.start_left + sign * (touch.press_ratio - 1.0) * config.delta_d_m
+    target = t.start_left + sign * (touch.press_ratio - 1.0) * deflection.delta_d_m
     gap = target - left
     if abs(gap) > 0.05e-3:
-        return state, clip(config.k_p * gap, -touch.press_m_s, touch.press_m_s), 0.0, None, False
+        return state, clip(deflection.k_p * gap, -touch.press_m_s, touch.press_m_s), 0.0, None, False
     if following:
         return _next(state, following, sample.time, t.start_left), 0.0, 0.0, None, False
     return changed(state, gain=_gain(t.gain_fit, config)), 0.0, 0.0, None, True

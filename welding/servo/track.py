@@ -13,7 +13,8 @@ from weldcal.welding.numerics import Array, box_least_squares, clip, cross, dot,
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.seam.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.servo.guards import SeamConditioning, seam_conditioning
-from weldcal.welding.servo.state import ServoConfig, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
@@ -105,7 +106,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
             # Round a sharp corner the bend here says little of the path a moment later, and a turn of the torch's way takes
             # a ramp at the limit of the turning rate, of which half counts as lag.
             speed = config.weld_speed_m_s
-            ramp = speed / (config.tool.torch_offset_m * config.omega_acceleration_rad_s2)
+            ramp = speed / (config.tool.torch_offset_m * config.limits.omega_acceleration_rad_s2)
             then = local_fit(
                 seam,
                 arc + speed * (config.lag_s + 0.5 * ramp),
@@ -195,13 +196,14 @@ def guarded_motion(
         target: of the torch.
         servo: the tip's lateral and upward speeds, m/s.
     """
+    limits, torch, weights = config.limits, config.torch, config.weights
     axes = tool_axes(X_BT, tip.up, target.up, config)
     u, m, a, d, up = axes.along, axes.across, axes.yaw, axes.d, axes.up
     t, n, b = target.tangent, target.normal, target.up
     e = axes.torch - target.point
-    limit = config.feedback_limit_m
-    back_n = target.rate - config.k_b * clip(dot(e, n), -limit, limit)
-    back_b = -config.k_h * clip(dot(e, b), -limit, limit)
+    limit = torch.feedback_limit_m
+    back_n = target.rate - torch.k_b * clip(dot(e, n), -limit, limit)
+    back_b = -torch.k_h * clip(dot(e, b), -limit, limit)
 
     # What is commanded now is done a robot's lag later: the rows look that far ahead along the path.
     turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.6, 0.6)
@@ -221,30 +223,30 @@ def guarded_motion(
 
     speed = config.weld_speed_m_s
     radius = 1.0 / max(abs(tip.curvature), 1e-6)
-    top = min(config.tip_speed_max_m_s, max(config.tip_speed_floor * speed, config.turn_rate_max_rad_s * radius))
-    dv, dw, w_top = config.tip_acceleration_m_s2 * dt, config.omega_acceleration_rad_s2 * dt, config.omega_max_rad_s
+    top = min(limits.tip_speed_max_m_s, max(limits.tip_speed_floor * speed, limits.turn_rate_max_rad_s * radius))
+    dv, dw, w_top = (limits.tip_acceleration_m_s2 * dt, limits.omega_acceleration_rad_s2 * dt, limits.omega_max_rad_s)
     # Where the tip would have to move square to the torch's way, or against it, speed at the torch is no reason to
     # stand: the tip creeps round, and the torch waits.
-    creep = config.creep * speed * clip(1.0 - 10.0 * dot(tb, u), 0.0, 1.0)
+    creep = limits.creep * speed * clip(1.0 - 10.0 * dot(tb, u), 0.0, 1.0)
     # Chord just past square to the torch's way: the rest point may give back a little, within what friction holds.
     given_back = state.furthest - state.progress
     least = (
-        creep if creep > 0.0 else -config.give_back_m_s * clip(2.0 - 2.0 * given_back / config.give_back_m, 0.0, 1.0)
+        creep if creep > 0.0 else -limits.give_back_m_s * clip(2.0 - 2.0 * given_back / limits.give_back_m, 0.0, 1.0)
     )
     v_low = min(max(least, state.v_tip - dv), state.v_tip + dv)
     v_high = max(v_low, min(top, state.v_tip + dv))
     w_low, w_high = max(-w_top, state.omega - dw), min(w_top, state.omega + dw)
     v, w = box_least_squares(
         (
-            (config.weight_lateral, n_v, n_w, back_n - n_0),
-            (config.weight_torch_speed, t_v, t_w, speed - t_0),
-            (config.weight_omega, 0.0, d, 0.0),
-            (config.weight_tip_speed, 1.0, 0.0, speed),
+            (weights.lateral, n_v, n_w, back_n - n_0),
+            (weights.torch_speed, t_v, t_w, speed - t_0),
+            (weights.omega, 0.0, d, 0.0),
+            (weights.tip_speed, 1.0, 0.0, speed),
         ),
         (v_low, v_high),
         (w_low, max(w_low, w_high)),
     )
-    w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
+    w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
 
     # Roll about the level chord goes to the work angle; what yaw about a tilted tool axis adds to it is taken off.
     level = unit(u - dot(u, up) * up, u)

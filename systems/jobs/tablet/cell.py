@@ -30,7 +30,7 @@ from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.welding.servo.guards import SlewLimits
-from weldcal.welding.servo.state import ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
 
 Array = NDArray[np.float64]
 PEN_BODY_M = 0.006  # radius of the pen where moves are to keep clear of the table

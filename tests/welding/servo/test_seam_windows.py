@@ -16,7 +16,8 @@ from weldcal.welding.numerics import changed
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, assess_seam, check_feasible, split_seam
-from weldcal.welding.servo.state import Phase, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
 
