@@ -1,4 +1,4 @@
-"""What one finger-camera frame says: where the tip is, how hard it leans, and whether it still touches."""
+"""Updates the servo's state from finger-camera frames: tip point, deflection, contact and tactile points."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
 
 
 def freshness(state: WeldingState, time: float) -> float:
-    """How much the newest frame still says of the tip at a time s: 1 up to three periods of the camera, 0 from six on."""
+    """Weight of the newest frame at a time s: 1 up to three camera periods of age, 0 from six on."""
     return clip(2.0 - (time - max(state.frame_time, state.started)) / 0.1, 0.0, 1.0)
 
 
@@ -38,13 +38,13 @@ def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config
     deflection = (frame.deflection_T if state.zero is None else frame.deflection_T - state.zero) / state.gain
     X_BT = frame.X_BT_at_capture
     point = tip_point(X_BT, deflection)
-    # The published laws go by the plan's frame alone.
-    minded = state.proven and config.law == "guarded"
-    felt = felt_turn(state, point, seam, config) if minded else 0.0
+    # The published laws use the plan's frame alone.
+    corrects_frame = state.proven and config.law == "guarded"
+    felt = felt_turn(state, point, seam, config) if corrects_frame else 0.0
     seam = turned(seam, felt)
     p_BT = np.asarray(X_BT.translation())
     delta = p_BT - point
-    steer = _steering(state, delta, seam, config) if minded else 0.0
+    steer = _steering(state, delta, seam, config) if corrects_frame else 0.0
     seam = turned(seam, steer)
     delta_n, delta_axial = dot(delta, seam.normal), -dot(delta, seam.up)
     same = state.reading is not None and bool(np.array_equal(frame.deflection_T, state.reading))
@@ -70,16 +70,16 @@ def turned(seam: SeamFrame, angle: float) -> SeamFrame:
 
 
 def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoConfig) -> float:
-    """How far the path just felt turns from the plan's tangent, rad about up; zero where they agree.
+    """Angle from the plan's tangent to the direction of the last tactile points, rad about up; zero where they agree.
 
     A plan rounds its corners, and beside a rounded corner its tangent is wrong by half of the turn. The direction of
-    the last points is noisier than the plan's, so that it is believed only where the two plainly differ.
+    the last points is noisier than the plan's, so it is used only where the two differ clearly.
     """
     felt_path = config.felt_path
     seam = state.refined
     points = [point, *(q.point for q in reversed(seam.pending))]
-    # Going over ground that was felt on the way back, the last points committed lie ahead.
-    if not (seam.pending and len(seam) and seam.pending[0].arc + seam.sprung < seam.arc[-1]):
+    # On a stretch that was measured backwards the last committed points lie ahead.
+    if not (seam.pending and len(seam) and seam.pending[0].arc + seam.jumped < seam.arc[-1]):
         points += [*seam.points[-1:-13:-1]]
     x, y = [0.0], [0.0]
     for earlier in points[1:]:
@@ -96,7 +96,7 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
     yy = sum((v - my) ** 2 for v in y)
     xy = sum((v - mx) * (w - my) for v, w in zip(x, y, strict=True))
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    # The principal axis has no sense; the way from the earliest to the newest point has.
+    # The principal axis has no direction; the path from the earliest to the newest point has.
     if math.cos(angle) * x[-1] + math.sin(angle) * y[-1] > 0.0:
         angle = math.remainder(angle + math.pi, 2.0 * math.pi)
     share = (abs(angle) - felt_path.dead_rad) / (felt_path.full_rad - felt_path.dead_rad)
@@ -104,10 +104,10 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
 
 
 def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoConfig) -> float:
-    """How far to turn the tip's frame about up, rad, where the deformation contradicts the plan's normal.
+    """Angle to turn the tip's frame about up, rad, where the deformation contradicts the plan's normal.
 
-    The tip leans against what stops it. When that is far from the plan's normal the plan is wrong there, and pressing
-    on along its tangent would jam the tip; friction's steady drag is no such evidence. Two things explain the lean: a
+    The tip leans against the wall that stops it. A lean far from the plan's normal shows that the plan is wrong there, and
+    moving on along its tangent would jam the tip; steady drag by friction is not such evidence. Two causes explain the lean: a
     plan that is ahead or behind at a corner, whose own tangent nearby then leaves no lean; or a wall where none is
     planned, to which the frame turns.
     """
@@ -130,7 +130,7 @@ def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoC
 
 
 def beyond_limit(state: WeldingState, config: ServoConfig) -> bool:
-    """Whether the newest frame shows the tip pushed beyond what its springs allow."""
+    """Whether the newest frame shows a deflection beyond the tip's mechanical limits."""
     if state.measurement is None:
         return False
     lateral = math.sqrt(max(0.0, norm(state.measurement.delta) ** 2 - state.delta_axial**2))
@@ -139,11 +139,11 @@ def beyond_limit(state: WeldingState, config: ServoConfig) -> bool:
 
 
 def contact_lost(before: WeldingState, now: WeldingState, config: ServoConfig) -> bool:
-    """Whether contact went between two frames: abrupt unloading, or too little deflection to call it contact."""
+    """Whether contact was lost between two frames: abrupt unloading, or too little deflection."""
     limits = config.contact
     if not now.proven:
         return now.delta_axial < 0.5 * limits.regain_axial_m
-    # Both springs let go at once; one falling alone is a noisy frame or a rough wall.
+    # Both springs unload at once; one alone is a noisy frame or a rough wall.
     unloaded = min(before.delta_n - now.delta_n, before.delta_axial - now.delta_axial) > limits.drop_m
     return unloaded or now.delta_n < limits.normal_min_m or now.delta_axial < limits.axial_min_m
 

@@ -1,4 +1,4 @@
-"""How far the soft tip is pushed: an ArUco tag behind the tip, seen by the finger camera, gives a displacement."""
+"""Measures the soft tip's displacement from an ArUco tag behind it, seen by the finger camera."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class TagLimits:
 
 @dataclass(frozen=True)
 class TagObservation:
-    """One look at the tag.
+    """The result of one tag detection.
 
     Attributes:
         valid: whether `X_KM` can be used.
@@ -103,7 +103,7 @@ def _detector(name: str, refine: bool) -> Any:
 
 
 def _corners(grey: NDArray[np.uint8], tag: TagModel, refine: bool) -> list[Array]:
-    """Corners (4, 2) px of each copy of the tag in the picture."""
+    """Corners (4, 2) px of each copy of the tag in the image."""
     found, ids, _ = _detector(tag.dictionary, refine).detectMarkers(grey)
     if ids is None:
         return []
@@ -113,7 +113,7 @@ def _corners(grey: NDArray[np.uint8], tag: TagModel, refine: bool) -> list[Array
 
 
 def _sharpened(grey: NDArray[np.uint8], corners: Array, tag: TagModel) -> Array:
-    """The corners by the tag's sides, or refined one by one where a side is covered or runs out of the picture."""
+    """The corners from the tag's sides, or refined one by one where a side is covered or outside the image."""
     by_sides = corners_from_sides(grey, corners, int(_dictionary(tag.dictionary).markerSize) + 2)
     if by_sides is not None:
         return by_sides
@@ -153,8 +153,8 @@ def detect_tag(
     """Find `tag` in one image and its pose in the camera.
 
     ArUco corners refined to a hundredth of a pixel by the tag's sides, IPPE for a square, then Levenberg-Marquardt on the reprojection.
-    A tag square to the camera may tip either way (two poses explain it): its translation, which is all that
-    `deflection_from_tag` uses, is the same in both.
+    Two poses explain a tag that is nearly parallel to the image: their translation, which is all that
+    `deflection_from_tag` uses, is the same.
 
     Args:
         image: (H,W) or (H,W,3|4) uint8, RGB(A).
@@ -164,7 +164,7 @@ def detect_tag(
         distortion: OpenCV's coefficients, None for none.
 
     Raises:
-        TagError: the image or camera matrix is not one.
+        TagError: the image or the camera matrix is invalid.
     """
     bounds = limits or TagLimits()
     K = np.asarray(camera_matrix, dtype=float)
@@ -174,7 +174,7 @@ def detect_tag(
     grey = _grey(image)
     hits = _corners(grey, tag, refine=False)
     if not hits:
-        return TagObservation(False, f"Tag {tag.id} is not in sight of the finger camera.")
+        return TagObservation(False, f"Tag {tag.id} is not visible to the finger camera.")
     if len(hits) > 1:
         return TagObservation(False, f"Tag {tag.id} is seen {len(hits)} times; it must be unique.")
     corners = _sharpened(grey, hits[0], tag)
@@ -230,12 +230,12 @@ def deflection_from_tag(
 
 
 def corners_from_sides(grey: NDArray[np.uint8], corners: Array, cells: int) -> Array | None:
-    """Where the four sides of a black square on white cross, (4, 2) px; None where they cannot be seen well enough.
+    """Locate the corners (4, 2) px of a black square on white as intersections of its sides; None where a side is not visible.
 
     Corner refinement looks at a few pixels round each corner, and where blur rounds the corner or the print differs on its two
-    sides it is drawn outwards: a tag of 112 px reads half a pixel too large, which is 0.2 mm in 40 mm of distance. Across a
-    whole side the blur is symmetric: the grey that a profile holds in all says where its edge is (the area under a
-    blurred step is that of the step, whatever the blur), and a side has a hundred pixels to say it.
+    sides they move outwards: a tag of 112 px reads half a pixel too large, which is 0.2 mm in 40 mm of distance. Across a
+    whole side the blur is symmetric: the total grey of a profile gives the position of its edge (the area under a
+    blurred step equals that of the step, whatever the blur), averaged over a hundred pixels of a side.
 
     Args:
         grey: (H, W) uint8.
@@ -278,7 +278,7 @@ def corners_from_sides(grey: NDArray[np.uint8], corners: Array, cells: int) -> A
 
 
 def _edge_offsets(profiles: Array, across: Array) -> Array | None:
-    """How far outwards each profile's edge lies, (4, PROFILES) px, from the share of it that is dark."""
+    """Outward offset of each profile's edge, (4, PROFILES) px, from its dark share."""
     k = max(2, profiles.shape[2] // 5)
     dark, light = np.median(profiles[:, :, :k], axis=(1, 2)), np.median(profiles[:, :, -k:], axis=(1, 2))
     if np.min(light - dark) < LEAST_CONTRAST:
@@ -290,7 +290,7 @@ def _edge_offsets(profiles: Array, across: Array) -> Array | None:
 
 
 def _lines(start: Array, end: Array, outward: Array, along: Array, offset: Array) -> Array:
-    """Homogeneous lines (4, 3) through the edge points of the sides; a point that strays (a scratch, a speck) does not count."""
+    """Homogeneous lines (4, 3) through the edge points of the sides; outliers (a scratch, a speck) are excluded."""
     weight = np.ones_like(offset)
     for _ in range(3):
         total = weight.sum(axis=1, keepdims=True)

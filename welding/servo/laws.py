@@ -1,4 +1,4 @@
-"""The steering laws by name: the paper's as printed and as mended step by step, and the guarded one."""
+"""The steering laws by name: the paper's as printed, its corrections step by step, and the guarded law."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.servo.track import Motion, TorchTarget, guarded_motion
 
-_OMEGA_CEILING = 100.0  # rad/s; an unguarded law asks for thousands, no robot turns by more than this in a tick
+_OMEGA_CEILING = 100.0  # rad/s; an unguarded law may command thousands, which no robot reaches
 
 MotionLaw = Callable[
     [WeldingState, RigidTransform, SeamFrame, TorchTarget, tuple[float, float], ServoConfig, float], Motion
@@ -33,11 +33,11 @@ class UnknownLaw(InputError):
 
 @dataclass(frozen=True)
 class SteeringLaw:
-    """One law of the comparison.
+    """One steering law and how it differs from the paper's.
 
     Attributes:
-        name: as in ServoConfig.law; words: what it is, for tables.
-        guarded: ours, with its phases; the paper's knows no gap and no end.
+        name: as in ServoConfig.law; summary: what it is, for tables.
+        guarded: the law with phases for gaps and ends, which the paper's does not have.
         sign: of omega; -1 as printed. fitted: normal from a local fit, else from the two points beside the nearest.
         feedback: whether the torch's offset is fed back.
         damping: of the division by n_d . n_t (0: as printed); omega_limit: clip, rad/s.
@@ -45,7 +45,7 @@ class SteeringLaw:
     """
 
     name: str
-    words: str
+    summary: str
     guarded: bool = False
     sign: float = 1.0
     fitted: bool = True
@@ -58,13 +58,13 @@ class SteeringLaw:
 LAWS: dict[str, SteeringLaw] = {
     law.name: law
     for law in (
-        SteeringLaw("guarded", "ours: torch speed first, box-constrained, guarded phases", guarded=True),
+        SteeringLaw("guarded", "guarded: torch speed first, box-constrained, with phases", guarded=True),
         SteeringLaw("printed", "Algorithm 2 as printed", sign=-1.0, feedback=False),
-        SteeringLaw("literal", "sign mended, normal from neighbouring points", fitted=False, feedback=False),
-        SteeringLaw("open", "sign mended, fitted normal, no feedback", feedback=False),
-        SteeringLaw("fixed", "sign mended, fitted normal, torch position fed back"),
-        SteeringLaw("fixed_zeroed", "the same; delta_d goes to zero where contact does", lost="zeroed"),
-        SteeringLaw("dls", "the same, division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8),
+        SteeringLaw("literal", "sign corrected, normal from neighbouring points", fitted=False, feedback=False),
+        SteeringLaw("open", "sign corrected, fitted normal, no feedback", feedback=False),
+        SteeringLaw("fixed", "sign corrected, fitted normal, torch position fed back"),
+        SteeringLaw("fixed_zeroed", "as fixed; delta_d set to zero where contact is lost", lost="zeroed"),
+        SteeringLaw("dls", "as fixed; division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8),
     )
 }
 
@@ -81,7 +81,7 @@ def get_law(name: str) -> SteeringLaw:
 
 
 def motion_law(law: SteeringLaw) -> MotionLaw:
-    """What turns a tick's target into motion under a law."""
+    """The function that computes one tick's motion under a law."""
     if law.guarded:
         return guarded_motion
 

@@ -49,7 +49,7 @@ class ToolGeometry:
 
 @dataclass(frozen=True)
 class TouchConfig:
-    """The search for the groove.
+    """The touch-on: descent, search for the groove, gain calibration and zero.
 
     Attributes:
         arc_m: where along the seam the tip touches; offset_m: how far to the -n side of the plan it comes down.
@@ -60,10 +60,10 @@ class TouchConfig:
         settle_s: pause on the face before the search.
         calibrate_gain: press to `press_ratio` times the wanted deflection and back, and fit the tag's gain.
         press_m_s: speed of that; gain_sigma: prior sigma of the gain about 1.
-        feel_start: draw the seated tip back over the seam's start before the weld, so that the torch has felt points to
-            begin on and the arc starts where the groove does (welding.feel_start).
-        zero_frames: frames of the free tip, before the descent, whose mean is taken for its rest (0: the tag's own rest
-            pose is); zero_limit_m: a larger mean, or as large a spread, is no free tip.
+        feel_start: draw the seated tip back over the seam's start before the weld, so that the torch has tactile points to
+            start on and the arc starts where the groove does (welding.servo.feel_start).
+        zero_frames: frames of the free tip, before the descent, whose mean is taken as its rest (0: the tag's own
+            rest pose is); zero_limit_m: with a larger mean or spread the tip is not free.
     """
 
     arc_m: float = 6.0e-3
@@ -132,7 +132,7 @@ class FaultLimits:
 
     Attributes:
         lateral_m, axial_m: mechanical limits of the tip's deflection.
-        hidden_s: longest time without a valid view of the tag; frozen_frames: most frames with exactly the same reading.
+        hidden_s: longest time without a valid view of the tag; frozen_frames: identical readings in so many frames are a fault.
         stall_s: time in which the torch must advance by half a millimetre.
         torch_error_m: largest distance of the burning torch from the seam.
     """

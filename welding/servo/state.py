@@ -28,7 +28,7 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class DeflectionSample:
-    """One finger-camera frame: when it was taken, where T was then, the tip's displacement from rest in T (m)."""
+    """One finger-camera frame: its capture time, the pose of T then, and the tip's displacement from rest in T (m)."""
 
     capture_time: float
     X_BT_at_capture: RigidTransform
@@ -47,7 +47,7 @@ class ServoSample:
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What the tick saw; NaN where a phase has no such thing.
+    """Measured and commanded values of one tick; NaN where a phase has none.
 
     Attributes:
         e_t, e_height: torch off the refined seam, to the left and up, m.
@@ -78,7 +78,7 @@ class Diagnostics:
 
 @dataclass(frozen=True)
 class WeldingCommand:
-    """One servo tick's answer: V_BT (6,) = [omega; v] of T in B, the torch, the phase, and why it stopped."""
+    """One servo tick's output: V_BT (6,) = [omega; v] of T in B, the torch, the phase, and the reason of a stop."""
 
     V_BT: Array
     torch_on: bool
@@ -88,7 +88,7 @@ class WeldingCommand:
 
 
 class Measurement(NamedTuple):
-    """The newest valid frame, in the base: time, tip point m, delta = P_r - P_s m, and T's place m (each (3,))."""
+    """The newest valid frame, in the base: time, tip point m, delta = P_r - P_s m, and T's position m (each (3,))."""
 
     capture_time: float
     point: Array
@@ -108,8 +108,8 @@ class GainFit(NamedTuple):
 
 @dataclass(frozen=True)
 class TouchState:
-    """Where the search is: its step, the step's start, heights and lateral place; `free`: deflections of the free tip;
-    `felt`: points felt on the way back to the start, each with how far ahead of its rest point friction held the tip."""
+    """State of the touch search: its step, the step's start, heights and lateral place; `free`: deflections of the free tip;
+    `felt`: points measured on the way back to the start, each with how far ahead of its rest point friction held the tip."""
 
     step: str = "descend"
     since: float = 0.0
@@ -123,12 +123,12 @@ class TouchState:
 
 @dataclass(frozen=True)
 class WeldingState:
-    """Everything the servo remembers. `WeldingState()` is the start of a weld."""
+    """State of the servo between ticks; `WeldingState()` is the start of a weld."""
 
     phase: Phase = Phase.TOUCH
     reason: str | None = None
     time: float | None = None
-    stood: float = 0.0
+    clock_stopped_s: float = 0.0
     started: float = 0.0
     plan_fit: PlanFit | None = None
     refined: RefinedSeam = field(default_factory=RefinedSeam.empty)
@@ -142,7 +142,7 @@ class WeldingState:
     delta_n: float = 0.0
     delta_axial: float = 0.0
     delta_wanted: float | None = None
-    sunk: bool = False
+    axial_paused: bool = False
     regained: int = 0
     proven: bool = False
     progress: float = 0.0

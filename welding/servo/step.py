@@ -1,4 +1,4 @@
-"""The welding servo: one pure step from what is felt and where the tool is to its motion and the arc."""
+"""The welding servo as one pure step: from the measured deflection and pose to the tool's motion and the arc."""
 
 from __future__ import annotations
 
@@ -57,8 +57,10 @@ def welding_step(
         state = _begin(state, sample, plan, config)
     if not finite(sample.X_BT.translation()):
         state = _fault(state, sample.time, "The robot's pose is not a number; check the robot's connection.")
-    stood = state.stood + config.period_s if state.time is not None and sample.time <= state.time else 0.0
-    state = changed(state, time=sample.time, stood=stood)
+    clock_stopped_s = (
+        state.clock_stopped_s + config.period_s if state.time is not None and sample.time <= state.time else 0.0
+    )
+    state = changed(state, time=sample.time, clock_stopped_s=clock_stopped_s)
 
     is_new = state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
     before = state
@@ -78,11 +80,11 @@ def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: Se
     tool = config.tool
     try:
         tip_line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
-        # Rest point and torch run beside the tip's line, lower by what the tip is pressed in.
+        # Rest point and torch run along the tip's line, lower by the axial deflection.
         line = tip_line.raised(config.clearance_m) if config.clearance_m else tip_line
         if tip_line.length < config.touch.arc_m + config.gap.end_window_m:
             return _fault(
-                state, sample.time, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short to be felt."
+                state, sample.time, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short for the touch-on."
             )
         check_feasible(line, tool.torch_offset_m, config.weld_speed_m_s, config.windows)
     except (InfeasibleSeam, SeamError) as problem:
@@ -98,32 +100,32 @@ def _frame_at_tip(state: WeldingState) -> SeamFrame:
 
 
 def _fault(state: WeldingState, now: float, reason: str) -> WeldingState:
-    """The first fault is kept; the arc goes off in this very tick."""
+    """Enter FAULT with a reason and the arc off in this tick; the first fault is kept."""
     if state.phase == Phase.FAULT:
         return state
     return changed(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_at=now)
 
 
 def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
-    """What stops a weld at any moment: a hidden tag, or a tip pushed too far."""
+    """Check the faults of every phase: stopped clock, deflection beyond its limit, hidden tag, frozen camera."""
     faults = config.faults
     if state.phase in (Phase.DONE, Phase.FAULT):
         return state
-    if state.stood > faults.hidden_s:
-        # The arm goes on meanwhile, and by its clock no frame is ever late.
-        text = f"The robot's clock has stood still for {state.stood:.2f} s; check the robot's connection."
+    if state.clock_stopped_s > faults.hidden_s:
+        # The arm may still move, and by a stopped clock no frame is ever late.
+        text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
         return _fault(state, sample.time, text)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
         return _fault(state, sample.time, text)
-    # Past the seam's end the tip has nothing more to say, and the tag is not needed.
+    # Past the seam's end the tip is not used, so the tag is not needed.
     blind = sample.time - max(state.frame_time, state.started)
     if state.phase != Phase.FINISH and blind > faults.hidden_s:
         text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
         return _fault(state, sample.time, text)
-    # No two readings of a tag are alike to the last bit, unless they are of one picture told again with a new time.
+    # Identical readings to the last bit mean one picture repeated with new times.
     if state.same_readings >= faults.frozen_frames:
-        text = f"The finger camera repeats one picture ({state.same_readings} readings alike); restart the camera."
+        text = f"The finger camera repeats one picture ({state.same_readings} identical readings); restart the camera."
         return _fault(state, sample.time, text)
     return state
 
@@ -162,15 +164,17 @@ def _touch(
 
 
 def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> WeldingState:
-    """What a new frame means for the phase."""
+    """Change the phase by the contact that a new frame shows."""
     limits, end_window = config.contact, config.gap.end_window_m
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
         if not law.guarded:
-            # The paper appends every point, and knows of no contact; what it seeks without one depends on the reading.
+            # The paper appends every point and does not detect contact; the wanted deflection without contact is an interpretation.
             return changed(
-                with_point(state, config), delta_wanted=0.0 if lost and law.lost == "zeroed" else None, sunk=lost
+                with_point(state, config),
+                delta_wanted=0.0 if lost and law.lost == "zeroed" else None,
+                axial_paused=lost,
             )
         if not lost:
             return with_point(state, config)
@@ -189,7 +193,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             residual_at_loss=_tip_residual(state),
         )
     if state.phase == Phase.COAST:
-        # Just after the loss the springs are still relaxing: that is no new contact.
+        # Just after the loss the springs are still relaxing: that is not a new contact.
         waited = state.frame_time - state.lost_time > limits.regain_after_s
         settled = waited and state.s_tip - state.lost_at > limits.regain_after_m
         touching = settled and state.delta_axial > limits.regain_axial_m
@@ -201,7 +205,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
 
 
 def _tip_residual(state: WeldingState) -> Array:
-    """How far the newest tactile points lie off the moved plan, (2,) m to the left and up."""
+    """Mean offset of the newest tactile points from the moved plan, (2,) m to the left and up."""
     assert state.plan_fit is not None
     points, curve = state.refined.points[-8:], state.plan_fit.curve
     if not len(points):
@@ -224,7 +228,7 @@ def _weld(
     p_BT = np.asarray(sample.X_BT.translation())
     at = p_BT
     if state.phase == Phase.TRACK and state.measurement is not None:
-        # Inside a corner the tool cuts it, and is beside the second leg while the tip is still on the first.
+        # The tool cuts a corner on its inside and is next to the second leg while the tip is still on the first.
         at = state.measurement.point + (p_BT - state.measurement.p_BT)
     s_tip = curve.nearest(at, state.s_tip)
     seam = curve.frame(s_tip)
@@ -236,7 +240,7 @@ def _weld(
         return _rest(_fault(state, sample.time, text), sample, config)
     beyond = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0
     if law.guarded and state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
-        # Still in contact so far beyond the plan's end: the seam ends no earlier than here.
+        # Still in contact this far beyond the plan's end: the seam does not end before this point.
         state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
         state = changed(state, hold=off)
@@ -268,7 +272,7 @@ def _weld(
     if state.torch_on and error > config.faults.torch_error_m:
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(_fault(state, sample.time, text), sample, config)
-    # Once lit it burns to the end: the plan may still move back under a torch that has just passed its start.
+    # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
     lit = state.torch_on or (target.s >= _start_arc(state, curve) and error < config.torch.ignition_error_m)
     burning = lit and target.s < state.s_end
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
@@ -290,12 +294,12 @@ def _weld(
 
 
 def _start_arc(state: WeldingState, curve: SeamCurve) -> float:
-    """Where the arc is to be lit, m along the moved plan: where the groove was felt to begin, else where planned."""
+    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned one."""
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
 def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfig) -> tuple[WeldingState, str | None]:
-    """Whether the torch still comes along: half a millimetre in `stall_s`, or the weld is stopped."""
+    """Check that the torch advances by half a millimetre in `stall_s`; otherwise return a fault sentence."""
     faults = config.faults
     since, s = state.advanced
     if abs(s_torch - s) > 0.5e-3:
@@ -309,7 +313,7 @@ def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfi
 
 
 def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> str | None:
-    """Work and travel angle beyond their windows, and by more than what a plan's error makes of them."""
+    """Fault sentence for a work or travel angle beyond its window plus a margin for the plan's error, or None."""
     R = sample.X_BT.rotation().matrix()
     margin = math.radians(5.0)
     travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0))
@@ -327,14 +331,14 @@ def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> st
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
-    """The tip's wanted lateral and upward speed, m/s: by feel in TRACK, by the moved plan in COAST and FINISH."""
+    """The tip's wanted lateral and upward speed, m/s: from the deflection in TRACK, from the moved plan in COAST and FINISH."""
     deflection = config.deflection
     if state.phase == Phase.TRACK:
-        # A late frame says where the tip was, not where it is: its correction fades out.
+        # A late frame shows where the tip was, not where it is: its correction fades out.
         fresh = freshness(state, sample.time)
         seek = deflection.delta_d_m if state.delta_wanted is None else state.delta_wanted
         lateral = deflection.k_p * (seek - state.delta_n)
-        if state.sunk:
+        if state.axial_paused:
             return fresh * lateral, 0.0
         return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
     wanted = state.residual_at_loss + np.array((0.0, -config.gap.hover_m)) if state.phase == Phase.COAST else state.hold
@@ -343,7 +347,7 @@ def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoCo
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
-    """The servo speeds within their limit and slew."""
+    """The state with the servo speeds limited in speed and slew."""
     deflection = config.deflection
     top, step = (
         max(deflection.speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
@@ -355,7 +359,7 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
 
 
 def _rest(state: WeldingState, sample: ServoSample, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """DONE and FAULT: the last motion fades to nothing; the arc is already off."""
+    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off."""
     share = clip(1.0 - (sample.time - state.stopped_at) / config.limits.ramp_s, 0.0, 1.0)
     return _answer(changed(state, torch_on=False), share * state.V_stop, config, Diagnostics())
 
@@ -365,7 +369,11 @@ def _answer(
 ) -> tuple[WeldingState, WeldingCommand]:
     if not finite(V):
         now = state.time or 0.0
-        state = _fault(state, now, "The welding law gave no number here; this is a defect, report it with a recording.")
+        state = _fault(
+            state,
+            now,
+            "The welding law returned a number that is not finite: this is a defect, report it with a recording.",
+        )
         V = state.V_stop
     measurement = state.measurement
     diagnostics = changed(

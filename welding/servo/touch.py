@@ -1,4 +1,4 @@
-"""TOUCH: come down beside the planned seam, feel sideways until the tip falls into the groove and leans on its wall."""
+"""The TOUCH phase: descend next to the planned seam and search sideways until the tip is seated in the groove."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from weldcal.welding.servo.contact import freshness
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 
-_TAG_SIGMA_M = 0.05e-3  # what a frame's deflection may be off while the gain is fitted
+_TAG_SIGMA_M = 0.05e-3  # sigma of a frame's deflection in the gain fit
 _SEATED_FRAMES = 3
 _WALL_FRAMES = 15
 
 
 def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
-    """X_BT to bring the arm to before the weld: above the face, on the -n side of the seam's start, torch behind.
+    """Start pose X_BT of the weld: above the face, on the -n side of the seam's start, torch behind.
 
     Args:
         plan: the planned seam in B.
@@ -39,7 +39,7 @@ def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
 def touch_step(
     state: WeldingState, sample: ServoSample, is_new: bool, seam: SeamFrame, config: ServoConfig
 ) -> tuple[WeldingState, float, float, str | None, bool]:
-    """One tick of the search.
+    """One tick of the touch search.
 
     Args:
         seam: the tip's planned line at the touch arc; `is_new`: whether the state holds a frame of this tick.
@@ -55,7 +55,7 @@ def touch_step(
     depth_servo = fresh * clip(
         deflection.k_z * (deep - deflection.axial_d_m), -deflection.speed_m_s, deflection.speed_m_s
     )
-    # Once it has met the face it may come down by the groove's depth more.
+    # After contact with the face it may descend by the groove's depth more.
     floor = (config.tool.tip_drop_m if t.step == "descend" else 0.0) - touch.depth_m - deflection.axial_d_m
     if height < floor:
         return state, 0.0, 0.0, _no_work(state, sample, height, config), False
@@ -85,14 +85,14 @@ def touch_step(
 
 
 def _no_work(state: WeldingState, sample: ServoSample, height: float, config: ServoConfig) -> str:
-    """What is said of a tip that has come too deep: how deep, what it read last, and how old that is."""
+    """Fault sentence for a tip that is too deep: its depth, its last deflection and the age of that reading."""
     below = 1e3 * (config.tool.tip_drop_m - height)
     if state.measurement is None:
-        read = "without a look at its tag"
+        read = "without a valid view of its tag"
     else:
         age = sample.time - state.measurement.capture_time
         read = f"and it read {1e3 * state.delta_axial:.1f} mm of deflection {age:.2f} s ago"
-    where = "met no work" if state.touch.step == "descend" else "lost the work"
+    where = "found no surface" if state.touch.step == "descend" else "lost the surface"
     return (
         f"Seam not found: the tip {where} (its rest is {below:.1f} mm below where it should meet the face, {read}); "
         "check the plan's height."
@@ -102,7 +102,7 @@ def _no_work(state: WeldingState, sample: ServoSample, height: float, config: Se
 def _zeroed(
     state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
 ) -> tuple[WeldingState, str | None]:
-    """What the tag reads while the tip hangs free is its zero: the rendered or printed tag's own bias goes with it."""
+    """Average the readings of the free tip as the tag's zero, which removes the tag's bias."""
     touch, t = config.touch, state.touch
     if not is_new or sample.deflection is None:
         return state, None
@@ -147,13 +147,13 @@ def _search(
             state,
             0.0,
             0.0,
-            "Seam not found: the tip met a wall but no groove; check the plan and clear the work.",
+            "Seam not found: the tip met a wall but no groove; check the plan and clear the workpiece.",
             False,
         )
     if left - t.start_left > touch.range_m:
-        text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the work again."
+        text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the workpiece again."
         return state, 0.0, 0.0, text, False
-    # While the tip falls there is little holding it down: wait for the depth servo, or it climbs out over the far wall.
+    # A tip falling into the groove is hardly pressed down: wait for the depth servo, or it climbs over the far wall.
     held = fresh * clip(2.0 * state.delta_axial / deflection.axial_d_m - 0.5, 0.0, 1.0)
     lateral = clip(deflection.k_p * (deflection.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
     return state, held * lateral, depth_servo, None, False
@@ -165,7 +165,7 @@ _LEGS = {"press up": ("press down", 1.0), "press down": ("press back", -1.0), "p
 def _press(
     state: WeldingState, sample: ServoSample, is_new: bool, left: float, seam: SeamFrame, config: ServoConfig
 ) -> tuple[WeldingState, float, float, str | None, bool]:
-    """Press against the seated tip and back: its wall does not move, so deflection per motion is the tag's gain."""
+    """Press the seated tip against the wall and back: the wall is fixed, so deflection per motion is the tag's gain."""
     deflection = config.deflection
     touch, t = config.touch, state.touch
     following, sign = _LEGS[t.step]
@@ -187,7 +187,7 @@ def _add(fit: GainFit, x: float, y: float) -> GainFit:
 
 
 def _gain(fit: GainFit, config: ServoConfig) -> float:
-    """The slope of deflection on motion, drawn to 1 by its prior."""
+    """Slope of deflection over motion, regularised towards 1."""
     if fit.n < 3:
         return 1.0
     sxx, sxy = fit.xx - fit.x**2 / fit.n, fit.xy - fit.x * fit.y / fit.n

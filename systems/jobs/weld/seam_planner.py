@@ -108,7 +108,7 @@ class SeamPlanner(LeafSystem):
             q_retract,
             points_B,
             sigma_m=found.sigma_m,
-            words=found.words,
+            words=found.summary,
         )
 
     def _output(self, context: Context, output: Any) -> None:

@@ -1,9 +1,9 @@
 """Extracts the weld seam of a V-groove from a point cloud without a drawing, on flat faces and on faces bent over a cylinder.
 
 Openings in faces are found coarsely (search); slices across them are fitted with a V (section), each slice with points
-of its own; the offsets of the centres are smoothed along the line, the line is moved by them, and so again until it
-stays (measure). A face bent over a cylinder is unrolled first, measured as a flat one and rolled back. Every figure has
-a sigma, scaled by how much neighbouring slices really differ.
+of its own; the offsets of the centres are smoothed along the line, the line is moved by them until it
+converges (measure). A face bent over a cylinder is unrolled first, measured as a flat one and rolled back. Every figure has
+a sigma, scaled by the observed scatter of neighbouring slices.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from weldcal.welding.locate.groove.search import find_grooves
 from weldcal.welding.locate.planes import Floats, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
-MOST_RADIUS_M = 1.0  # over 0.3 m a larger one sags by 11 mm or less, and its walls lean by less than 9 deg
+MOST_RADIUS_M = 1.0  # over 0.3 m a larger radius sags by 11 mm or less, and counts as flat
 MARGIN_M = 0.020
-GROUND_REACH_M = 0.030  # the ends of a bent plate lean: the ground beyond lies that much further off, unrolled
-COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # to find openings in: a groove 2 mm wide is still three cells wide
+GROUND_REACH_M = 0.030  # the ends of a bent plate are inclined: the ground beyond is that much further away, unrolled
+COARSE_POINTS, COARSE_CELL_M = 800_000, 0.0006  # for the search: a groove 2 mm wide is still three cells wide
 
 
 def extract_groove(
@@ -34,7 +34,7 @@ def extract_groove(
     start_A: npt.ArrayLike | None = None,
     config: GrooveConfig | None = None,
 ) -> GrooveSeam:
-    """The V-groove in a cloud (N,3) or (H,W,3), metres, z roughly up out of the face, NaN where unmeasured.
+    """Extract the V-groove from a cloud (N,3) or (H,W,3), metres, z roughly up out of the face, NaN where unmeasured.
 
     hint_A (3,): where several grooves are in view, the one nearest to this point. start_A (3,): the seam starts at the
     end nearest to it; without it at the end nearest to the origin of A (the robot, for a cloud in its base).
@@ -60,7 +60,7 @@ def extract_groove(
             except WeldcalError as error:
                 failures.append(error)
     if not seams and failures:
-        # A groove that was seen but cannot be used says more than an opening that is none.
+        # The refusal of a real groove is more useful than that of an opening that is not a groove.
         raise next((e for e in failures if not isinstance(e, GrooveNotFound)), failures[0])
     if not seams:
         depth = 2.0 * max(4.0 * noise, 0.0008)
@@ -73,7 +73,7 @@ def extract_groove(
         return seams[0]
     if hint_A is None:
         where = "; ".join(f"{1e3 * g.s[-1]:.0f} mm long near {_mm(g.root[len(g.root) // 2])}" for g in seams)
-        raise SeveralGrooves(f"{len(seams)} grooves are in view ({where}): say which by a point near it.")
+        raise SeveralGrooves(f"{len(seams)} grooves are in view ({where}): name one by a point near it.")
     hint = np.asarray(hint_A, dtype=np.float64)
     return min(seams, key=lambda g: float(np.linalg.norm(g.root - hint, axis=1).min()))
 
@@ -85,7 +85,7 @@ def _mm(p: Floats) -> str:
 def bent_seams(
     points: Floats, config: GrooveConfig, start_A: npt.ArrayLike | None
 ) -> tuple[list[GrooveSeam], Floats, list[WeldcalError]]:
-    """The grooves of all bent faces in a cloud (N,3) m, the points that belong to none of these faces, and why others fail."""
+    """Grooves of all bent faces in a cloud (N,3) m, the points outside these faces, and the errors of grooves refused."""
     seams: list[GrooveSeam] = []
     failures: list[WeldcalError] = []
     rng = np.random.default_rng(config.search.seed)
@@ -110,7 +110,7 @@ def bent_seams(
 
 
 def _rolled(seam: GrooveSeam, face: BentFace, start: str) -> GrooveSeam:
-    """The seam of the unrolled face, back on the cylinder and in the cloud's frame; arc lengths are those of the root there."""
+    """Roll the seam of an unrolled face back onto the cylinder, in the cloud's frame, with the arc lengths of its root there."""
     root = face.rolled(seam.root)
     s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(root, axis=0), axis=1))])
 

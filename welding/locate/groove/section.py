@@ -18,12 +18,12 @@ from weldcal.welding.locate.groove.search import CoarseGroove
 from weldcal.welding.locate.planes import Floats
 
 ITERATIONS = 12
-ENOUGH = 3  # points on a wall to be a wall
-WIDE_M = 0.0015  # how far off in z points may at first be, on a line that is not yet the groove's
-SHOULDER_PITCHES = 1.5  # how far the end of the face may lie from the shoulder and be it
-BAND_M = 0.006  # of face beyond each shoulder that takes part
+ENOUGH = 3  # fewest points on a measured wall
+WIDE_M = 0.0015  # initial scale of the residuals in z, while the line is still off the groove
+SHOULDER_PITCHES = 1.5  # largest distance between the end of the face and the shoulder
+BAND_M = 0.006  # width of the face used beyond each shoulder
 STATION_M = 0.001
-FOLLOW = 3.0  # times wider than the last smoothing: a line moved again and again keeps ever more of the noise
+FOLLOW = 3.0  # width relative to the last smoothing: repeated moves accumulate noise
 SLOPE_SIGMA = 0.06  # relative, of a slice about the common profile: 2 deg between the walls of a 45 deg groove
 DEPTH_SIGMA = 0.10
 
@@ -49,34 +49,34 @@ class Section:
 
     @property
     def shoulders(self) -> tuple[float, float]:
-        """n of the left and the right edge of the opening."""
+        """Offsets n of the left and the right edge of the opening."""
         left, right = ((face - self.root) / slope for face, slope in zip(self.faces, self.slopes, strict=True))
         return self.centre + left, self.centre - right
 
     @property
     def depth(self) -> float:
-        """Of the root below the face on its two sides, their mean."""
+        """Mean depth of the root below the face on its two sides."""
         return 0.5 * (self.faces[0] + self.faces[1]) - self.root
 
     @property
     def width(self) -> float:
-        """Of the opening."""
+        """Width of the opening."""
         return self.shoulders[0] - self.shoulders[1]
 
     @property
     def angle(self) -> float:
-        """Between the walls, rad."""
+        """Angle between the walls, rad."""
         return math.atan(1.0 / self.slopes[0]) + math.atan(1.0 / self.slopes[1])
 
 
 def fit_section(
     n: Floats, z: Floats, guess: tuple[float, Profile], sigma: float, pitch: float, faces_known: bool = True
 ) -> Section | None:
-    """The V through points (N,) at n and z of one slice, or None where they show none.
+    """Fit a V to the points of one slice at n and z, each (N,); None where they show none.
 
     `guess`: the centre's n and the expected profile; `sigma` the noise of the face, `pitch` the distance of points.
-    Where one wall was hardly measured the edge of the face there and the expected slope stand in for it, and the
-    covariance says what that is worth.
+    Where one wall was hardly measured the edge of the face there and the expected slope replace it, and the
+    covariance includes their uncertainty.
     """
     centre, profile = guess
     slopes = np.array(profile.slopes)
@@ -110,7 +110,7 @@ def fit_section(
         J *= on_wall[:, None]
         if np.count_nonzero(on_wall) >= 6:
             spread = 1.4826 * float(np.median(np.abs(residual[on_wall])))
-            # Shrinking slowly: the first residuals are those of a wrong centre.
+            # The scale shrinks slowly, because the first residuals come from a wrong centre.
             scale = max(min(scale, 3.0 * spread if step > 1 else scale), 2.5 * floor)
         sigma_point = np.where(on_wall, max(scale / 2.5, floor), floor)
         u = residual / (sigma_point * 2.5)
@@ -121,13 +121,13 @@ def fit_section(
             enough = np.count_nonzero(on_wall & (left == (side == 0))) >= ENOUGH
             if edge is None or enough:
                 continue
-            # The shoulder lies where the face was seen to end.
+            # The shoulder is where the face was seen to end.
             sign = 1.0 if side == 0 else -1.0
             rise = faces[side] - x[1]
             row = np.zeros(4)
             row[0], row[1], row[2 + side] = 1.0, -sign / x[2 + side], -sign * rise / x[2 + side] ** 2
             off = centre + edge - (x[0] + sign * rise / x[2 + side])
-            # Where something hides the groove the face ends at its shadow, and not at the shoulder.
+            # Where something hides the groove the face ends at its shadow, not at the shoulder.
             belief = 1.0 if step < 3 else 1.0 / (1.0 + (off / (SHOULDER_PITCHES * pitch)) ** 2) ** 2
             A += belief * np.outer(row, row) / (0.5 * pitch) ** 2
             b += belief * row * off / (0.5 * pitch) ** 2
@@ -157,7 +157,7 @@ def fit_section(
 
 
 def _faces(n: Floats, z: Floats, half: float, sigma: float) -> tuple[float, float]:
-    """Height of the face to the left and to the right, 0 where too little of it is in view."""
+    """Height of the face on the left and on the right, 0 where too little of it is in view."""
     heights = []
     for sign in (1.0, -1.0):
         beside = (sign * n > half + 0.5e-3) & (sign * n < half + BAND_M) & (np.abs(z) < max(5.0 * sigma, 0.002))
@@ -195,7 +195,7 @@ class Slices:
 
 
 def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: GrooveConfig) -> Profile:
-    """The groove's cross-section over its whole length, from the coarse line."""
+    """Fit the groove's cross-section over its whole length, about the coarse line."""
     _, n, beside = line.coordinates(f[:, :2])
     beside &= np.abs(n) < 0.5 * groove.width_m + BAND_M + 0.003
     n, z = n[beside], f[beside, 2]
@@ -204,12 +204,12 @@ def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: Groove
     inner = np.abs(n) < 0.3 * groove.width_m
     if np.count_nonzero(inner) < 20:
         raise GrooveNotFound(
-            f"An opening {1e3 * groove.width_m:.1f} mm wide was seen, but nothing in it: look from above."
+            f"An opening {1e3 * groove.width_m:.1f} mm wide was seen, but no points inside it: scan from above."
         )
     depth = -float(np.percentile(z[inner], 10.0))
     slope = depth / (0.5 * groove.width_m)
     guess = Profile((slope, slope), depth, slope_sigma=1.0, depth_sigma=1.0)
-    # The coarse line wanders by a fraction of a millimetre, which on the walls looks like noise.
+    # The coarse line deviates by a fraction of a millimetre, which looks like noise on the walls.
     best = fit_section(n, z, (0.0, guess), max(groove.sigma_m, 2e-4), groove.pitch_m, faces_known=False)
     if (
         best is None
@@ -223,13 +223,13 @@ def measured_profile(f: Floats, line: Line, groove: CoarseGroove, config: Groove
         )
     if best.width < config.least_pitches * groove.pitch_m:
         raise _too_narrow(best.width, groove.pitch_m, config)
-    # About a wandering line one wall looks steeper than the other; what they have in common is nearer to the truth.
+    # About an inaccurate line one wall looks steeper than the other; their mean is more accurate.
     slope = float(np.mean(best.slopes))
     return Profile((slope, slope), best.depth)
 
 
 def common_profile(f: Floats, line: Line, slices: Slices, profile: Profile, sigma: float, pitch: float) -> Profile:
-    """The profile of all points about the slices' centres: known so much better that the next slices may differ less."""
+    """Fit one profile to all points about the slices' centres; it is accurate enough to constrain the next slices."""
     if len(slices.s) < 5:
         return profile
     s, n, beside = line.coordinates(f[:, :2])
@@ -237,7 +237,7 @@ def common_profile(f: Floats, line: Line, slices: Slices, profile: Profile, sigm
     beside &= (s > slices.s[0]) & (s < slices.s[-1]) & (np.abs(n) < half_width + BAND_M)
     beside &= f[:, 2] > -1.3 * profile.depth - 4.0 * sigma
     n = n - np.interp(s, slices.s, slices.column("centre"))
-    # Slices that were steadied by the last profile would only repeat it: these points are asked anew.
+    # Slices constrained by the last profile would only repeat it, so the points are fitted again without it.
     slope = float(np.mean(profile.slopes))
     loose = Profile((slope, slope), profile.depth, slope_sigma=0.5, depth_sigma=0.5)
     whole = fit_section(n[beside], f[beside, 2], (0.0, loose), sigma, pitch)
@@ -255,10 +255,10 @@ def _too_narrow(width: float, pitch: float, config: GrooveConfig) -> GrooveTooNa
 def cut_slices(
     f: Floats, line: Line, profile: Profile, sigma: float, pitch: float, half_slice: float, corners: list[Corner]
 ) -> Slices:
-    """Sections one beside the other along a line, each from points of its own; none within reach of a sharp corner."""
+    """Fit consecutive sections along a line, each to points of its own; none within reach of a sharp corner."""
     half_width = profile.depth / min(profile.slopes)
     s, n, beside = line.coordinates(f[:, :2])
-    # What lies deeper than the root is the table beyond the plate's edge.
+    # Points deeper than the root belong to the table beyond the plate's edge.
     beside &= (np.abs(n) < half_width + BAND_M + 0.002) & (f[:, 2] > -1.3 * profile.depth - 4.0 * sigma)
     order = np.argsort(s[beside])
     s, n, z = (v[beside][order] for v in (s, n, f[:, 2]))
@@ -279,14 +279,14 @@ def cut_slices(
 
 
 def agreed(slices: Slices) -> Slices:
-    """Without the sections that have few points, or that their neighbours deny."""
+    """The slices without sections that have few points or disagree with their neighbours."""
     if len(slices.s) < 5:
         return slices
     points = np.array([sum(x.on_walls) for x in slices.sections])
     good = points >= max(5.0, 0.35 * float(np.median(points)))
     for name, least in (("centre", 3e-4), ("root", 6e-4)):
         value = slices.column(name)
-        # Against a smooth curve through the others near it: a bend is not an outlier.
+        # Compared with a smooth curve through its neighbours, so that a bend is not an outlier.
         W = smoothing_weights(slices.s, slices.s, np.ones(len(value)), 3.0 * slices.half_slice)
         own = np.diag(W)
         off = np.abs(value - W @ value) / np.maximum(1.0 - own, 0.2)
@@ -304,23 +304,23 @@ def followed(
     config: GrooveConfig,
     settled: bool,
 ) -> Line:
-    """The line moved to where its sections have their centres, smoothly."""
+    """Move the line smoothly onto the centres of its sections."""
     slices = cut_slices(f, line, profile, sigma, pitch, half_slice, [])
     slices = agreed(slices) if settled else slices
     if len(slices.s) < 5:
         raise GrooveNotFound("An opening was seen whose cross-sections show no V: it is not a groove to weld.")
     r, weight = slices.column("centre"), slices.sigma
     at = np.arange(0.0, line.length + STATION_M, STATION_M)
-    # Wider than the last smoothing: moving a line again and again keeps ever more of the noise.
+    # Wider than the last smoothing, because repeated moves accumulate noise.
     width = FOLLOW * max(config.smoothing_m, 2.0 * half_slice)
     for _ in range(2):
         smooth = smoothing_weights(slices.s, slices.s, weight, width) @ r
         off = np.abs(r - smooth)
-        # A section that its neighbours deny counts for little.
+        # A section that disagrees with its neighbours gets a small weight.
         weight = np.where(off > 4.0 * np.median(off) + 5e-5, 10.0, 1.0) * slices.sigma
     W = smoothing_weights(np.clip(at, slices.s[0], slices.s[-1]), slices.s, weight, width)
     moved = line.moved(at, W @ r)
-    # Where nothing was seen the coarse line is not to be believed: the sides that were seen say how it goes on.
+    # Where nothing was seen the coarse line is not reliable: it is replaced by a bridge between the sides that were seen.
     stretch = moved.length / line.length
     for k in np.flatnonzero(np.diff(slices.s) > 0.010)[::-1]:
         a, b = stretch * float(slices.s[k]), stretch * float(slices.s[k + 1])
