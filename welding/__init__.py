@@ -1,1 +1,1 @@
-"""The mathematics of following a seam: registration, deformation, refinement, servo law, guards."""
+"""Locating, following and recording a weld seam, without Drake systems."""

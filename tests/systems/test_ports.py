@@ -81,7 +81,7 @@ from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.welding.servo.guards import SlewLimits
-from weldcal.welding.servo.state import ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
 
 X = RigidTransform()
 IDEAL = get_scanner("ideal", width=206, height=154)

@@ -10,9 +10,10 @@ import numpy as np
 from weldcal.tools.studies.weld.budgets import NOMINAL, Budget
 from weldcal.tools.studies.weld.plant import simulate
 from weldcal.tools.studies.weld.seams import TrueSeam, arcs, corner
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.state import Phase, ServoConfig, WeldingCommand, WeldingState
-from weldcal.welding.vectors import Array
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase, WeldingCommand, WeldingState
 
 
 @dataclass(frozen=True)

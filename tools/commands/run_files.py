@@ -123,7 +123,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
     if weld.planned is not None:
         up = np.asarray(weld.planned.up(log.telemetry["s_torch"]))
     moving = log.telemetry["phase"] != PHASE_CODES[Phase.TOUCH]
-    work, travel = torch_angles(log.R_BT, up, config.work_angle_rad)
+    work, travel = torch_angles(log.R_BT, up, config.torch.work_angle_rad)
     named = log.telemetry
     table = {"time_s": log.time, "torch_on": log.torch_on.astype(float), "sigma_min": log.sigma_min}
     table |= {f"{name}_m": named[name] for name in ("s_tip", "s_torch", "delta_n", "delta_axial", "e_t", "e_height")}
@@ -148,9 +148,9 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
         "robot": robot,
         "servo_period_s": config.period_s,
         "weld_speed_m_s": config.weld_speed_m_s,
-        "delta_d_m": config.delta_d_m,
-        "axial_d_m": config.axial_d_m,
-        "omega_max_rad_s": config.omega_max_rad_s,
+        "delta_d_m": config.deflection.delta_d_m,
+        "axial_d_m": config.deflection.axial_d_m,
+        "omega_max_rad_s": config.limits.omega_max_rad_s,
         "chord_m": config.tool.torch_offset_m,
         "law": config.law,
         "ended": run.reason or "done",

@@ -10,7 +10,8 @@ from weldcal.tools.outcomes.weld import WeldOutcome
 from weldcal.tools.report.plots_weld import OURS, ROBOT, THEIRS, TRUTH, Array, WeldTrace, plain, svg
 from weldcal.welding.record.process import path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.state import Phase, ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 
 def convergence(status: CalibrationStatus, required_m: float) -> bytes:
@@ -37,7 +38,7 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
     work = travel = None
     if weld.planned is not None:
         up = weld.planned.up(named["s_torch"])
-        work, travel = (angle[keep] for angle in torch_angles(log.R_BT, up, config.work_angle_rad))
+        work, travel = (angle[keep] for angle in torch_angles(log.R_BT, up, config.torch.work_angle_rad))
     errors = [None if e is None else (e.s, e.lateral, e.height) for e in (weld.plan_error, weld.error)]
     return WeldTrace(
         s=named["s_torch"][keep],
@@ -56,9 +57,9 @@ def weld_trace(weld: WeldOutcome, config: ServoConfig) -> WeldTrace:
         omega=named["omega"][keep],
         n_d_dot_n_t=named["n_d_dot_n_t"][keep],
         weld_speed=config.weld_speed_m_s,
-        delta_d=config.delta_d_m,
-        axial_d=config.axial_d_m,
-        omega_max=config.omega_max_rad_s,
+        delta_d=config.deflection.delta_d_m,
+        axial_d=config.deflection.axial_d_m,
+        omega_max=config.limits.omega_max_rad_s,
         e_t=named["e_t"][keep],
         work=work,
         travel=travel,

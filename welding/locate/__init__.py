@@ -1,1 +1,1 @@
-"""Where the part and its groove lie in a scan."""
+"""Locates the workpiece and its groove in a scan."""

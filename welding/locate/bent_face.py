@@ -1,4 +1,4 @@
-"""Faces bent over a cylinder: found in a cloud by their normals, fitted, and unrolled, so that flat methods work on them."""
+"""Finds faces bent over a cylinder in a cloud, fits them and unrolls them, so that methods for flat faces apply."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BAND_M = 0.003
 
 @dataclass(frozen=True, eq=False)
 class BentFace:
-    """A cylinder: frame Q touches it at its origin, x around it, y along its axis, z out of the face; m.
+    """A cylindrical face: frame Q is tangent to it at its origin, x around it, y along its axis, z out of the face; m.
 
     radius_m is negative where the axis lies above the face (a hollow one). Unrolled, a point has the coordinates
     (arc length around, along, height over the face). reach_m: how far from the origin the face was seen, around and along.
@@ -51,21 +51,21 @@ class BentFace:
         return np.asarray(n @ self.X_AQ.rotation().matrix().T)
 
     def at(self, x: float, y: float, turn: float) -> RigidTransform:
-        """The frame in A that touches the face at an unrolled place and is turned there."""
+        """The frame in A tangent to the face at an unrolled position, rotated by `turn` about its normal."""
         around = RotationMatrix.MakeYRotation(x / self.radius_m)
         p = rolled(np.array([[x, y, 0.0]]), self.radius_m)[0]
         return self.X_AQ @ RigidTransform(around @ RotationMatrix.MakeZRotation(turn), p)
 
 
 def unrolled(p_Q: Floats, radius_m: float) -> Floats:
-    """Points (N,3) of a frame that touches the cylinder, unrolled; the inverse of `rolled`."""
+    """Unroll points (N,3) given in a frame tangent to the cylinder; the inverse of `rolled`."""
     r, side = abs(radius_m), math.copysign(1.0, radius_m)
     out, up = p_Q[:, 0], side * p_Q[:, 2] + r
     return np.column_stack([r * np.arctan2(out, up), p_Q[:, 1], side * (np.hypot(out, up) - r)])
 
 
 def rolled(u: Floats, radius_m: float) -> Floats:
-    """Unrolled points (N,3), on the cylinder."""
+    """Roll unrolled points (N,3) back onto the cylinder."""
     r, side = abs(radius_m), math.copysign(1.0, radius_m)
     angle, far = u[:, 0] / r, r + side * u[:, 2]
     return np.column_stack([far * np.sin(angle), u[:, 1], side * (far * np.cos(angle) - r)])
@@ -80,7 +80,7 @@ def find_bent_faces(
     most: int = 2,
     hollow: bool = False,
 ) -> list[BentFace]:
-    """Up to `most` faces bent over a radius in a range, the largest first, in a cloud (N,3) m whose z is up.
+    """Find up to `most` faces with a bend radius in a range, largest first, in a cloud (N,3) m whose z is up.
 
     Two points and their normals span a cylinder; the one that most others agree with, in distance and in normal, is fitted.
     """
@@ -127,7 +127,7 @@ def _spanned(
     least: int,
     hollow: bool,
 ) -> BentFace | None:
-    """The cylinder through two of the points that most of them agree with."""
+    """The cylinder spanned by two points and their normals with the most inliers, or None."""
     first, second = rng.integers(len(at), size=(2, 20 * PAIRS))
     axis = np.cross(normal[first], normal[second])
     size = np.linalg.norm(axis, axis=1)
@@ -158,7 +158,7 @@ def _spanned(
 
 
 def _centred(face: BentFace, at: Floats, normal: Floats) -> BentFace:
-    """The same with its origin in the middle of the points (M,3) that lie on it, and how far these reach."""
+    """The same face with its origin in the middle of its inliers among points (M,3), and their extent."""
     u = face.unrolled(at)
     on = u[(np.abs(u[:, 2]) < BAND_M) & _agrees(face, u, normal), :2]
     low, high = np.percentile(on, [1.0, 99.0], axis=0)
@@ -168,7 +168,7 @@ def _centred(face: BentFace, at: Floats, normal: Floats) -> BentFace:
 
 
 def _turns(face: BentFace, x: Floats, normal: Floats) -> bool:
-    """Whether the normals (M,3) turn with the way x (M,) around as on that cylinder: those of a plane it touches do not."""
+    """Whether the normals (M,3) rotate with the arc length x (M,) as on that cylinder; those of a tangent plane do not."""
     n = normal @ face.X_AQ.rotation().matrix()
     off = np.arctan2(n[:, 0], n[:, 2]) - x / face.radius_m
     # Strip by strip around it: a mixture of planes agrees on the whole, but in no strip.
@@ -185,7 +185,7 @@ def _agrees(face: BentFace, u: Floats, normal: Floats) -> npt.NDArray[np.bool_]:
 def fit_bent_face(
     points: Floats, face: BentFace, radii_m: tuple[float, float], gates_m: tuple[float, ...] = (0.004, 0.002, 0.001)
 ) -> BentFace:
-    """The cylinder through the points (N,3) near a first one, by robust least squares in its axis, place and radius."""
+    """Refine a cylinder by robust least squares on the points (N,3) near it, in axis, position and radius."""
     side = math.copysign(1.0, face.radius_m)
     low, high = (side * r for r in radii_m)
     low, high = min(low, high), max(low, high)

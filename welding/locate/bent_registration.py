@@ -1,8 +1,8 @@
-"""Where a bent plate lies, from one scan: its cylinder leaves the way around and along it open, the outline closes both.
+"""Registers a bent plate to one scan by its cylindrical face and its outline.
 
-A drawing's radius is known. The face is found by its normals and unrolled; there the flat outline is slid over the
+The drawing gives the radius. The face is found by its normals and unrolled; there the flat outline is slid over the
 flat edge of what was seen. Then pose and inset are fitted together to the face (distance from the cylinder) and to its outermost
-points (distance from the outline, unrolled): the face alone says nothing of the way along the axis and around it.
+points (distance from the outline, unrolled): the face alone does not constrain the position along and around the axis.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from weldcal.welding.locate.registration_result import (
     not_found,
 )
 
-RADIUS_SHARE = 0.15  # how far the radius of a face that is looked at may be from the drawn one
-MOST_SAG_M = 0.0006  # by how much the part may sag against its drawing from its middle to its ends
+RADIUS_SHARE = 0.15  # largest relative difference between a candidate face's radius and the drawn one
+MOST_SAG_M = 0.0006  # largest sag of the part against its drawing, from its middle to its ends
 FACE_POINTS = 4000
 COARSE_POINTS = 60_000
 FORM_M, FORM_WAVES = 3e-5, 10
 
 
 def flattened(workpiece: Workpiece) -> Workpiece:
-    """A bent workpiece as it was before: its seam unrolled; a flat one as it is."""
+    """The workpiece before bending, with its seam unrolled; a flat workpiece unchanged."""
     if not math.isfinite(workpiece.bend_radius_m):
         return workpiece
     seam = unrolled(workpiece.seam_P, workpiece.bend_radius_m)
@@ -55,7 +55,7 @@ def flattened(workpiece: Workpiece) -> Workpiece:
 
 
 def into_plate(X_BP: RigidTransform, points_B: Floats, workpiece: Workpiece) -> Floats:
-    """Points (N,3) in the plate's frame; of a bent plate unrolled."""
+    """Points (N,3) expressed in the plate's frame, unrolled for a bent plate."""
     p = into(X_BP, points_B)
     return unrolled(p, workpiece.bend_radius_m) if math.isfinite(workpiece.bend_radius_m) else p
 
@@ -63,7 +63,7 @@ def into_plate(X_BP: RigidTransform, points_B: Floats, workpiece: Workpiece) -> 
 def register_bent(
     points: Floats, workpiece: Workpiece, X_BP_guess: RigidTransform, config: RegistrationConfig, eye_B: Floats | None
 ) -> WorkpieceRegistration:
-    """As `register_workpiece`, for a plate bent over a cylinder; points (N,3) m in base, all measured."""
+    """Register a plate bent over a cylinder, as `register_workpiece`; points (N,3) m in base, all finite."""
     radius = workpiece.bend_radius_m
     half = 0.5 * np.array(workpiece.size_m[:2])
     reach = config.max_shift_m + float(np.hypot(*half)) * math.sin(config.max_turn_rad)
@@ -84,7 +84,7 @@ def register_bent(
         y = face.X_AQ.rotation().matrix()[:, 1]
         if abs(math.atan2(-y[0], y[1])) > config.max_turn_rad + math.radians(3.0):
             continue
-        # The unrolled place of the guess is where the search begins.
+        # The search starts at the unrolled position of the guess.
         x0, y0, _ = face.unrolled(np.zeros((1, 3)))[0]
         face = BentFace(face.at(float(x0), float(y0), 0.0), radius)
         X_QP, score = slide(face.unrolled(few), workpiece.outline_P, config.max_shift_m, math.radians(5.0))
@@ -102,14 +102,14 @@ def register_bent(
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """What the pose is fitted to, in the plate's frame before the fit: face (N,3), rims (M,3) and their edges (M,)."""
+    """The data of the pose fit, in the plate's frame before it: face (N,3), rims (M,3) and their edges (M,)."""
 
     face: Floats
     rims: Floats
     edges: npt.NDArray[np.int64]
     pitch: float
     noise: float
-    crowd: float  # of how many face points each one here stands for, in independent ones
+    crowd: float  # how many correlated face points count as one independent point
 
 
 def _refine(
@@ -179,7 +179,7 @@ def _fit(
     """
     a, inward = outline[seen.edges], inward_normals(outline)[seen.edges]
     pitch = seen.pitch
-    # However many its points: the plate is no cylinder to less than that, in a few long waves.
+    # A floor independent of the number of points: a real plate deviates from a cylinder in a few long waves.
     face_sigma = math.hypot(
         max(seen.noise, 1e-5) * math.sqrt(max(seen.crowd, 1e-3)), FORM_M * math.sqrt(len(seen.face) / FORM_WAVES)
     )
@@ -212,7 +212,7 @@ def _fit(
     J = np.asarray(fit.jac)
     G = np.linalg.inv(J.T @ J) @ J.T
     n = len(face)
-    # What a residual of weight one stands for: its own scatter, and what all points of an edge have in common.
+    # Variance of a residual of weight one: its own scatter, and the error common to all points of an edge.
     scatter = max(float(np.mean(np.square(rims))), (0.5 * SCATTER_PITCHES * pitch) ** 2) / np.square(rim_sigma)
     middle = (G[:, :n] @ G[:, :n].T) + (G[:, n:-1] * scatter) @ G[:, n:-1].T + np.outer(G[:, -1], G[:, -1])
     for edge in np.unique(seen.edges):
@@ -239,7 +239,7 @@ def _slants(outline: Floats, radius: float, eye_P: Floats | None) -> Floats:
 
 
 def _same_bend(u: Floats, workpiece: Workpiece, noise: float) -> None:
-    """Raises WorkpieceNotFound where the face (N,3), unrolled, is bent more or less than drawn."""
+    """Raise WorkpieceNotFound if the unrolled face (N,3) has another bend radius than drawn."""
     x, y, z = u.T
     A = np.column_stack([np.ones(len(x)), x, y, x * y, 0.5 * x * x])
     coefficients, *_ = np.linalg.lstsq(A, z, rcond=None)

@@ -1,9 +1,9 @@
-"""Where a plate lies, without a guess: its outline laid over every flat face in every turn, then the fine registration.
+"""Finds a plate in a scan without an initial guess: template search over all faces and turns, then fine registration.
 
 Coarse: the planes that face up; on each, the outline as a template (face inside, none just outside) correlated with what
 was seen, over all turns. Fine: register_workpiece from the best of these places. The answer is compared with its
-runners-up: a second place that fits as well, or a half turn that looks the same, is a question and not an answer. What
-the outline leaves open the groove decides, where it was drawn unsymmetrically and can be seen.
+runners-up: a second place that fits as well, or a half turn that looks the same, is refused as ambiguous. Where the
+outline is symmetric the groove decides, if it is drawn asymmetrically and can be seen.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ CLOSE_M, CLOSE_RAD = 0.004, math.radians(1.5)  # how far the coarse place may be
 
 
 class AmbiguousWorkpiece(WorkpieceNotFound):
-    """The scan agrees with two places of the part, or with two turns of it, and nothing decides."""
+    """The scan agrees with two positions or two orientations of the part, and nothing distinguishes them."""
 
 
 @dataclass(frozen=True)
 class FindConfig:
-    """How the search goes, and what counts as decided.
+    """Settings of the search, and the thresholds of its decision.
 
     steepest_rad     largest tilt of the part's face from the up direction
     cell_m, turn_step_rad   of the coarse search
@@ -73,14 +73,14 @@ class FindConfig:
 
 @dataclass(frozen=True, eq=False)
 class FoundWorkpiece:
-    """Where the part is, and how sure that is.
+    """The pose of the part found, and its confidence.
 
     registration  the fine registration at the place found
     runner_up     score of the next best other place over that of this one, 0 to 1
     groove        agreement of the groove seen with the one drawn here, -1 to 1; None where it could not be seen
     turned_groove the same, with the part turned by 180 deg
-    confidence    0 to 1: what the outline supports less what it contradicts, less what the runner-up claims
-    words         that in words
+    confidence    0 to 1: supported less contradicted share of the outline, reduced by the runner-up
+    summary       the result in one sentence
     """
 
     registration: WorkpieceRegistration
@@ -88,11 +88,11 @@ class FoundWorkpiece:
     groove: float | None
     turned_groove: float | None
     confidence: float
-    words: str
+    summary: str
 
     @property
     def X_BP(self) -> RigidTransform:
-        """Where the plate is."""
+        """Pose of the plate in the base."""
         return self.registration.X_BP
 
 
@@ -104,10 +104,10 @@ def find_workpiece(
     eye_B: npt.ArrayLike | None = None,
     config: FindConfig | None = None,
 ) -> FoundWorkpiece:
-    """The plate in a scan (N,3) or (H,W,3), metres in base with z up, anywhere in it and in any turn.
+    """Find the plate in a scan (N,3) or (H,W,3), metres in base with z up, at any position and turn about z.
 
     turn_hint_rad: the part's turn about z to within 90 deg, for parts that look the same after half a turn.
-    eye_B (3,): where the scanner stands, for the covariance.
+    eye_B (3,): the scanner's position, for the covariance.
 
     Raises:
         WorkpieceNotFound, AmbiguousWorkpiece: in a sentence; InputError for a scan of the wrong shape.
@@ -120,7 +120,7 @@ def find_workpiece(
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) < config.fine.min_points:
         raise WorkpieceNotFound(f"The scan has only {len(points)} points: move the workpiece into view.")
-    # Which place it is, a thinned scan tells as well; where exactly, all of its points say at the end.
+    # A thinned scan is enough to find the place; the final registration uses all points.
     few = thinned(points, COARSE_POINTS)
     coarse = config.fine if few is points else replace(config.fine, max_sigma_m=math.inf)
     places = _places(few, workpiece, config)
@@ -142,7 +142,7 @@ def find_workpiece(
             fits.append((found.confidence, found))
     if not fits:
         raise refusal or WorkpieceNotFound("The scan shows no such workpiece: check which one this is.")
-    # Each place in both turns, the groove's word counted beside the outline's.
+    # Each place in both turns, scored by outline and groove.
     judged = []
     for score, found in fits:
         turns = [found] if not _half_turn_fits(workpiece) else [found, found.turned_round(workpiece)]
@@ -175,7 +175,7 @@ def _decided(
     turn_hint_rad: float | None,
     config: FindConfig,
 ) -> FoundWorkpiece:
-    """Which of the two turns it is, and the answer with its confidence; or why that cannot be said."""
+    """Choose between the two turns and return the result with its confidence; raise where nothing decides."""
     seen = [g for g in grooves if g is not None]
     if seen and max(seen) < config.least_groove:
         raise WorkpieceNotFound(
@@ -205,9 +205,9 @@ def _decided(
     found = turns[chosen]
     confidence = float(np.clip(found.confidence * (1.0 - max(0.0, other - 0.5)), 0.0, 1.0))
     word = "high" if confidence > 0.85 else "fair" if confidence > 0.65 else "low"
-    words = f"{word} confidence {confidence:.2f}: {found.words}; the next best place is {100 * other:.0f} % as good, and {why}"
+    summary = f"{word} confidence {confidence:.2f}: {found.summary}; the next best place is {100 * other:.0f} % as good, and {why}"
     turned_groove = grooves[1 - chosen] if len(grooves) == 2 else None
-    return FoundWorkpiece(found, other, grooves[chosen], turned_groove, confidence, words)
+    return FoundWorkpiece(found, other, grooves[chosen], turned_groove, confidence, summary)
 
 
 def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tuple[float, RigidTransform]]:
@@ -229,7 +229,7 @@ def _places(points: Floats, workpiece: Workpiece, config: FindConfig) -> list[tu
 def _bent_places(
     points: Floats, workpiece: Workpiece, config: FindConfig, rng: np.random.Generator
 ) -> list[tuple[float, RigidTransform]]:
-    """The same on the bent faces in view: which way round the part lies on its cylinder is all there is of a turn."""
+    """Rough poses on the bent faces in view; only half turns about the cylinder's normal are possible there."""
     radius = workpiece.bend_radius_m
     places: list[tuple[float, RigidTransform]] = []
     for seen in find_bent_faces(points, ((1.0 - RADIUS_SHARE) * radius, (1.0 + RADIUS_SHARE) * radius), rng):
@@ -310,7 +310,7 @@ def _heading(X: RigidTransform) -> float:
 
 
 def _same_place(A: RigidTransform, B: RigidTransform, workpiece: Workpiece) -> bool:
-    """Whether two poses put the part into the same place, half turns of a symmetric part left out."""
+    """Whether two poses put the part into the same place, regardless of half turns of a symmetric part."""
     E = A.InvertAndCompose(B)
     turn = abs(math.remainder(_heading(E), math.pi if _half_turn_fits(workpiece) else 2.0 * math.pi))
     return float(np.linalg.norm(E.translation())) < 0.012 and turn < math.radians(8.0)

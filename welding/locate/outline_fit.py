@@ -1,4 +1,4 @@
-"""A plate's outline against the edge of its seen face: slid over it, fitted to the outermost points, and checked.
+"""Fits a plate's outline to the edge of its scanned face: exhaustive search, robust fit and check.
 
 All in the plane of the face; a bent face is unrolled first.
 """
@@ -68,7 +68,7 @@ def slide(q: Floats, outline: Floats, max_shift_m: float, max_turn_rad: float) -
 
 
 def by_the_edge(p: Floats, outline: Floats, reach: float = 0.020) -> npt.NDArray[np.bool_]:
-    """Which of points (N,k) lie within a reach of the outline, inside or outside of it."""
+    """Mask of points (N,k) within a distance of the outline, inside or outside of it."""
     near = np.zeros(len(p), dtype=bool)
     for a, b, inward in zip(outline, np.roll(outline, -1, axis=0), inward_normals(outline), strict=True):
         length = float(np.linalg.norm(b - a))
@@ -80,7 +80,7 @@ def by_the_edge(p: Floats, outline: Floats, reach: float = 0.020) -> npt.NDArray
 def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple[Floats, npt.NDArray[np.int64]]:
     """The face point nearest the outside in every strip across each edge: its row (M,k) and the edges' numbers (M,).
 
-    face (N,k): x and y first, whatever else behind.
+    face (N,k): x and y first, then any other columns.
     """
     found, numbers = [], []
     for k, (a, b, inward) in enumerate(
@@ -89,7 +89,7 @@ def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple
         length = float(np.linalg.norm(b - a))
         t = (face[:, :2] - a) @ (b - a) / length
         d = (face[:, :2] - a) @ inward
-        # Strips end short of the corners, where the neighbouring edge would answer.
+        # Strips end before the corners, where points belong to the neighbouring edge.
         near = np.flatnonzero((np.abs(d) < gate) & (t > 0.01) & (t < length - 0.01))
         strip = (t[near] / (3.0 * pitch)).astype(np.int64)
         order = np.lexsort((d[near], strip))
@@ -102,7 +102,7 @@ def outermost(face: Floats, outline: Floats, gate: float, pitch: float) -> tuple
 def fit_outline(
     rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, pitch: float, slant_rad: float | None, noise: float
 ) -> tuple[RigidTransform, float, float, Floats]:
-    """The motion in the plane that puts outermost points (M,2) on their edges, the inset found, the rms left, m, and
+    """Fit the in-plane motion that puts outermost points (M,2) on their edges; the inset, the remaining rms, m, and
     the covariance (3,3) of x, y and turn.
 
     The scanner's last point on the face lies up to a pitch inside the edge; that inset is one more unknown, the same at
@@ -136,7 +136,7 @@ def fit_outline(
 def displaced(
     rims: Floats, edges: npt.NDArray[np.int64], outline: Floats, inset: float, tolerance: float, raster: Raster
 ) -> set[int]:
-    """Edges that most of their outermost points (M,2) put further than the tolerance from where they are drawn.
+    """Edges whose outermost points (M,2) lie further than the tolerance from where the edges are drawn.
 
     Only points that end the face count: lower ground is seen just beyond them, not the shadow of something in front.
     """

@@ -1,4 +1,4 @@
-"""Flat faces in a scan: planes that face up, frames on them, and rasters of what lies on and below a face."""
+"""Finds upward planes in a scan, frames on them, and rasters of the points on and below a face."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Raster:
     corner: Floats
 
     def look(self, cells: npt.NDArray[Any], xy: Floats) -> npt.NDArray[Any]:
-        """Values of a raster (H,W) at points (...,2); what lies outside reads as its first cell, kept empty."""
+        """Values of a raster (H,W) at points (...,2); points outside it read its first cell, which is kept empty."""
         i = ((xy - self.corner) / self.cell).astype(np.int64)
         height, width = cells.shape
         inside = np.all((i >= 0) & (i < np.array([width, height])), axis=-1, keepdims=True)
@@ -46,7 +46,7 @@ def turned(x: float, y: float, yaw: float) -> RigidTransform:
 
 
 def plane_frame(normal: Floats, center: Floats) -> RigidTransform:
-    """This frame moved on to a plane by the shortest way: z becomes the normal, x stays as near as it can."""
+    """A frame on a plane: z along the normal, x as close to the given x as possible."""
     x = np.array([1.0, 0.0, 0.0]) - normal[0] * normal
     x /= np.linalg.norm(x)
     R = RotationMatrix(np.column_stack([x, np.cross(normal, x), normal]))
@@ -120,9 +120,9 @@ def point_pitch(xy: Floats) -> float:
 
 
 def thinned(points: Floats, most: int, least_cell_m: float = 0.0) -> Floats:
-    """About `most` of the points (N,3), z up: one in every cell of a square grid seen from above, none of them changed.
+    """Thin points (N,3), z up, to about `most`: one unchanged point in every cell of a square grid seen from above.
 
-    least_cell_m: cells are at least this large, so that even fewer may be left. Fewer points than that come back as they are.
+    least_cell_m: cells are at least this large, so that fewer may be left. A cloud with fewer points is returned unchanged.
     """
     if len(points) <= most and least_cell_m == 0.0:
         return points
@@ -138,7 +138,7 @@ def thinned(points: Floats, most: int, least_cell_m: float = 0.0) -> Floats:
 
 
 def rasterise(p: Floats, face: Mask, below: Mask, pitch: float) -> Raster:
-    """The points (N,3) as cells of two pitches; small gaps in the face are closed."""
+    """Rasterise points (N,3) in cells of two pitches; small gaps in the face are closed."""
     cell = max(2.0 * pitch, 0.001)
     corner = p[:, :2].min(axis=0) - 4.0 * cell
     width, height = (np.ceil((p[:, :2].max(axis=0) - corner) / cell).astype(int) + 4).tolist()

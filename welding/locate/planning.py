@@ -1,4 +1,4 @@
-"""One call from a scan to the groove's root: by the drawing laid over the scan, or from the cloud alone."""
+"""Plans the groove's root from one scan: by the drawing registered to the scan, or from the cloud alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
-from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.locate.registration import register_workpiece
 
@@ -22,7 +22,7 @@ SEARCHES = ("guess", "anywhere")
 
 @dataclass(frozen=True)
 class PlanningMethod:
-    """How a seam is planned.
+    """Method and search of the seam plan.
 
     method   cad: the drawing registered to the scan; cloud: the groove found in the scan, no drawing
     search   of the drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns apart)
@@ -42,12 +42,12 @@ class PlanningMethod:
 
 @dataclass(frozen=True, eq=False)
 class RootPlan:
-    """The groove's root in base, in the direction of travel.
+    """The planned root of the groove in base, in the direction of travel.
 
     root, up      (N,3) m and unit normals of the face; half_angle_rad between a wall and the groove's middle plane
     X_BP          where the drawing lies, where one was used
-    sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, which the real one may miss
-    rms_m         of the face's points about their plane; confidence 0 to 1; words: what was found, in a sentence
+    sigma_m       of the root sideways, rms along it: with a drawing that of the drawn groove, from which the real one may differ
+    rms_m         of the face's points about their plane; confidence 0 to 1; summary: what was found, in a sentence
     """
 
     root: Floats
@@ -57,7 +57,7 @@ class RootPlan:
     sigma_m: float
     rms_m: float
     confidence: float
-    words: str
+    summary: str
 
 
 def plan_root(
@@ -67,7 +67,7 @@ def plan_root(
     method: PlanningMethod | None = None,
     eye_B: npt.ArrayLike | None = None,
 ) -> RootPlan:
-    """The root of the groove in a scan (N,3) or (H,W,3), metres in base; eye_B (3,): where the scanner stands.
+    """Plan the root of the groove from a scan (N,3) or (H,W,3), metres in base; eye_B (3,): the scanner's position.
 
     The cloud method takes nothing from `workpiece`; of several grooves it chooses the one nearest to the guess.
 
@@ -85,15 +85,15 @@ def plan_root(
             sigma_m=groove.typical_sigma,
             rms_m=groove.face_sigma,
             confidence=groove.confidence,
-            words=groove.words,
+            summary=groove.summary,
         )
     if method.search == "anywhere":
         x = X_BP_guess.rotation().matrix()[:, 0]
         found = find_workpiece(points_B, workpiece, turn_hint_rad=math.atan2(x[1], x[0]), eye_B=eye_B)
-        registration, confidence, words = found.registration, found.confidence, found.words
+        registration, confidence, summary = found.registration, found.confidence, found.summary
     else:
         registration = register_workpiece(points_B, workpiece, X_BP_guess, eye_B=eye_B)
-        confidence, words = registration.confidence, registration.words
+        confidence, summary = registration.confidence, registration.summary
     X_BP = registration.X_BP
     return RootPlan(
         root=workpiece.seam_P @ X_BP.rotation().matrix().T + X_BP.translation(),
@@ -103,5 +103,5 @@ def plan_root(
         sigma_m=registration.seam_sigma_m,
         rms_m=registration.rms_m,
         confidence=confidence,
-        words=words,
+        summary=summary,
     )

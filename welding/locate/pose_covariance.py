@@ -1,7 +1,7 @@
-"""What the residuals of a plate's registration say about its pose: a 6x6 covariance, and the seam's sigma from it.
+"""Computes the 6x6 pose covariance of a plate's registration, and from it the sigma of the drawn seam.
 
-Neighbouring points of a scan err together, and all points of one edge may: which pixel still falls on the plate repeats
-along an edge. Both are modelled; the figures were set on simulated scans and are tested on others.
+Errors of neighbouring scan points are correlated, and so may be those of all points of one edge: which pixel is the last
+on the plate repeats along an edge. Both are modelled; the figures were tuned on simulated scans and are tested on others.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from weldcal.models.workpieces import Workpiece
 from weldcal.welding.locate.planes import Floats
 
 EDGE_PITCHES = 0.03  # error common to the points of an edge, in point distances
-SCATTER_PITCHES = 0.20  # what the outermost points of an edge scatter where their pixels' phases are mixed
-EDGE_NOISES = 0.25  # error of an edge in the noise of the face: what flies off it is the more, the noisier the scanner
+SCATTER_PITCHES = 0.20  # scatter of an edge's outermost points where their pixel phases are mixed
+EDGE_NOISES = 0.25  # error of an edge per noise of the face: flying points increase with the scanner's noise
 SLANT_PITCHES = 0.15  # error of an edge per tangent of the angle at which the face is seen
 INSET_PITCHES = 0.25  # common to all edges
 USUAL_SLANT_RAD = math.radians(8.0)
@@ -43,7 +43,7 @@ def outline_covariance(
     for edge in np.unique(edges):
         mine = edges == edge
         common = G[:, :-1][:, mine].sum(axis=1)
-        # Along the pixel rows all points of an edge have one phase: they scatter little and err together.
+        # Along the pixel rows all points of an edge have one phase: they scatter little and share one error.
         hidden = max(0.0, (SCATTER_PITCHES * pitch) ** 2 - float(np.var(off[mine])))
         variance = hidden + pitch**2 * (EDGE_PITCHES**2 + (SLANT_PITCHES * slant) ** 2) + (EDGE_NOISES * noise) ** 2
         middle += np.outer(common, common) * variance
@@ -64,7 +64,7 @@ def pose_covariance(face_P: Floats, in_plane: Floats, pitch: float) -> Floats:
 
 
 def points_per_independent(face_P: Floats, pitch: float) -> float:
-    """How many neighbouring points err as one: from how much means over patches vary, against single points."""
+    """Number of points per independent one, from the variance of means over patches against that of single points."""
     patch = np.floor(face_P[:, :2] / (6.0 * pitch)).astype(np.int64)
     patch -= patch.min(axis=0)
     number = patch[:, 0] * (int(patch[:, 1].max()) + 1) + patch[:, 1]
@@ -77,7 +77,7 @@ def points_per_independent(face_P: Floats, pitch: float) -> float:
 
 
 def moved_covariance(covariance: Floats, X_PQ: RigidTransform) -> Floats:
-    """The same uncertainty said of frame Q, which stands fast in P."""
+    """The covariance expressed for frame Q, which is fixed in P."""
     R, p = X_PQ.rotation().matrix(), X_PQ.translation()
     cross = np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
     A = np.zeros((6, 6))

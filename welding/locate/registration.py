@@ -1,10 +1,10 @@
-"""Where a plate lies, from one scan: its top face and its outline are the datums, the groove is not.
+"""Registers a flat plate to one scan by its top face and its outline; the groove is not used.
 
-On real parts the outline is where the drawing says and the groove is not, so nothing here looks at the groove. In
+On real parts the outline agrees with the drawing and the groove does not, so the groove is not used here. In
 order: horizontal planes near the guess (random triples, seeded); on each, the plate's outline slid over the edge of the
-seen face (an exhaustive search: flat parts give ICP nothing to hold on to sideways); then a robust plane through the
+seen face (an exhaustive search: ICP cannot observe the lateral position of flat parts); then a robust plane through the
 face and a robust fit of its edges to the outermost face points. Last, every stretch of the outline is checked against
-what was seen on both sides of it: a plate of another size contradicts its drawing and is refused.
+the points on both sides of it: a plate of another size contradicts its drawing and is refused.
 
 Accuracy in simulation (pixel pitch 1 mm, noise 0.1 mm, from above): 0.03 mm and 0.02 deg, or 0.15 mm and 0.1 deg where
 the plate's edges run exactly along the pixel rows. A slanted view adds about 0.3 mm per unit of tangent of its slant,
@@ -47,9 +47,9 @@ def register_workpiece(
     config: RegistrationConfig | None = None,
     eye_B: npt.ArrayLike | None = None,
 ) -> WorkpieceRegistration:
-    """Finds the plate in a scan (N,3) or (H,W,3), metres in base, NaN where unmeasured, near a guess.
+    """Register the plate to a scan (N,3) or (H,W,3), metres in base, NaN where unmeasured, near a guess.
 
-    `eye_B` (3,): where the scanner stands; it only serves the covariance, which assumes a usual slant without it.
+    `eye_B` (3,): the scanner's position; only the covariance uses it, and assumes a typical slant without it.
     A rectangle looks the same after half a turn: the guess decides. Raises WorkpieceNotFound when the scan shows no
     such plate there, InputError for a scan of the wrong shape.
     """
@@ -108,7 +108,7 @@ def _refine(
     inset, fit_rms = 0.0, math.inf
     for gate in (0.008, 0.004, 0.002):
         p = into(X_BP, near_edge)
-        # Points a little below the face are the side of the plate, which would move the edges the scanner looks at.
+        # Points a little below the face are the side of the plate and would shift the edges that face the scanner.
         face = p[(p[:, 2] > -0.5 * band) & (p[:, 2] < band)][:, :2]
         rims, edges = outermost(face, outline, max(gate, 2.0 * pitch), pitch)
         if len(edges) < 40 or len(np.unique(edges % 2)) < 2:

@@ -1,4 +1,4 @@
-"""What a registration says: where the plate lies, how well the scan agrees with its drawing; or why it is not that plate."""
+"""The result of a plate's registration, the check of the scan against the drawing, and the errors that refuse it."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class WorkpieceNotFound(WeldcalError):
 
 @dataclass(frozen=True)
 class RegistrationConfig:
-    """How far the guess may be off, and what counts as found.
+    """Limits on the guess and on the agreement of the scan with the drawing.
 
     `max_contradicted` is the largest share of the outline at which the scan may show material beyond it or the table
-    inside it; `min_supported` the smallest share at which it must show the face ending there (the rest is unseen);
+    inside it; `min_supported` the smallest share at which it must show the end of the face (the rest is unseen);
     `max_sigma_m` how uncertain the drawn seam may be, sideways.
     """
 
@@ -39,17 +39,17 @@ class RegistrationConfig:
 
 @dataclass(frozen=True, eq=False)
 class WorkpieceRegistration:
-    """Where the plate is: X_BP (frame P of models.workpieces), and how well the scan agrees with it.
+    """The pose X_BP of the plate (frame P of models.workpieces), and how well the scan agrees with it.
 
     rms_m             rms distance of the face's points from its plane, m
     outline_rms_m     rms distance of the face's outermost points from the outline, m (0.3 pixel pitches or so)
     inlier_fraction   share of the points above the plate's area that lie on its face (the groove and clutter do not)
-    supported, contradicted   shares of the outline where the scan confirms, or denies, that the face ends there
+    supported, contradicted   shares of the outline where the scan confirms, or contradicts, that the face ends there
     confidence        supported less contradicted, 0 to 1
     n_points          points on the face
     covariance        (6,6) of the small motion of P in P that leads from X_BP to the truth, rotation then translation
-    seam_sigma_m      what that covariance makes of the drawn seam: rms over it of the sigma sideways in the face, m.
-                      The groove's own displacement against the outline comes on top and is not seen here.
+    seam_sigma_m      lateral sigma of the drawn seam from that covariance, rms over the seam, in the face, m.
+                      The displacement of the real groove against the outline is not included.
     """
 
     X_BP: RigidTransform
@@ -64,15 +64,15 @@ class WorkpieceRegistration:
     seam_sigma_m: float
 
     @property
-    def words(self) -> str:
-        """What was found, for a person."""
+    def summary(self) -> str:
+        """One sentence that describes the result."""
         return (
-            f"{100 * self.supported:.0f} % of the outline seen where it is drawn, {100 * self.contradicted:.0f} % denied; "
+            f"{100 * self.supported:.0f} % of the outline agrees with the drawing, {100 * self.contradicted:.0f} % contradicts it; "
             f"the drawn seam is known to {1e3 * self.seam_sigma_m:.2f} mm"
         )
 
     def turned_round(self, workpiece: Workpiece) -> WorkpieceRegistration:
-        """The same with the part turned by 180 deg about the middle of its outline."""
+        """The same registration with the part turned by 180 deg about the middle of its outline."""
         x, y = 2.0 * workpiece.outline_P.mean(axis=0)
         turn = turned(float(x), float(y), math.pi)
         covariance = moved_covariance(self.covariance, turn)
@@ -80,7 +80,7 @@ class WorkpieceRegistration:
 
 
 def not_found(workpiece: Workpiece, why: str) -> WorkpieceNotFound:
-    """The refusal, with the plate's size."""
+    """The error that refuses a plate, with its size."""
     size = " x ".join(f"{1e3 * v:.0f}" for v in workpiece.size_m[:2])
     return WorkpieceNotFound(f"The scan shows no plate of {size} mm there: {why}")
 
@@ -88,10 +88,10 @@ def not_found(workpiece: Workpiece, why: str) -> WorkpieceNotFound:
 def agreement(
     p: Floats, workpiece: Workpiece, band: float, pitch: float, inset: float, config: RegistrationConfig
 ) -> tuple[float, float]:
-    """Shares of the outline that points (N,3) in the plate's frame, unrolled, confirm and deny.
+    """Shares of the outline that points (N,3) in the plate's frame, unrolled, confirm and contradict.
 
     Raises:
-        WorkpieceNotFound: too much is denied, or too little is seen.
+        WorkpieceNotFound: too much of the outline is contradicted, or too little is seen.
     """
     outline = workpiece.outline_P
     flat = np.abs(p[:, 2]) < band
@@ -115,7 +115,7 @@ def agreement(
 def known_well_enough(
     covariance: Floats, workpiece: Workpiece, noise: float, pitch: float, config: RegistrationConfig
 ) -> float:
-    """The drawn seam's sigma sideways, m.
+    """Lateral sigma of the drawn seam, m, checked against the limit.
 
     Raises:
         WorkpieceNotFound: it is larger than the limit.
@@ -123,7 +123,7 @@ def known_well_enough(
     uncertain = seam_sigma(covariance, workpiece)
     if uncertain > config.max_sigma_m:
         raise WorkpieceNotFound(
-            f"The plate is there, but its place is only known to {1e3 * uncertain:.2f} mm from this scan (noise "
+            f"The plate was found, but its position is only known to {1e3 * uncertain:.2f} mm from this scan (noise "
             f"{1e3 * noise:.2f} mm, points {1e3 * pitch:.1f} mm apart) and {1e3 * config.max_sigma_m:.2f} mm are required: "
             "use a finer scanner or move it nearer."
         )

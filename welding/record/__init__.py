@@ -1,1 +1,1 @@
-"""What a weld was: process, heat input and the weld log."""
+"""Welding process, figures of a weld, and the weld log."""

@@ -1,4 +1,4 @@
-"""What the weld was: the process, where the arc burned, how fast the torch went, its heat, how far it lay off the seam."""
+"""Computes the figures of a weld: arc events, torch speed, heat input, angles and path error."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array
 
 _BAND = 0.25  # a travel speed beyond +-25 % is commonly taken as another welding procedure
 
@@ -24,12 +24,12 @@ class ProcessLogError(InputError):
 
 
 class WeldProcessError(InputError):
-    """A welding process that cannot be."""
+    """A welding process with invalid values."""
 
 
 @dataclass(frozen=True)
 class WeldProcess:
-    """The arc as it is set at the power source: nominal values, not measured ones; None is not known, and never guessed.
+    """Nominal values of the arc as set at the power source, not measured; None means unknown.
 
     Attributes:
         name: a key of EFFICIENCY; current_A, voltage_V: both or neither.
@@ -121,7 +121,7 @@ class PathError:
 
 @dataclass(frozen=True)
 class SpeedStatistics:
-    """Torch speed over arc length.
+    """Statistics of the torch speed over arc length.
 
     Attributes:
         mean, least, most: m/s; cv: standard deviation over mean, by arc length.
@@ -139,7 +139,7 @@ class SpeedStatistics:
 
 
 def path_error(p_B: ArrayLike, seam: SeamCurve) -> PathError:
-    """How far each point lies off the true line, in the seam's own frame.
+    """Distance of each point from the true line, in the seam's frame.
 
     Args:
         p_B: (N,3) m, in order of travel.
@@ -174,7 +174,7 @@ def speed_statistics(
     Args:
         time: (N,) s; p_B: (N,3) torch point m; torch_on: (N,) flags.
         weld_speed: the wanted speed, m/s.
-        window_s: a speed is the path over this time, so that a robot's noise is not taken for speed.
+        window_s: a speed is the path over this time, which suppresses the robot's noise.
 
     Raises:
         ProcessLogError: the lengths differ, or the arc burned for less than three windows.
@@ -187,8 +187,8 @@ def speed_statistics(
         raise ProcessLogError("The arc never burned: there is no weld to evaluate.")
     t_on, p_on = t[on], p[on]
     if t_on[-1] - t_on[0] < 3.0 * window_s:
-        raise ProcessLogError("The arc burned too briefly to speak of a speed.")
-    # Evenly in time first; then each stretch counts by its length, as metal does.
+        raise ProcessLogError("The arc burned too briefly to compute a speed.")
+    # Sampled evenly in time first; then each stretch is weighted by its length, as the metal deposited is.
     even = np.arange(t_on[0], t_on[-1], window_s)
     q = np.column_stack([np.interp(even, t_on, p_on[:, k]) for k in range(3)])
     lengths = np.linalg.norm(np.diff(q, axis=0), axis=1)
@@ -203,7 +203,7 @@ def speed_statistics(
 
 
 def speed_along(time: ArrayLike, p_B: ArrayLike, window_s: float = 0.05) -> Array:
-    """Speed (N,) m/s of a point at each sample: its path over the window around it, so that a robot's noise is no speed.
+    """Speed (N,) m/s of a point at each sample: its path over a window around it, which suppresses the robot's noise.
 
     Args:
         time: (N,) s, rising; p_B: (N,3) m.

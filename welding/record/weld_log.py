@@ -1,4 +1,4 @@
-"""The weld log on disk: a CSV with one row per servo tick and a JSON header that says what each column is, and in what unit."""
+"""Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each column."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import WeldProcess
-from weldcal.welding.vectors import Array
 
 SCHEMA, VERSION = "weldcal weld log", 1
 CSV_NAME, HEADER_NAME = "weld.csv", "weld.json"
@@ -78,13 +78,13 @@ _NUMBERS = tuple(name for name in NAMES if name != "phase")
 
 @dataclass(frozen=True, eq=False)
 class WeldRecord:
-    """A weld, row by row.
+    """The columns of one weld, its process and its settings.
 
     Attributes:
         columns: (N,) arrays by the names in COLUMNS, SI units; NaN where a phase has no such thing.
         phase: (N,) words.
-        process: the arc as it was set.
-        settings: what the weld was asked for (weld_speed_m_s, delta_d_m ...) and where it is from (scenario, seed, robot ...).
+        process: the arc's nominal values.
+        settings: commanded values (weld_speed_m_s, delta_d_m ...) and origin (scenario, seed, robot ...).
     """
 
     columns: Mapping[str, Array]
@@ -165,7 +165,7 @@ def load_weld_log(path: Path | str) -> WeldRecord:
     text = _text(csv_path)
     if hashlib.sha256(text.encode()).hexdigest() != header["sha256"]:
         raise WeldLogError(
-            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; take the original."
+            f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; use the original."
         )
     rows = list(csv.reader(io.StringIO(text)))
     if len(rows) != header["rows"] + 1:
@@ -193,14 +193,14 @@ def _text(path: Path) -> str:
     except FileNotFoundError:
         raise WeldLogError(f"There is no {path}: a weld log is {CSV_NAME} and {HEADER_NAME} side by side.") from None
     except (OSError, UnicodeDecodeError) as problem:
-        raise WeldLogError(f"{path} cannot be read as text ({type(problem).__name__}); take the original.") from None
+        raise WeldLogError(f"{path} cannot be read as text ({type(problem).__name__}); use the original.") from None
 
 
 def _header(text: str, path: Path) -> dict[str, Any]:
     try:
         header = json.loads(text)
     except json.JSONDecodeError as problem:
-        raise WeldLogError(f"{path} is not whole JSON (line {problem.lineno}); take the original.") from None
+        raise WeldLogError(f"{path} is not complete JSON (line {problem.lineno}); use the original.") from None
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
         raise WeldLogError(f"{path} is not the header of a weld log: its schema is not '{SCHEMA}'.")
     if header.get("version") != VERSION:
@@ -208,7 +208,7 @@ def _header(text: str, path: Path) -> dict[str, Any]:
     wanted = {"rows": int, "sha256": str, "settings": dict, "process": dict}
     for key, kind in wanted.items():
         if not isinstance(header.get(key), kind):
-            raise WeldLogError(f"{path} has no usable '{key}'; take the original.")
+            raise WeldLogError(f"{path} has no usable '{key}'; use the original.")
     return header
 
 

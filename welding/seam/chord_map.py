@@ -1,4 +1,4 @@
-"""The chord map: what a seam asks of a tool whose torch trails its tip, known before the arc is lit."""
+"""Computes the motion that a planned seam requires of a tool whose torch trails its tip: turn, speed and travel angle."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, dot, norm
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array, dot, norm
 
 
 @dataclass(frozen=True)
 class ChordMap:
-    """Tip and torch on the seam, one row per torch position; every figure is of the nominal plan.
+    """Tip and torch on the nominal plan, one row per torch position.
 
     Attributes:
         s_torch, s_tip: (n,) arc lengths m of the two ends of the chord.
@@ -37,7 +37,7 @@ class ChordMap:
 
     @property
     def back_up_m(self) -> float:
-        """How far the torch falls behind where it has already been, m."""
+        """Longest distance that the torch must move backwards, m."""
         return float(np.max(np.maximum.accumulate(self.s_torch) - self.s_torch))
 
     @property
@@ -52,7 +52,7 @@ class ChordMap:
 
     @property
     def speed_loss(self) -> float:
-        """The largest share of the weld speed that the limits take from the torch, 0..1."""
+        """Largest relative loss of torch speed caused by the limits, 0..1."""
         top = float(np.max(self.torch_speed))
         return min(1.0, 1.0 - float(np.min(self.torch_speed)) / top) if top > 0.0 else 1.0
 
@@ -62,7 +62,7 @@ class ChordMap:
         return float(np.max(np.abs(self.travel)))
 
     def travel_at(self, s: Array) -> Array:
-        """The travel angle rad foretold where the torch is at arc length s (n,) m."""
+        """The predicted travel angle rad where the torch is at arc length s (n,) m."""
         return np.interp(s, np.maximum.accumulate(self.s_torch), self.travel)
 
 
@@ -75,10 +75,10 @@ def chord_map(
     spacing: float = 0.5e-3,
     tip_left: float = 0.0,
 ) -> ChordMap:
-    """Run the chord along the plan with both ends on it, from the torch d before the seam to the torch at its end.
+    """Move the chord along the plan with both ends on it, from the torch d before the seam to the torch at its end.
 
     The pairs (tip, torch) at distance d form a curve whose tangent is (n_d . n_t, t_s . u): the projective law itself.
-    It is followed by its own length, so a tip that stands while the torch moves, or a torch that backs up, is seen.
+    It is followed by its own length, which covers a tip at rest while the torch moves, and a torch that backs up.
 
     Args:
         plan: the seam; straight beyond its ends.
@@ -96,7 +96,7 @@ def chord_map(
         size = math.hypot(c_tip, c_torch)
         if size > 1e-3:
             way = (c_torch / size, c_tip / size)
-            # Through the fold of a hairpin the pair keeps its sense, the torch alone may reverse.
+            # Through the fold of a hairpin the pair keeps its direction; only the torch may reverse.
             sense = 1.0 if way[0] * heading[0] + way[1] * heading[1] >= 0.0 else -1.0
             heading = (sense * way[0], sense * way[1])
         tip, torch = tip + spacing * heading[0], torch + spacing * heading[1]
@@ -108,7 +108,7 @@ def chord_map(
                 break
         pairs.append((tip, torch))
         farthest = max(farthest, torch)
-        # A torch a whole chord back is a tool turned round in a hairpin: nothing further is worth knowing.
+        # A torch a whole chord back means a tool turned round in a hairpin: the rest is not needed.
         if torch >= plan.length or torch < farthest - d:
             break
     s_tip, s_torch = np.array(pairs).T
@@ -128,7 +128,7 @@ def chord_map(
 
 
 def _ends(plan: SeamCurve, tip: float, torch: float, tip_left: float) -> tuple[float, float, float]:
-    """(tip's way . u, torch's way . u, distance m) of a pair of arc lengths; beside a bend the tip's way is shorter."""
+    """(tip direction . u, torch direction . u, distance m) of a pair of arc lengths; on the inside of a bend the tip's path is shorter."""
     a, b = plan.frame(tip), plan.frame(torch)
     gap = a.position - b.position
     share = 1.0

@@ -1,4 +1,4 @@
-"""A corner that the tip sprang across: the two sides it felt, prolonged until they meet, and rounded a little."""
+"""Reconstructs a corner that the tip jumped across: extends the two measured sides until they meet and rounds them."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.welding.vectors import Array, dot, norm, unit
+from weldcal.welding.numerics import Array, dot, norm, unit
 
 
 @dataclass(frozen=True)
 class CornerConfig:
-    """When a jump of the tip is a corner, and how it is filled in.
+    """Thresholds for a jump of the tip at a corner, and the shape that is filled in.
 
-    A tip held `delta_d` to the side springs across every convex corner of a lesser radius and feels nothing of it.
+    A tip held `delta_d` to the side jumps across every convex corner of a smaller radius without measuring it.
 
     Attributes:
-        jump_m: a step between points that is a hole in what was felt, where it also is `jump_steps` times the step before.
+        jump_m: a step between points that is a gap in the measurement, if it also is `jump_steps` times the step before.
         side_m: length of each side that is fitted; points: how many it needs.
         turn_rad: sides that turn by less are one side.
         reach_m: farther than this from the points felt the sides do not meet.
-        radius_m: of the rounding; half of delta_d halves the largest error over all radii that spring.
+        radius_m: of the rounding; half of delta_d halves the largest error over all radii that are jumped.
         spacing_m: of the points filled in.
         planned_radius_m: where the plan, which rounds its corners, bends less than this within `reach_m` there is none.
     """
@@ -49,7 +49,7 @@ class Corner:
 
 
 def is_jump(last: Array, point: Array, config: CornerConfig) -> bool:
-    """Whether a point (3,) m comes after a hole in the points (n,3) m before it."""
+    """Whether a gap separates a point (3,) m from the points (n,3) m before it."""
     if len(last) < 4:
         return False
     step = norm(point - last[-1])
@@ -57,7 +57,7 @@ def is_jump(last: Array, point: Array, config: CornerConfig) -> bool:
 
 
 def fill_corner(before: Array, after: Array, config: CornerConfig) -> Corner | None:
-    """The corner between two sides, each (n,3) m in order of travel; None where they do not make one.
+    """Compute the corner between two sides, each (n,3) m in order of travel; None where there is none.
 
     The lines through the sides are met where they pass closest in space.
     """

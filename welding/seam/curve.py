@@ -1,4 +1,4 @@
-"""A weld seam as a curve in space: where it is, where it heads and which way is up, by its own arc length."""
+"""A weld seam as an arc-length spline: position, tangent, normal, up-normal, curvature and projection."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pydrake.math import RigidTransform
 from scipy.interpolate import CubicSpline, make_smoothing_spline
 
 from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array
+from weldcal.welding.numerics import Array
 
-_REPEAT_M = 1e-6  # two neighbours closer than a micrometre are one point told twice
+_REPEAT_M = 1e-6  # neighbours closer than a micrometre are the same point
 _KNOT_M = 1e-3  # knots at most a millimetre apart: a 1 mm radius is still a curve
 
 
@@ -69,7 +69,7 @@ class SeamCurve:
             points: (N,3) in m.
             up: (3,), or (N,3) where the surface bends; need not be unit length.
             smoothing: None interpolates; a number is the penalty of a cubic smoothing spline over arc length, in m^3
-                (features much shorter than its fourth root times the fourth root of the spacing are ironed out).
+                (features much shorter than its fourth root times the fourth root of the spacing are removed).
 
         Raises:
             TooFewSeamPoints, RepeatedSeamPoints, NonFiniteSeamPoints, SeamError: what the points lack.
@@ -94,7 +94,7 @@ class SeamCurve:
         if smoothing is not None and len(p) >= 5:
             p = np.column_stack([make_smoothing_spline(s, p[:, k], lam=smoothing)(s) for k in range(3)])
             s = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))])
-        # Twice: measure the arc of the spline, lay knots evenly along it, spline again; its speed is 1 within 1e-4.
+        # Twice: measure the arc length of the spline, place even knots, fit again; its speed is then 1 within 1e-4.
         for _ in range(2):
             curve = CubicSpline(s, np.column_stack([p, b]))
             fine = np.linspace(0.0, s[-1], 8 * max(len(s), math.ceil(s[-1] / _KNOT_M)) + 1)
@@ -109,7 +109,7 @@ class SeamCurve:
         coefficients = np.ascontiguousarray(np.transpose(CubicSpline(s, p).c, (1, 0, 2)))
         tangents = coefficients[:, 2]
         if (np.abs(np.einsum("ij,ij->i", tangents, b[:-1])) > 0.9).any():
-            raise SeamError("The up-normal of a seam must stand across it; here it points along the seam.")
+            raise SeamError("The up-normal of a seam must be perpendicular to it; here it points along the seam.")
         return cls(s, coefficients, b)
 
     @property
@@ -175,7 +175,7 @@ class SeamCurve:
         return float(self.knots[1]), float(self.knots[-1])
 
     def frame(self, s: float) -> SeamFrame:
-        """Everything about the seam at one arc length s m, in plain floats: five times as fast as in arrays."""
+        """The seam's frame and curvature at one arc length s m, in plain floats: five times as fast as with arrays."""
         step, last = self._scale
         inside = 0.0 if s < 0.0 else last if s > last else s
         rows = self._rows
@@ -229,7 +229,7 @@ class SeamCurve:
             slope = dx * dx + dy * dy + dz * dz
             along = gx * dx + gy * dy + gz * dz
             if s == inside:
-                # A bend towards p sharper than the distance would turn Newton's step round: keep half of the slope.
+                # A bend towards p tighter than the distance would reverse Newton's step: keep half of the slope.
                 bend = 6.0 * x * (gx * ax + gy * ay + gz * az) + 2.0 * (gx * bx + gy * by + gz * bz)
                 slope = max(slope - bend, 0.5 * slope)
             step_s = along / slope - (s - inside)

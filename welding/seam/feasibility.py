@@ -1,4 +1,4 @@
-"""What stands against a seam, named before the arc is lit, and where to split it so that nothing does."""
+"""Checks whether a seam can be welded in one go, and where to split it if not."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _SPACING_M = 1.0e-3
 
 
 class InfeasibleSeam(WeldcalError):
-    """No trailing torch can weld this seam in one go: it would have to run backwards, stand, or leave its windows."""
+    """A trailing torch cannot weld this seam in one go: it would have to run backwards, stop, or leave its windows."""
 
 
 @dataclass(frozen=True)
 class SeamWindows:
-    """What a seam may ask of the tool.
+    """Limits on the motion that a seam may require of the tool.
 
     Attributes:
         back_up_m: how far the torch may have to run backwards: what the plan's noise makes of a right angle.
@@ -41,7 +41,7 @@ class SeamWindows:
 
 @dataclass(frozen=True)
 class SeamProblem:
-    """One thing that stands against a seam: its kind, the torch's arc length m, and one sentence."""
+    """One reason why a seam cannot be welded in one go: its kind, the torch's arc length m, and one sentence."""
 
     kind: str
     s: float
@@ -50,7 +50,7 @@ class SeamProblem:
 
 @dataclass(frozen=True)
 class SeamReport:
-    """A seam's chord map, what stands against it, and where to split it (arc lengths m) when that helps."""
+    """A seam's chord map, its problems, and where to split it (arc lengths m) when that helps."""
 
     chart: ChordMap
     problems: tuple[SeamProblem, ...]
@@ -63,7 +63,7 @@ class SeamReport:
 
 
 def assess_seam(plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindows | None = None) -> SeamReport:
-    """The chord map of a seam and everything that stands against welding it in one go.
+    """Compute the chord map of a seam and every problem of welding it in one go.
 
     Args:
         plan: the line that tip and torch run on; d: chord m; weld_speed: m/s.
@@ -77,25 +77,25 @@ def assess_seam(plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindo
 
 
 def check_feasible(plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindows | None = None) -> ChordMap:
-    """The chord map of a seam that can be welded in one go.
+    """The chord map of a feasible seam.
 
     Raises:
-        InfeasibleSeam: naming the first thing against it, and where to split the seam if that helps.
+        InfeasibleSeam: naming its first problem, and where to split the seam if that helps.
     """
     report = assess_seam(plan, d, weld_speed, windows)
     if report.problems:
         places = " and ".join(f"{1e3 * s:.0f}" for s in report.splits)
-        remedy = (
+        action = (
             f"split the weld at {places} mm or shorten the tool" if places else "shorten the tool or change the seam"
         )
-        raise InfeasibleSeam(f"Plan infeasible: {report.problems[0].sentence}; {remedy}.")
+        raise InfeasibleSeam(f"Plan infeasible: {report.problems[0].sentence}; {action}.")
     return report.chart
 
 
 def split_seam(
     plan: SeamCurve, d: float, weld_speed: float, windows: SeamWindows | None = None
 ) -> tuple[SeamCurve, ...]:
-    """The seam as pieces that each can be welded in one go, in order; the seam itself when nothing is against it.
+    """Split the seam into pieces that each can be welded in one go, in order; a feasible seam is one piece.
 
     Raises:
         InfeasibleSeam: no split helps.
@@ -124,7 +124,7 @@ def _problems(plan: SeamCurve, chart: ChordMap, d: float, limits: SeamWindows) -
         text = f"{within}, and the torch would have to run {1e3 * chart.back_up_m:.1f} mm backwards"
         found.append(SeamProblem("back-up", place, text))
     elif chart.min_conditioning < limits.conditioning:
-        text = f"{within}, and the tool stands square to both ends of the seam"
+        text = f"{within}, and the tool is square to both ends of the seam"
         found.append(SeamProblem("conditioning", place, text))
     sharp, where = _sharpest(plan)
     if sharp > limits.sharp_rad:
@@ -156,14 +156,14 @@ def _sharpest(plan: SeamCurve) -> tuple[float, float]:
 
 
 def _splits(plan: SeamCurve, d: float, weld_speed: float, limits: SeamWindows, depth: int = 4) -> tuple[float, ...]:
-    """Where to split a seam that turns too far: at the middle of the turn, and the pieces again as need be."""
+    """Arc lengths at which to split a seam that turns too far: the middle of the turn, and recursively in the pieces."""
     chart = chord_map(plan, d, weld_speed, spacing=_SPACING_M)
     kinds = {p.kind for p in _problems(plan, chart, d, limits)}
     if not kinds or depth == 0 or plan.length < 0.030 or not kinds <= {"back-up", "conditioning", "cusp"}:
         return ()
     sharp, where = _sharpest(plan)
     if sharp < math.radians(50.0):
-        # A wide turn: the middle of what is turned within the chord where it is most.
+        # A wide turn: its middle within the chord that turns most.
         k = int(np.argmax(np.abs(chart.turn)))
         low, high = max(0.0, float(chart.s_torch[k])), min(plan.length, float(chart.s_tip[k]))
         s = np.arange(low, high, _SPACING_M)

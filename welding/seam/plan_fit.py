@@ -1,4 +1,4 @@
-"""The plan, moved rigidly onto what the tip has felt: tangents, preview and a path through gaps come from it."""
+"""Registers the plan rigidly to the tactile points: source of tangents, of the preview and of the path through gaps."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array, pose, unit
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array, pose, unit
 
 
 @dataclass(frozen=True)
 class PlanFitConfig:
-    """How far the plan may be moved, and on how much evidence.
+    """Weights of the plan's registration to the tactile points.
 
-    The along-track shift is invisible on a straight seam, so the prior is real and neighbouring points count as one.
+    The along-track shift is unobservable on a straight seam, so a prior holds it; correlated neighbours count as one point.
 
     Attributes:
         window_m: length of the newest tactile points used.
         spacing_m: distance between the points used.
         correlation_m: length of seam that counts as one independent measurement (the plan's warp is smooth).
-        sigma_m: what a point may differ from the moved plan.
+        sigma_m: sigma of a point about the moved plan.
         prior_angle_rad, prior_shift_m: one sigma of the plan's pose error.
     """
 
@@ -36,7 +36,7 @@ class PlanFitConfig:
 
 @dataclass(frozen=True)
 class PlanFit:
-    """A plan and the motion (angle about its up-normal, shift) that lays it on the tactile points.
+    """A plan and the motion (angle about its up-normal, shift) that registers it to the tactile points.
 
     Attributes:
         plan: the tip line as planned, in B.
@@ -53,12 +53,12 @@ class PlanFit:
 
     @classmethod
     def start(cls, plan: SeamCurve) -> PlanFit:
-        """The plan as it came."""
+        """The fit before any tactile point: the plan unmoved."""
         return cls(plan, plan)
 
 
 def plan_motion(plan: SeamCurve, parameters: Array) -> RigidTransform:
-    """The motion X_BB' of the plan for parameters (4,): it turns about its own middle."""
+    """The rigid motion of the plan in B for parameters (4,), with its rotation about the plan's middle."""
     axes, pivot = _axes(plan)
     c, s = math.cos(parameters[0]), math.sin(parameters[0])
     turn = axes.T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ axes

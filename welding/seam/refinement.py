@@ -1,4 +1,4 @@
-"""The seam as the tip felt it: points committed only once the contact that gave them has proved itself."""
+"""Refines the seam by tactile points, each committed only after further frames confirm its contact."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.corner import CornerConfig, fill_corner, is_jump
-from weldcal.welding.vectors import Array
 
 _EMPTY_POINTS = np.zeros((0, 3))
 _EMPTY_ARC = np.zeros(0)
-_STEPS = 6  # frames over which the tip's own way is measured
-_SLOW = 0.5  # of the progress: less is a tip that is held up
-_FRAME_M = 1.5e-3  # no frame's progress is as long (40 mm/s at 30 Hz): beyond it lies a gap
+_STEPS = 6  # frames over which the tip's own path is measured
+_SLOW = 0.5  # share of the progress below which the tip is held back
+_FRAME_M = 1.5e-3  # longer than one frame's progress (40 mm/s at 30 Hz): a longer step is a gap
 _LEAST_STEP_M = 0.01e-3
-_STICKING = 0.25  # path per progress: below it the tip all but stands
+_STICKING = 0.25  # path per progress below which the tip is almost at rest
 
 
 class PendingPoint(NamedTuple):
@@ -30,7 +30,7 @@ class PendingPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class RefinementConfig:
-    """When a point counts, and how the path is smoothed.
+    """When a tactile point is committed, and how the path is smoothed.
 
     Attributes:
         frames_to_commit: further good frames a point waits for.
@@ -41,7 +41,7 @@ class RefinementConfig:
         fit_points: effective points it grows for.
         bridge_from_m: farther than this from any point a gap is bridged on the moved plan instead.
         slope_ridge: weight that holds the fitted slope to the plan's, in effective points at one fit width.
-        corner: how a corner is filled in that the tip sprang across.
+        corner: how a corner that the tip jumped across is filled in.
     """
 
     frames_to_commit: int = 4
@@ -58,13 +58,13 @@ class RefinementConfig:
 
 @dataclass(frozen=True)
 class RefinedSeam:
-    """Committed tactile points and those still pending. Grows by new values; nothing in it is ever changed.
+    """Committed tactile points and those still pending; immutable.
 
     Attributes:
         points: (n,3) m in B, the tip's centre.
-        arc: (n,) m, the commanded tip progress at each point and what the tip sprang beyond it, increasing.
+        arc: (n,) m, the commanded tip progress at each point plus the tip's jumps, increasing.
         pending: points waiting for confirmation, oldest first.
-        sprung: what the tip sprang so far, less what it was held up, m.
+        jumped: sum of the tip's jumps so far, less the progress it was held back, m.
         jump: number of points (before, after) a jump that is not filled in yet, or None.
         corners: (k,) arcs m of corners filled in.
     """
@@ -72,13 +72,13 @@ class RefinedSeam:
     points: Array
     arc: Array
     pending: tuple[PendingPoint, ...] = ()
-    sprung: float = 0.0
+    jumped: float = 0.0
     jump: tuple[int, int] | None = None
     corners: Array = field(default_factory=lambda: _EMPTY_ARC)
 
     @classmethod
     def empty(cls) -> RefinedSeam:
-        """A seam nobody has touched yet."""
+        """A seam without tactile points."""
         return cls(_EMPTY_POINTS, _EMPTY_ARC)
 
     def __len__(self) -> int:
@@ -93,41 +93,41 @@ def tip_point(X_BT_at_capture: RigidTransform, deflection_T: Array) -> Array:
 def refine(
     seam: RefinedSeam, point: Array, arc: float, config: RefinementConfig, is_corner: bool = True
 ) -> RefinedSeam:
-    """The seam after one more good frame: its point queues, and the oldest of a full queue is committed.
+    """The seam after one more valid frame: its point is queued, and the oldest of a full queue is committed.
 
-    A hole in the points is filled in as a corner only where the plan has one (`is_corner`): in a gentle bend a tip that
-    stuck and let go leaves a hole too.
+    A gap in the points is filled in as a corner only where the plan has one (`is_corner`): a tip that sticks and slips in a
+    gentle bend leaves a gap too.
     """
     pending = (*seam.pending, PendingPoint(point, arc))
     if len(pending) <= config.frames_to_commit:
         return replace(seam, pending=pending)
     oldest, pending = pending[0], pending[1:]
     seam = replace(seam, pending=pending)
-    arc = oldest.arc + seam.sprung
+    arc = oldest.arc + seam.jumped
     # The path is a function of progress: a point that does not advance it would make the fit's slope meaningless.
     if len(seam) and arc <= seam.arc[-1] + 1e-6:
         return seam
     if len(seam) and is_jump(seam.points[-4:], oldest.point, config.corner):
         step = float(np.linalg.norm(oldest.point - seam.points[-1]))
         extra = max(0.0, step - (arc - float(seam.arc[-1])))
-        # What was felt in the middle of a jump belongs to neither side.
+        # Points measured in the middle of a jump belong to neither side.
         before = len(seam) if seam.jump is None or len(seam) - seam.jump[1] > 4 else seam.jump[0]
-        seam = replace(seam, sprung=seam.sprung + extra, jump=(before, len(seam)) if is_corner else None)
+        seam = replace(seam, jumped=seam.jumped + extra, jump=(before, len(seam)) if is_corner else None)
         arc += extra
     elif len(seam) >= _STEPS:
-        # Where the tip hardly comes on, as in a concave corner that the rest point goes round outside, the parameter goes
-        # with the tip: points a third as far apart as their parameters tell the direction no worse, points that stand do.
+        # Where the tip hardly advances, as in a concave corner that the rest point goes round outside, the parameter follows
+        # the tip: points a third as far apart as their parameters give the direction as well, points at rest do not.
         step = arc - float(seam.arc[-1])
         way = max(float(np.linalg.norm(oldest.point - seam.points[-_STEPS])) / _STEPS, _LEAST_STEP_M)
         if way < _SLOW * step < _SLOW * _FRAME_M:
-            seam = replace(seam, sprung=seam.sprung + way - step)
+            seam = replace(seam, jumped=seam.jumped + way - step)
             arc += way - step
     seam = replace(seam, points=np.vstack([seam.points, oldest.point]), arc=np.append(seam.arc, arc))
     return _filled(seam, config.corner) if seam.jump is not None else seam
 
 
 def _filled(seam: RefinedSeam, config: CornerConfig) -> RefinedSeam:
-    """The seam with its jump filled in, once the side behind it is long enough to be fitted."""
+    """The seam with its jump filled in, once the side after it is long enough to be fitted."""
     assert seam.jump is not None
     before, after = seam.jump
     if seam.arc[-1] - seam.arc[after] < config.side_m and len(seam) - after < 4 * config.points:
@@ -142,14 +142,14 @@ def _filled(seam: RefinedSeam, config: CornerConfig) -> RefinedSeam:
         seam,
         points=np.vstack([seam.points[:before], corner.points, seam.points[after:]]),
         arc=np.concatenate([seam.arc[:before], start + corner.along, seam.arc[after:] + extra]),
-        sprung=seam.sprung + extra,
+        jumped=seam.jumped + extra,
         jump=None,
         corners=np.append(seam.corners, start + corner.middle),
     )
 
 
 def drop_pending(seam: RefinedSeam) -> RefinedSeam:
-    """The seam after contact was lost: points felt while it was going are not the seam."""
+    """The seam after contact was lost, without the points measured while contact was going."""
     return replace(seam, pending=()) if seam.pending else seam
 
 
@@ -178,7 +178,7 @@ def local_fit(
     config: RefinementConfig,
     least_radius: float = 0.0,
 ) -> LocalFit | None:
-    """A quadratic fitted to the points around `arc`, on both sides of it (the tip is a chord ahead of the torch).
+    """Fit a quadratic to the points around `arc`, on both sides of it (the tip is a chord ahead of the torch).
 
     Args:
         seam: committed points.
@@ -194,10 +194,10 @@ def local_fit(
     sigma = max(sigma, min(math.sqrt(config.fit_sagitta_m * least_radius), config.fit_sigma_wide_m))
     widest = max(config.fit_sigma_max_m, sigma)
     if len(seam.corners):
-        # Round a corner that was filled in the points are dense and free of noise: a wide fit would cut it.
+        # The points of a corner that was filled in are dense and free of noise: a wide fit would cut the corner.
         sigma = max(min(sigma, 0.4 * float(np.min(np.abs(seam.corners - arc)))), 0.3e-3)
     # At the ends points lie on one side only, and a quadratic's end is three times as noisy as its middle: a window up to
-    # twice as wide takes that back.
+    # twice as wide compensates for that.
     edge = min(arc - float(seam.arc[0]), float(seam.arc[-1]) - arc) if len(seam) else math.inf
     if edge < 2.0 * sigma and not len(seam.corners):
         sigma = max(sigma, min((2.0 - max(edge, 0.0) / (2.0 * sigma)) * sigma, config.fit_sigma_max_m, 0.2 * radius))
@@ -228,7 +228,7 @@ def local_fit(
     speed = math.sqrt(float(slope @ slope))
     if not math.isfinite(speed):
         return None
-    # The way the fitted point itself goes when the window moves on is the slope plus what the moving weights add: where
+    # The fitted point moves along the slope plus the effect of the moving weights as the window advances: where
     # the curvature jumps the two differ by 0.2 sigma/R, and a torch that headed along the slope would leave the point.
     left_over = seam.points[low:high] - seam.points[low] - basis.T @ c
     slope = slope + np.linalg.solve(normal, (weighted * x) @ left_over)[0] / sigma

@@ -1,1 +1,1 @@
-"""Touching and following a seam: contact, steering laws, guards and the servo's step."""
+"""Touches and follows a seam: settings, contact, steering laws, guards and the servo's step."""

@@ -1,4 +1,4 @@
-"""What one finger-camera frame says: where the tip is, how hard it leans, and whether it still touches."""
+"""Updates the servo's state from finger-camera frames: tip point, deflection, contact and tactile points."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, changed, clip, dot, finite, norm
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.plan_fit import add_point
 from weldcal.welding.seam.refinement import drop_pending, refine, tip_point
-from weldcal.welding.servo.evolve import changed
-from weldcal.welding.servo.state import Measurement, Phase, ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import Array, clip, dot, finite, norm
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Measurement, Phase, ServoSample, WeldingState
 
 
 def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
@@ -27,7 +27,7 @@ def is_new_frame(state: WeldingState, sample: ServoSample) -> bool:
 
 
 def freshness(state: WeldingState, time: float) -> float:
-    """How much the newest frame still says of the tip at a time s: 1 up to three periods of the camera, 0 from six on."""
+    """Weight of the newest frame at a time s: 1 up to three camera periods of age, 0 from six on."""
     return clip(2.0 - (time - max(state.frame_time, state.started)) / 0.1, 0.0, 1.0)
 
 
@@ -38,13 +38,13 @@ def with_frame(state: WeldingState, sample: ServoSample, seam: SeamFrame, config
     deflection = (frame.deflection_T if state.zero is None else frame.deflection_T - state.zero) / state.gain
     X_BT = frame.X_BT_at_capture
     point = tip_point(X_BT, deflection)
-    # The published laws go by the plan's frame alone.
-    minded = state.proven and config.law == "guarded"
-    felt = felt_turn(state, point, seam, config) if minded else 0.0
+    # The published laws use the plan's frame alone.
+    corrects_frame = state.proven and config.law == "guarded"
+    felt = felt_turn(state, point, seam, config) if corrects_frame else 0.0
     seam = turned(seam, felt)
     p_BT = np.asarray(X_BT.translation())
     delta = p_BT - point
-    steer = _steering(state, delta, seam, config) if minded else 0.0
+    steer = _steering(state, delta, seam, config) if corrects_frame else 0.0
     seam = turned(seam, steer)
     delta_n, delta_axial = dot(delta, seam.normal), -dot(delta, seam.up)
     same = state.reading is not None and bool(np.array_equal(frame.deflection_T, state.reading))
@@ -70,22 +70,23 @@ def turned(seam: SeamFrame, angle: float) -> SeamFrame:
 
 
 def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoConfig) -> float:
-    """How far the path just felt turns from the plan's tangent, rad about up; zero where they agree.
+    """Angle from the plan's tangent to the direction of the last tactile points, rad about up; zero where they agree.
 
     A plan rounds its corners, and beside a rounded corner its tangent is wrong by half of the turn. The direction of
-    the last points is noisier than the plan's, so that it is believed only where the two plainly differ.
+    the last points is noisier than the plan's, so it is used only where the two differ clearly.
     """
+    felt_path = config.felt_path
     seam = state.refined
     points = [point, *(q.point for q in reversed(seam.pending))]
-    # Going over ground that was felt on the way back, the last points committed lie ahead.
-    if not (seam.pending and len(seam) and seam.pending[0].arc + seam.sprung < seam.arc[-1]):
+    # On a stretch that was measured backwards the last committed points lie ahead.
+    if not (seam.pending and len(seam) and seam.pending[0].arc + seam.jumped < seam.arc[-1]):
         points += [*seam.points[-1:-13:-1]]
     x, y = [0.0], [0.0]
     for earlier in points[1:]:
         back = earlier - point
         x.append(dot(back, at.tangent))
         y.append(dot(back, at.normal))
-        if len(x) >= config.felt_points and math.hypot(x[-1], y[-1]) >= config.felt_length_m:
+        if len(x) >= felt_path.points and math.hypot(x[-1], y[-1]) >= felt_path.length_m:
             break
     else:
         return 0.0
@@ -95,34 +96,33 @@ def felt_turn(state: WeldingState, point: Array, at: SeamFrame, config: ServoCon
     yy = sum((v - my) ** 2 for v in y)
     xy = sum((v - mx) * (w - my) for v, w in zip(x, y, strict=True))
     angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
-    # The principal axis has no sense; the way from the earliest to the newest point has.
+    # The principal axis has no direction; the path from the earliest to the newest point has.
     if math.cos(angle) * x[-1] + math.sin(angle) * y[-1] > 0.0:
         angle = math.remainder(angle + math.pi, 2.0 * math.pi)
-    share = (abs(angle) - config.felt_dead_rad) / (config.felt_full_rad - config.felt_dead_rad)
+    share = (abs(angle) - felt_path.dead_rad) / (felt_path.full_rad - felt_path.dead_rad)
     return clip(angle, -0.5 * math.pi, 0.5 * math.pi) * clip(share, 0.0, 1.0)
 
 
 def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoConfig) -> float:
-    """How far to turn the tip's frame about up, rad, where the deformation contradicts the plan's normal.
+    """Angle to turn the tip's frame about up, rad, where the deformation contradicts the plan's normal.
 
-    The tip leans against what stops it. When that is far from the plan's normal the plan is wrong there, and pressing
-    on along its tangent would jam the tip; friction's steady drag is no such evidence. Two things explain the lean: a
+    The tip leans against the wall that stops it. A lean far from the plan's normal shows that the plan is wrong there, and
+    moving on along its tangent would jam the tip; steady drag by friction is not such evidence. Two causes explain the lean: a
     plan that is ahead or behind at a corner, whose own tangent nearby then leaves no lean; or a wall where none is
     planned, to which the frame turns.
     """
+    steering = config.steering
     lean, delta_n = dot(delta, seam.tangent), dot(delta, seam.normal)
-    excess = max(0.0, abs(lean) - config.drag_m)
-    angle = -math.copysign(math.atan2(excess, max(delta_n, 0.5 * config.delta_d_m)), lean)
-    share = clip(
-        (abs(angle) - config.steering_dead_rad) / (config.steering_full_rad - config.steering_dead_rad), 0.0, 1.0
-    )
+    excess = max(0.0, abs(lean) - steering.drag_m)
+    angle = -math.copysign(math.atan2(excess, max(delta_n, 0.5 * config.deflection.delta_d_m)), lean)
+    share = clip((abs(angle) - steering.dead_rad) / (steering.full_rad - steering.dead_rad), 0.0, 1.0)
     if share == 0.0 or state.plan_fit is None:
         return 0.0
-    curve, s, reach = state.plan_fit.curve, state.s_tip, config.steering_reach_m
+    curve, s, reach = state.plan_fit.curve, state.s_tip, steering.reach_m
     best = excess
     for k in (-8, -7, -6, -5, -4, -3, -2, -1, 1, 2, 3, 4, 5, 6, 7, 8):
         there = curve.frame(s + k * reach / 8.0).tangent
-        cost = max(0.0, abs(dot(delta, there)) - config.drag_m) + 0.02 * reach * abs(k)
+        cost = max(0.0, abs(dot(delta, there)) - steering.drag_m) + 0.02 * reach * abs(k)
         if cost < best:
             best = cost
             angle = math.atan2(dot(there, seam.normal), dot(there, seam.tangent))
@@ -130,30 +130,31 @@ def _steering(state: WeldingState, delta: Array, seam: SeamFrame, config: ServoC
 
 
 def beyond_limit(state: WeldingState, config: ServoConfig) -> bool:
-    """Whether the newest frame shows the tip pushed beyond what its springs allow."""
+    """Whether the newest frame shows a deflection beyond the tip's mechanical limits."""
     if state.measurement is None:
         return False
     lateral = math.sqrt(max(0.0, norm(state.measurement.delta) ** 2 - state.delta_axial**2))
-    limits = config.contact
-    return lateral > limits.limit_lateral_m or state.delta_axial > limits.limit_axial_m
+    limits = config.faults
+    return lateral > limits.lateral_m or state.delta_axial > limits.axial_m
 
 
 def contact_lost(before: WeldingState, now: WeldingState, config: ServoConfig) -> bool:
-    """Whether contact went between two frames: abrupt unloading, or too little deflection to call it contact."""
+    """Whether contact was lost between two frames: abrupt unloading, or too little deflection."""
     limits = config.contact
     if not now.proven:
         return now.delta_axial < 0.5 * limits.regain_axial_m
-    # Both springs let go at once; one falling alone is a noisy frame or a rough wall.
+    # Both springs unload at once; one alone is a noisy frame or a rough wall.
     unloaded = min(before.delta_n - now.delta_n, before.delta_axial - now.delta_axial) > limits.drop_m
     return unloaded or now.delta_n < limits.normal_min_m or now.delta_axial < limits.axial_min_m
 
 
 def with_point(state: WeldingState, config: ServoConfig) -> WeldingState:
     """The state with its newest tactile point queued, the oldest committed, and the plan moved onto the points."""
+    deflection = config.deflection
     assert state.measurement is not None
     assert state.plan_fit is not None
-    proven = state.proven or state.delta_n > 0.5 * config.delta_d_m
-    if not (proven or state.delta_axial > 0.33 * config.axial_d_m):
+    proven = state.proven or state.delta_n > 0.5 * deflection.delta_d_m
+    if not (proven or state.delta_axial > 0.33 * deflection.axial_d_m):
         return changed(state, refined=drop_pending(state.refined), proven=proven)
     arc = progress_at(state, state.measurement.capture_time)
     plan_fit, corner = state.plan_fit, config.refinement.corner

@@ -1,4 +1,4 @@
-"""The seam's start by feel: the seated tip is drawn back over it, so that the torch begins on ground that was felt."""
+"""Measures the seam's start: draws the seated tip back over it, so that the torch starts on tactile points."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ from dataclasses import replace
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, changed, clip, dot
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import add_point
 from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 from weldcal.welding.servo.contact import contact_lost
-from weldcal.welding.servo.evolve import changed
-from weldcal.welding.servo.state import ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import Array, clip, dot
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import ServoSample, WeldingState
 
-BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH that are taken here
+BACK_STEPS = ("back", "lift", "enter")  # steps of TOUCH handled here
 
-_STRAIGHT_RAD = math.radians(10.0)  # where the plan turns by more than this
-_BESIDE_M = 4.0e-3  # within this before and after is no place to come down beside
-_REACH_M = 0.030  # nor is what lies farther than this from the start
+_STRAIGHT_RAD = math.radians(10.0)  # a bend turns by more than this
+_BESIDE_M = 4.0e-3  # the tip must not touch down within this distance of a bend
+_REACH_M = 0.030  # nor farther than this from the start
 _SETTLED_M = 0.15e-3
 _REENTRY_M = 12.0e-3
 _LEAST_STEP_M = 0.03e-3
 
 
 def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
-    """The settings with a touch place that can be touched: the first straight stretch, where the start is a bend.
+    """The settings with the touch position moved to the first straight stretch where the seam starts in a bend.
 
-    Beside a bend of about the touch's offset there is no telling which part of the seam the tip meets. Only a tip that
-    then feels its way back (`touch.feel_start`) may begin so far on.
+    Next to a bend of about the touch's offset it is unknown which part of the seam the tip meets. Only a tip that
+    then measures the start backwards (`touch.feel_start`) may start so far along the seam.
     """
     touch = config.touch
     if not touch.feel_start:
         return config
-    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.contact.end_window_m), touch.arc_m + 1e-6), 1e-3)
+    s = np.arange(touch.arc_m, max(min(_REACH_M, plan.length - config.gap.end_window_m), touch.arc_m + 1e-6), 1e-3)
     turn = np.sum(plan.tangent(s - _BESIDE_M) * plan.tangent(s + _BESIDE_M), axis=1)
     straight = np.flatnonzero(turn > math.cos(_STRAIGHT_RAD))
     place = float(s[straight[0] if len(straight) else np.argmax(turn)])
@@ -42,14 +42,14 @@ def with_touch_place(plan: SeamCurve, config: ServoConfig) -> ServoConfig:
 
 
 def begin_feeling_back(state: WeldingState, now: float) -> WeldingState:
-    """The state of a tip that is seated and sets off backwards."""
+    """The state of a seated tip that starts to move backwards."""
     return changed(state, proven=True, v_tip=0.0, touch=replace(state.touch, step="back", since=now))
 
 
 def feel_start_step(
     before: WeldingState, state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
 ) -> tuple[WeldingState, tuple[float, float, float], str | None, bool]:
-    """One tick of it: back until contact is lost, or six millimetres past the plan's start; then up, and in again.
+    """One tick: back until contact is lost or six millimetres past the plan's start; then up, and into the groove again.
 
     Args:
         before: the state before this tick's frame, `is_new`: whether there is one.
@@ -57,6 +57,7 @@ def feel_start_step(
     Returns:
         (state, wanted speeds along, to the left and up m/s, fault sentence or None, whether the tip is ready to track).
     """
+    deflection = config.deflection
     assert state.plan_fit is not None
     assert state.measurement is not None
     curve, limits, t, last = state.plan_fit.curve, config.contact, state.touch, state.measurement
@@ -70,18 +71,18 @@ def feel_start_step(
         if is_new:
             point = PendingPoint(last.point, curve.nearest(last.point, s) - curve.nearest(last.p_BT, s))
             state = changed(state, touch=replace(t, felt=(*t.felt, point)))
-        if s < -limits.end_window_m:
-            # Still in the groove: it begins before the plan does, and the weld begins where the plan says.
+        if s < -config.gap.end_window_m:
+            # Still in the groove: it starts before the plan does, and the weld starts where the plan does.
             return _ready(changed(state, proven=True), p_BT, config), (0.0, 0.0, 0.0), None, True
-        lateral = config.k_p * (config.delta_d_m - state.delta_n)
-        upward = config.k_z * (state.delta_axial - config.axial_d_m)
+        lateral = deflection.k_p * (deflection.delta_d_m - state.delta_n)
+        upward = deflection.k_z * (state.delta_axial - deflection.axial_d_m)
         return state, (-config.touch.search_m_s, lateral, upward), None, False
-    # Out of the groove: centred and raised, so that it lifts the tip when it comes back, as after a gap.
+    # Out of the groove: centred and hanging free, so that the groove lifts the tip on re-entry, as after a gap.
     seam = curve.frame(s)
     gap = p_BT - seam.position
     side = state.residual_at_loss[0] - dot(gap, seam.normal)
-    height = state.residual_at_loss[1] - limits.hover_m - dot(gap, seam.up)
-    servo = (config.k_follow * side, config.k_follow * height)
+    height = state.residual_at_loss[1] - config.gap.hover_m - dot(gap, seam.up)
+    servo = (deflection.k_follow * side, deflection.k_follow * height)
     if t.step == "lift":
         settled = math.hypot(side, height) < _SETTLED_M and sample.time - t.since > limits.regain_after_s
         if settled:
@@ -98,7 +99,7 @@ def feel_start_step(
 
 
 def _start_found(before: WeldingState, state: WeldingState, now: float, config: ServoConfig) -> WeldingState:
-    """The state once contact went: what was felt while it was going is dropped, and the seam starts where it went."""
+    """The state after contact was lost: the last uncertain points are dropped, and the seam starts where contact ended."""
     assert before.measurement is not None
     assert state.plan_fit is not None
     felt = state.touch.felt[: max(0, len(state.touch.felt) - config.refinement.frames_to_commit)]
@@ -116,10 +117,10 @@ def _start_found(before: WeldingState, state: WeldingState, now: float, config: 
 
 
 def _ready(state: WeldingState, p_BT: Array, config: ServoConfig) -> WeldingState:
-    """The state with what was felt on the way back as the first of the refined seam, and the plan moved onto it.
+    """The state with the points measured backwards as the first of the refined seam, and the plan registered to them.
 
-    Forwards friction holds the tip back behind its rest point by as much as it held it ahead on the way back; the path's
-    parameter is the rest point's progress, so that a point's is its arc length and that lag.
+    Forwards, friction holds the tip behind its rest point by as much as it held it ahead backwards; the path's
+    parameter is the rest point's progress, so that a point's parameter is its arc length plus that lag.
     """
     assert state.plan_fit is not None
     felt = state.touch.felt[::-1]
@@ -138,7 +139,7 @@ def _ready(state: WeldingState, p_BT: Array, config: ServoConfig) -> WeldingStat
     s = curve.nearest(p_BT, state.s_tip, 0.02)
     start = state.start_point
     if start is not None:
-        reach = config.contact.end_window_m
+        reach = config.gap.end_window_m
         at = curve.nearest(start, 0.0, 0.02)
         start = start + (clip(at, -reach, reach) - at) * curve.frame(at).tangent
     return changed(state, plan_fit=plan_fit, refined=refined, s_tip=s, progress=s, start_point=start)

@@ -1,4 +1,4 @@
-"""Three guards that keep motion finite: the seam's geometry, the arm's geometry, and the last word on slew."""
+"""Guards that keep motion bounded: seam conditioning, arm singularity and joint slew limits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array, dot, within
+from weldcal.welding.numerics import Array, dot, within
 
 
 class GuardError(InputError):
@@ -18,7 +18,7 @@ class GuardError(InputError):
 
 
 class SeamConditioning(NamedTuple):
-    """How well the chord fits the seam.
+    """Conditioning of the chord on the seam.
 
     Attributes:
         cos_tip, cos_torch: t_s . u at the two ends; cos_torch is the paper's n_d . n_t.
@@ -42,7 +42,7 @@ def seam_conditioning(chord: Array, tangent_tip: Array, tangent_torch: Array) ->
 
 @dataclass(frozen=True)
 class ArmGuardConfig:
-    """Where the arm slows and stops.
+    """Thresholds at which the arm slows and stops near a singularity.
 
     Attributes:
         sigma_slow, sigma_stop: least singular value of the length-scaled Jacobian where slowing begins, and the stop.
@@ -63,13 +63,13 @@ class ArmGuardConfig:
 
     @cached_property
     def row_scale(self) -> Array:
-        """(6,) what the rows of a Jacobian [omega; v] are multiplied by."""
+        """Scale factors (6,) of the rows of a Jacobian [omega; v]."""
         return np.array([1.0, 1.0, 1.0, *([1.0 / self.characteristic_length_m] * 3)])
 
 
 @dataclass(frozen=True)
 class GuardedVelocity:
-    """What the arm may do.
+    """The joint velocity that the guard allows.
 
     Attributes:
         q_dot: (6,) rad/s, always finite.
@@ -136,7 +136,7 @@ class SlewLimits:
 
 
 def command_is_finite(v_des: ArrayLike) -> bool:
-    """Whether a command is made of numbers; `slew_limit` brings the arm to rest when it is not."""
+    """Whether every number of a command is finite; `slew_limit` brings the arm to rest when one is not."""
     return bool(np.isfinite(np.asarray(v_des, dtype=float)).all())
 
 
@@ -149,7 +149,7 @@ def slew_limit(v_des: ArrayLike, v_prev: Array, a_prev: Array, limits: SlewLimit
     the first step of that fall, so the same holds a tick later whatever is then wanted.
 
     Args:
-        v_des: (n,) rad/s; anything not finite counts as "come to rest" for every joint.
+        v_des: (n,) rad/s; a value that is not finite brings every joint to rest.
         v_prev, a_prev: (n,), what this function returned a tick ago (zeros at the start).
         limits: bounds.
         dt: tick in s.

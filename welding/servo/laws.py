@@ -1,4 +1,4 @@
-"""The steering laws by name: the paper's as printed and as mended step by step, and the guarded one."""
+"""The steering laws by name: the paper's as printed, its corrections step by step, and the guarded law."""
 
 from __future__ import annotations
 
@@ -10,29 +10,34 @@ from typing import Literal
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.models.errors import InputError
+from weldcal.welding.numerics import Array, clip, cross, dot, unit
 from weldcal.welding.seam.curve import SeamFrame
 from weldcal.welding.seam.refinement import RefinedSeam
-from weldcal.welding.servo.chord import UnknownLaw
 from weldcal.welding.servo.guards import seam_conditioning
-from weldcal.welding.servo.state import ServoConfig, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
 from weldcal.welding.servo.track import Motion, TorchTarget, guarded_motion
-from weldcal.welding.vectors import Array, clip, cross, dot, unit
 
-_OMEGA_CEILING = 100.0  # rad/s; an unguarded law asks for thousands, no robot turns by more than this in a tick
+_OMEGA_CEILING = 100.0  # rad/s; an unguarded law may command thousands, which no robot reaches
 
 MotionLaw = Callable[
     [WeldingState, RigidTransform, SeamFrame, TorchTarget, tuple[float, float], ServoConfig, float], Motion
 ]
 
 
+class UnknownLaw(InputError):
+    """No steering law has this name."""
+
+
 @dataclass(frozen=True)
 class SteeringLaw:
-    """One law of the comparison.
+    """One steering law and how it differs from the paper's.
 
     Attributes:
-        name: as in ServoConfig.law; words: what it is, for tables.
-        guarded: ours, with its phases; the paper's knows no gap and no end.
+        name: as in ServoConfig.law; summary: what it is, for tables.
+        guarded: the law with phases for gaps and ends, which the paper's does not have.
         sign: of omega; -1 as printed. fitted: normal from a local fit, else from the two points beside the nearest.
         feedback: whether the torch's offset is fed back.
         damping: of the division by n_d . n_t (0: as printed); omega_limit: clip, rad/s.
@@ -40,7 +45,7 @@ class SteeringLaw:
     """
 
     name: str
-    words: str
+    summary: str
     guarded: bool = False
     sign: float = 1.0
     fitted: bool = True
@@ -53,13 +58,13 @@ class SteeringLaw:
 LAWS: dict[str, SteeringLaw] = {
     law.name: law
     for law in (
-        SteeringLaw("guarded", "ours: torch speed first, box-constrained, guarded phases", guarded=True),
+        SteeringLaw("guarded", "guarded: torch speed first, box-constrained, with phases", guarded=True),
         SteeringLaw("printed", "Algorithm 2 as printed", sign=-1.0, feedback=False),
-        SteeringLaw("literal", "sign mended, normal from neighbouring points", fitted=False, feedback=False),
-        SteeringLaw("open", "sign mended, fitted normal, no feedback", feedback=False),
-        SteeringLaw("fixed", "sign mended, fitted normal, torch position fed back"),
-        SteeringLaw("fixed_zeroed", "the same; delta_d goes to zero where contact does", lost="zeroed"),
-        SteeringLaw("dls", "the same, division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8),
+        SteeringLaw("literal", "sign corrected, normal from neighbouring points", fitted=False, feedback=False),
+        SteeringLaw("open", "sign corrected, fitted normal, no feedback", feedback=False),
+        SteeringLaw("fixed", "sign corrected, fitted normal, torch position fed back"),
+        SteeringLaw("fixed_zeroed", "as fixed; delta_d set to zero where contact is lost", lost="zeroed"),
+        SteeringLaw("dls", "as fixed; division damped (0.2) and omega clipped", damping=0.2, omega_limit=0.8),
     )
 }
 
@@ -76,7 +81,7 @@ def get_law(name: str) -> SteeringLaw:
 
 
 def motion_law(law: SteeringLaw) -> MotionLaw:
-    """What turns a tick's target into motion under a law."""
+    """The function that computes one tick's motion under a law."""
     if law.guarded:
         return guarded_motion
 
@@ -108,6 +113,7 @@ def paper_motion(
 
     The paper is planar; as in the guarded law, pitch keeps the torch's height and roll the work angle.
     """
+    limits, torch = config.limits, config.torch
     axes = tool_axes(X_BT, tip.up, target.up, config)
     u, m, a, d = axes.along, axes.across, axes.yaw, axes.d
     n, t = target.normal, target.tangent
@@ -117,7 +123,7 @@ def paper_motion(
     v = config.weld_speed_m_s
     V_tip = v * tip.tangent + servo[0] * tip.normal + servo[1] * tip.up
     e = axes.torch - target.point
-    back = config.k_b * dot(e, n) if law.feedback else 0.0
+    back = torch.k_b * dot(e, n) if law.feedback else 0.0
     c = dot(m, n)
     wanted = law.sign * dot(V_tip, n) + back
     slope = c / (c * c + law.damping**2) if law.damping else 1.0 / math.copysign(max(abs(c), 1e-9), c)
@@ -125,9 +131,9 @@ def paper_motion(
 
     b = target.up
     flat = V_tip - d * omega * m
-    w_p = -(dot(flat, b) + config.k_h * clip(dot(e, b), -config.feedback_limit_m, config.feedback_limit_m))
+    w_p = -(dot(flat, b) + torch.k_h * clip(dot(e, b), -torch.feedback_limit_m, torch.feedback_limit_m))
     w_p /= d * height_share(axes, b)
-    w_p = clip(w_p, -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
+    w_p = clip(w_p, -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
     V = np.concatenate([omega * a + w_p * m + roll_rate(axes, b, config) * u, V_tip])
     return Motion(V, v, dot(flat, t), omega, seam_conditioning(u, tip.tangent, t))
 

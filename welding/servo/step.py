@@ -1,4 +1,4 @@
-"""The welding servo: one pure step from what is felt and where the tool is to its motion and the arc."""
+"""The welding servo as one pure step: from the measured deflection and pose to the tool's motion and the arc."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, changed, clip, dot, finite
 from weldcal.welding.seam.curve import SeamCurve, SeamError, SeamFrame
 from weldcal.welding.seam.feasibility import InfeasibleSeam, check_feasible
 from weldcal.welding.seam.plan_fit import PlanFit
@@ -21,14 +22,13 @@ from weldcal.welding.servo.contact import (
     with_point,
     with_progress,
 )
-from weldcal.welding.servo.evolve import changed
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
 from weldcal.welding.servo.laws import get_law, motion_law
-from weldcal.welding.servo.state import Diagnostics, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.touch import touch_step
 from weldcal.welding.servo.track import TorchTarget, torch_target
 from weldcal.welding.servo.weave import weave_at
-from weldcal.welding.vectors import Array, clip, dot, finite
 
 _MOVING = (Phase.TRACK, Phase.COAST, Phase.FINISH)
 
@@ -57,8 +57,10 @@ def welding_step(
         state = _begin(state, sample, plan, config)
     if not finite(sample.X_BT.translation()):
         state = _fault(state, sample.time, "The robot's pose is not a number; check the robot's connection.")
-    stood = state.stood + config.period_s if state.time is not None and sample.time <= state.time else 0.0
-    state = changed(state, time=sample.time, stood=stood)
+    clock_stopped_s = (
+        state.clock_stopped_s + config.period_s if state.time is not None and sample.time <= state.time else 0.0
+    )
+    state = changed(state, time=sample.time, clock_stopped_s=clock_stopped_s)
 
     is_new = state.phase not in (Phase.DONE, Phase.FAULT) and is_new_frame(state, sample)
     before = state
@@ -78,11 +80,11 @@ def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: Se
     tool = config.tool
     try:
         tip_line = plan.raised(tool.tip_seat_height_m) if tool.tip_seat_height_m else plan
-        # Rest point and torch run beside the tip's line, lower by what the tip is pressed in.
+        # Rest point and torch run along the tip's line, lower by the axial deflection.
         line = tip_line.raised(config.clearance_m) if config.clearance_m else tip_line
-        if tip_line.length < config.touch.arc_m + config.contact.end_window_m:
+        if tip_line.length < config.touch.arc_m + config.gap.end_window_m:
             return _fault(
-                state, sample.time, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short to be felt."
+                state, sample.time, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short for the touch-on."
             )
         check_feasible(line, tool.torch_offset_m, config.weld_speed_m_s, config.windows)
     except (InfeasibleSeam, SeamError) as problem:
@@ -98,31 +100,32 @@ def _frame_at_tip(state: WeldingState) -> SeamFrame:
 
 
 def _fault(state: WeldingState, now: float, reason: str) -> WeldingState:
-    """The first fault is kept; the arc goes off in this very tick."""
+    """Enter FAULT with a reason and the arc off in this tick; the first fault is kept."""
     if state.phase == Phase.FAULT:
         return state
     return changed(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_at=now)
 
 
 def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
-    """What stops a weld at any moment: a hidden tag, or a tip pushed too far."""
+    """Check the faults of every phase: stopped clock, deflection beyond its limit, hidden tag, frozen camera."""
+    faults = config.faults
     if state.phase in (Phase.DONE, Phase.FAULT):
         return state
-    if state.stood > config.contact.hidden_s:
-        # The arm goes on meanwhile, and by its clock no frame is ever late.
-        text = f"The robot's clock has stood still for {state.stood:.2f} s; check the robot's connection."
+    if state.clock_stopped_s > faults.hidden_s:
+        # The arm may still move, and by a stopped clock no frame is ever late.
+        text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
         return _fault(state, sample.time, text)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
         return _fault(state, sample.time, text)
-    # Past the seam's end the tip has nothing more to say, and the tag is not needed.
+    # Past the seam's end the tip is not used, so the tag is not needed.
     blind = sample.time - max(state.frame_time, state.started)
-    if state.phase != Phase.FINISH and blind > config.contact.hidden_s:
+    if state.phase != Phase.FINISH and blind > faults.hidden_s:
         text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
         return _fault(state, sample.time, text)
-    # No two readings of a tag are alike to the last bit, unless they are of one picture told again with a new time.
-    if state.same_readings >= config.contact.frozen_frames:
-        text = f"The finger camera repeats one picture ({state.same_readings} readings alike); restart the camera."
+    # Identical readings to the last bit mean one picture repeated with new times.
+    if state.same_readings >= faults.frozen_frames:
+        text = f"The finger camera repeats one picture ({state.same_readings} identical readings); restart the camera."
         return _fault(state, sample.time, text)
     return state
 
@@ -142,7 +145,7 @@ def _touch(
     if problem is not None:
         return _rest(_fault(state, sample.time, problem), sample, config)
     state = _slewed(state, lateral, upward, config, dt)
-    speed_up = config.tip_acceleration_m_s2 * dt
+    speed_up = config.limits.tip_acceleration_m_s2 * dt
     state = changed(state, v_tip=clip(along, state.v_tip - speed_up, state.v_tip + speed_up))
     V = np.concatenate([np.zeros(3), state.v_tip * seam.tangent + state.u_n * seam.normal + state.u_a * seam.up])
     if seated and feels_start:
@@ -161,24 +164,26 @@ def _touch(
 
 
 def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> WeldingState:
-    """What a new frame means for the phase."""
-    limits = config.contact
+    """Change the phase by the contact that a new frame shows."""
+    limits, end_window = config.contact, config.gap.end_window_m
     assert state.plan_fit is not None
     if state.phase == Phase.TRACK:
         lost, law = contact_lost(before, state, config), get_law(config.law)
         if not law.guarded:
-            # The paper appends every point, and knows of no contact; what it seeks without one depends on the reading.
+            # The paper appends every point and does not detect contact; the wanted deflection without contact is an interpretation.
             return changed(
-                with_point(state, config), delta_wanted=0.0 if lost and law.lost == "zeroed" else None, sunk=lost
+                with_point(state, config),
+                delta_wanted=0.0 if lost and law.lost == "zeroed" else None,
+                axial_paused=lost,
             )
         if not lost:
             return with_point(state, config)
         state = changed(state, refined=drop_pending(state.refined), proven=False, regained=0, steer=0.0, felt=0.0)
-        if state.s_tip > state.s_end - limits.end_window_m:
+        if state.s_tip > state.s_end - end_window:
             assert before.measurement is not None
             assert state.plan_fit is not None
             last = state.plan_fit.curve.nearest(before.measurement.point, state.s_tip)
-            low, high = state.s_end - limits.end_window_m, state.s_end + limits.end_window_m
+            low, high = state.s_end - end_window, state.s_end + end_window
             return changed(_finish(state), s_end=clip(last, low, high))
         return changed(
             state,
@@ -188,7 +193,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
             residual_at_loss=_tip_residual(state),
         )
     if state.phase == Phase.COAST:
-        # Just after the loss the springs are still relaxing: that is no new contact.
+        # Just after the loss the springs are still relaxing: that is not a new contact.
         waited = state.frame_time - state.lost_time > limits.regain_after_s
         settled = waited and state.s_tip - state.lost_at > limits.regain_after_m
         touching = settled and state.delta_axial > limits.regain_axial_m
@@ -200,7 +205,7 @@ def _contact(before: WeldingState, state: WeldingState, config: ServoConfig) -> 
 
 
 def _tip_residual(state: WeldingState) -> Array:
-    """How far the newest tactile points lie off the moved plan, (2,) m to the left and up."""
+    """Mean offset of the newest tactile points from the moved plan, (2,) m to the left and up."""
     assert state.plan_fit is not None
     points, curve = state.refined.points[-8:], state.plan_fit.curve
     if not len(points):
@@ -223,21 +228,19 @@ def _weld(
     p_BT = np.asarray(sample.X_BT.translation())
     at = p_BT
     if state.phase == Phase.TRACK and state.measurement is not None:
-        # Inside a corner the tool cuts it, and is beside the second leg while the tip is still on the first.
+        # The tool cuts a corner on its inside and is next to the second leg while the tip is still on the first.
         at = state.measurement.point + (p_BT - state.measurement.p_BT)
     s_tip = curve.nearest(at, state.s_tip)
     seam = curve.frame(s_tip)
     gap = p_BT - seam.position
     off = np.array((dot(gap, seam.normal), dot(gap, seam.up)))
     state = changed(state, s_tip=s_tip)
-    if state.phase == Phase.COAST and s_tip - state.lost_at > config.contact.coast_m:
-        text = (
-            f"Contact lost for {1e3 * config.contact.coast_m:.0f} mm in the middle of the seam; check the groove there."
-        )
+    if state.phase == Phase.COAST and s_tip - state.lost_at > config.gap.coast_m:
+        text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
         return _rest(_fault(state, sample.time, text), sample, config)
-    beyond = config.contact.end_window_m if state.phase == Phase.TRACK else 0.0
+    beyond = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0
     if law.guarded and state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
-        # Still in contact so far beyond the plan's end: the seam ends no earlier than here.
+        # Still in contact this far beyond the plan's end: the seam does not end before this point.
         state = _finish(changed(state, s_end=s_tip) if state.phase == Phase.TRACK else state)
     if state.phase == Phase.FINISH and math.isnan(state.hold[0]):
         state = changed(state, hold=off)
@@ -266,11 +269,11 @@ def _weld(
     problem = problem or _angles(sample, target, config)
     if problem is not None and (state.torch_on or state.phase == Phase.COAST):
         return _rest(_fault(state, sample.time, problem), sample, config)
-    if state.torch_on and error > config.torch_error_max_m:
+    if state.torch_on and error > config.faults.torch_error_m:
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(_fault(state, sample.time, text), sample, config)
-    # Once lit it burns to the end: the plan may still move back under a torch that has just passed its start.
-    lit = state.torch_on or (target.s >= _start_arc(state, curve) and error < config.ignition_error_m)
+    # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
+    lit = state.torch_on or (target.s >= _start_arc(state, curve) and error < config.torch.ignition_error_m)
     burning = lit and target.s < state.s_end
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
     state = changed(state, torch_on=burning, lit_at=lit_at)
@@ -291,29 +294,30 @@ def _weld(
 
 
 def _start_arc(state: WeldingState, curve: SeamCurve) -> float:
-    """Where the arc is to be lit, m along the moved plan: where the groove was felt to begin, else where planned."""
+    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned one."""
     return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
 def _advance(state: WeldingState, s_torch: float, now: float, config: ServoConfig) -> tuple[WeldingState, str | None]:
-    """Whether the torch still comes along: half a millimetre in `stall_s`, or the weld is stopped."""
+    """Check that the torch advances by half a millimetre in `stall_s`; otherwise return a fault sentence."""
+    faults = config.faults
     since, s = state.advanced
     if abs(s_torch - s) > 0.5e-3:
         return changed(state, advanced=(now, s_torch)), None
-    if now - since <= config.stall_s:
+    if now - since <= faults.stall_s:
         return state, None
     return (
         state,
-        f"The torch has stood at {1e3 * s_torch:.0f} mm for {config.stall_s:.0f} s; check the seam's shape there.",
+        f"The torch has stood at {1e3 * s_torch:.0f} mm for {faults.stall_s:.0f} s; check the seam's shape there.",
     )
 
 
 def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> str | None:
-    """Work and travel angle beyond their windows, and by more than what a plan's error makes of them."""
+    """Fault sentence for a work or travel angle beyond its window plus a margin for the plan's error, or None."""
     R = sample.X_BT.rotation().matrix()
     margin = math.radians(5.0)
     travel = math.asin(clip(dot(R[:, 0], target.up), -1.0, 1.0))
-    work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.work_angle_rad
+    work = math.asin(clip(dot(R[:, 1], target.up), -1.0, 1.0)) - config.torch.work_angle_rad
     for name, angle, limit in (
         ("travel", travel, config.windows.travel_rad),
         ("work", work, config.windows.work_rad),
@@ -327,27 +331,27 @@ def _angles(sample: ServoSample, target: TorchTarget, config: ServoConfig) -> st
 
 
 def _servo(state: WeldingState, off: Array, sample: ServoSample, config: ServoConfig) -> tuple[float, float]:
-    """The tip's wanted lateral and upward speed, m/s: by feel in TRACK, by the moved plan in COAST and FINISH."""
+    """The tip's wanted lateral and upward speed, m/s: from the deflection in TRACK, from the moved plan in COAST and FINISH."""
+    deflection = config.deflection
     if state.phase == Phase.TRACK:
-        # A late frame says where the tip was, not where it is: its correction fades out.
+        # A late frame shows where the tip was, not where it is: its correction fades out.
         fresh = freshness(state, sample.time)
-        seek = config.delta_d_m if state.delta_wanted is None else state.delta_wanted
-        lateral = config.k_p * (seek - state.delta_n)
-        if state.sunk:
+        seek = deflection.delta_d_m if state.delta_wanted is None else state.delta_wanted
+        lateral = deflection.k_p * (seek - state.delta_n)
+        if state.axial_paused:
             return fresh * lateral, 0.0
-        return fresh * lateral, fresh * config.k_z * (state.delta_axial - config.axial_d_m)
-    wanted = (
-        state.residual_at_loss + np.array((0.0, -config.contact.hover_m)) if state.phase == Phase.COAST else state.hold
-    )
+        return fresh * lateral, fresh * deflection.k_z * (state.delta_axial - deflection.axial_d_m)
+    wanted = state.residual_at_loss + np.array((0.0, -config.gap.hover_m)) if state.phase == Phase.COAST else state.hold
     gap = wanted - off
-    return config.k_follow * float(gap[0]), config.k_follow * float(gap[1])
+    return deflection.k_follow * float(gap[0]), deflection.k_follow * float(gap[1])
 
 
 def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoConfig, dt: float) -> WeldingState:
-    """The servo speeds within their limit and slew."""
+    """The state with the servo speeds limited in speed and slew."""
+    deflection = config.deflection
     top, step = (
-        max(config.servo_speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
-        config.servo_slew_m_s2 * dt,
+        max(deflection.speed_m_s, config.touch.fast_m_s if state.phase == Phase.TOUCH else 0.0),
+        deflection.slew_m_s2 * dt,
     )
     u_n = clip(clip(lateral, -top, top), state.u_n - step, state.u_n + step)
     u_a = clip(clip(upward, -top, top), state.u_a - step, state.u_a + step)
@@ -355,8 +359,8 @@ def _slewed(state: WeldingState, lateral: float, upward: float, config: ServoCon
 
 
 def _rest(state: WeldingState, sample: ServoSample, config: ServoConfig) -> tuple[WeldingState, WeldingCommand]:
-    """DONE and FAULT: the last motion fades to nothing; the arc is already off."""
-    share = clip(1.0 - (sample.time - state.stopped_at) / config.ramp_s, 0.0, 1.0)
+    """The answer in DONE and FAULT: the last motion ramps to zero with the arc off."""
+    share = clip(1.0 - (sample.time - state.stopped_at) / config.limits.ramp_s, 0.0, 1.0)
     return _answer(changed(state, torch_on=False), share * state.V_stop, config, Diagnostics())
 
 
@@ -365,7 +369,11 @@ def _answer(
 ) -> tuple[WeldingState, WeldingCommand]:
     if not finite(V):
         now = state.time or 0.0
-        state = _fault(state, now, "The welding law gave no number here; this is a defect, report it with a recording.")
+        state = _fault(
+            state,
+            now,
+            "The welding law returned a number that is not finite: this is a defect, report it with a recording.",
+        )
         V = state.V_stop
     measurement = state.measurement
     diagnostics = changed(

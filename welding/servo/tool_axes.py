@@ -1,4 +1,4 @@
-"""The tool in its seam: chord and axes that every steering law moves by, and the roll that holds the work angle."""
+"""Computes the tool's chord and axes on the seam, and the roll rate that holds the work angle."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 from pydrake.math import RigidTransform
 
-from weldcal.welding.servo.state import ServoConfig
-from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
+from weldcal.welding.numerics import Array, clip, cross, dot, norm, unit
+from weldcal.welding.servo.settings import ServoConfig
 
 
 class ToolAxes(NamedTuple):
-    """The tool at a tick, all in B.
+    """The tool's points and axes at a tick, all in B.
 
     `rest`: point T (3,) m; `left`: y_T (3,); `chord`: torch to rest point (3,) m, `d` long; `along`: its direction u;
     `across`: the paper's n_d, level and to the left; `yaw`: the axis u x n_d that turns the chord towards n_d;
@@ -35,7 +35,7 @@ class ToolAxes(NamedTuple):
 
 
 def tool_axes(X_BT: RigidTransform, tip_up: Array, torch_up: Array, config: ServoConfig) -> ToolAxes:
-    """The axes of a tool at X_BT above a seam whose up-normals (3,) at tip and torch are given."""
+    """Compute the axes of a tool at X_BT above a seam with given up-normals (3,) at tip and torch."""
     R = X_BT.rotation().matrix()
     chord = -(R @ config.p_TW)
     d = norm(chord)
@@ -47,12 +47,13 @@ def tool_axes(X_BT: RigidTransform, tip_up: Array, torch_up: Array, config: Serv
 
 
 def height_share(axes: ToolAxes, torch_up: Array) -> float:
-    """How much of the yaw axis stands along the torch's up (3,): what pitch divides by, never under 0.2."""
+    """Component of the yaw axis along the torch's up (3,), which pitch divides by; at least 0.2 in magnitude."""
     share = dot(axes.yaw, torch_up)
     return share if abs(share) > 0.2 else math.copysign(0.2, share)
 
 
 def roll_rate(axes: ToolAxes, torch_up: Array, config: ServoConfig) -> float:
     """The rate rad/s about the chord that brings the lean across it to the wanted work angle."""
-    lean = math.asin(clip(dot(axes.left, torch_up), -1.0, 1.0)) - config.work_angle_rad
-    return clip(-config.k_roll * lean, -0.3, 0.3)
+    torch = config.torch
+    lean = math.asin(clip(dot(axes.left, torch_up), -1.0, 1.0)) - torch.work_angle_rad
+    return clip(-torch.k_roll * lean, -0.3, 0.3)

@@ -1,4 +1,4 @@
-"""TOUCH: come down beside the planned seam, feel sideways until the tip falls into the groove and leans on its wall."""
+"""The TOUCH phase: descend next to the planned seam and search sideways until the tip is seated in the groove."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import changed, clip, dot, pose, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.servo.contact import freshness
-from weldcal.welding.servo.evolve import changed
-from weldcal.welding.servo.state import GainFit, ServoConfig, ServoSample, WeldingState
-from weldcal.welding.vectors import clip, dot, pose, unit
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import GainFit, ServoSample, WeldingState
 
-_TAG_SIGMA_M = 0.05e-3  # what a frame's deflection may be off while the gain is fitted
+_TAG_SIGMA_M = 0.05e-3  # sigma of a frame's deflection in the gain fit
 _SEATED_FRAMES = 3
 _WALL_FRAMES = 15
 
 
 def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
-    """X_BT to bring the arm to before the weld: above the face, on the -n side of the seam's start, torch behind.
+    """Start pose X_BT of the weld: above the face, on the -n side of the seam's start, torch behind.
 
     Args:
         plan: the planned seam in B.
@@ -39,7 +39,7 @@ def touch_start_pose(plan: SeamCurve, config: ServoConfig) -> RigidTransform:
 def touch_step(
     state: WeldingState, sample: ServoSample, is_new: bool, seam: SeamFrame, config: ServoConfig
 ) -> tuple[WeldingState, float, float, str | None, bool]:
-    """One tick of the search.
+    """One tick of the touch search.
 
     Args:
         seam: the tip's planned line at the touch arc; `is_new`: whether the state holds a frame of this tick.
@@ -47,13 +47,16 @@ def touch_step(
     Returns:
         (state, wanted lateral speed, wanted upward speed m/s, fault sentence or None, whether the tip is seated).
     """
+    deflection = config.deflection
     touch, t = config.touch, state.touch
     gap = sample.X_BT.translation() - seam.position
     left, height = dot(gap, seam.normal), dot(gap, seam.up)
     deep, fresh = state.delta_axial, freshness(state, sample.time)
-    depth_servo = fresh * clip(config.k_z * (deep - config.axial_d_m), -config.servo_speed_m_s, config.servo_speed_m_s)
-    # Once it has met the face it may come down by the groove's depth more.
-    floor = (config.tool.tip_drop_m if t.step == "descend" else 0.0) - touch.depth_m - config.axial_d_m
+    depth_servo = fresh * clip(
+        deflection.k_z * (deep - deflection.axial_d_m), -deflection.speed_m_s, deflection.speed_m_s
+    )
+    # After contact with the face it may descend by the groove's depth more.
+    floor = (config.tool.tip_drop_m if t.step == "descend" else 0.0) - touch.depth_m - deflection.axial_d_m
     if height < floor:
         return state, 0.0, 0.0, _no_work(state, sample, height, config), False
 
@@ -61,11 +64,11 @@ def touch_step(
         if state.zero is None and touch.zero_frames > 0:
             state, problem = _zeroed(state, sample, is_new, config)
             return state, 0.0, 0.0, problem, False
-        fast = height > config.tool.tip_drop_m + touch.slow_height_m and deep < 0.3 * config.axial_d_m
+        fast = height > config.tool.tip_drop_m + touch.slow_height_m and deep < 0.3 * deflection.axial_d_m
         speed = touch.fast_m_s if fast else touch.slow_m_s
-        if is_new and deep > 0.9 * config.axial_d_m:
+        if is_new and deep > 0.9 * deflection.axial_d_m:
             return _next(state, "settle", sample.time), 0.0, 0.0, None, False
-        down = min(speed, config.k_z * max(0.0, config.axial_d_m - deep) + 0.3e-3)
+        down = min(speed, deflection.k_z * max(0.0, deflection.axial_d_m - deep) + 0.3e-3)
         return state, 0.0, -fresh * down, None, False
 
     assert state.measurement is not None
@@ -82,14 +85,14 @@ def touch_step(
 
 
 def _no_work(state: WeldingState, sample: ServoSample, height: float, config: ServoConfig) -> str:
-    """What is said of a tip that has come too deep: how deep, what it read last, and how old that is."""
+    """Fault sentence for a tip that is too deep: its depth, its last deflection and the age of that reading."""
     below = 1e3 * (config.tool.tip_drop_m - height)
     if state.measurement is None:
-        read = "without a look at its tag"
+        read = "without a valid view of its tag"
     else:
         age = sample.time - state.measurement.capture_time
         read = f"and it read {1e3 * state.delta_axial:.1f} mm of deflection {age:.2f} s ago"
-    where = "met no work" if state.touch.step == "descend" else "lost the work"
+    where = "found no surface" if state.touch.step == "descend" else "lost the surface"
     return (
         f"Seam not found: the tip {where} (its rest is {below:.1f} mm below where it should meet the face, {read}); "
         "check the plan's height."
@@ -99,7 +102,7 @@ def _no_work(state: WeldingState, sample: ServoSample, height: float, config: Se
 def _zeroed(
     state: WeldingState, sample: ServoSample, is_new: bool, config: ServoConfig
 ) -> tuple[WeldingState, str | None]:
-    """What the tag reads while the tip hangs free is its zero: the rendered or printed tag's own bias goes with it."""
+    """Average the readings of the free tip as the tag's zero, which removes the tag's bias."""
     touch, t = config.touch, state.touch
     if not is_new or sample.deflection is None:
         return state, None
@@ -124,13 +127,14 @@ def _search(
     config: ServoConfig,
     now: float,
 ) -> tuple[WeldingState, float, float, str | None, bool]:
+    deflection = config.deflection
     touch, t = config.touch, state.touch
     half_drop = 0.5 * config.tool.tip_drop_m
     dropped = tip_height < t.face_height - half_drop or tip_height < half_drop
-    leaning = state.delta_n > 0.9 * config.delta_d_m
+    leaning = state.delta_n > 0.9 * deflection.delta_d_m
     frames = t.seated_frames
     if is_new:
-        pressed = abs(state.delta_axial - config.axial_d_m) < 0.25 * config.axial_d_m
+        pressed = abs(state.delta_axial - deflection.axial_d_m) < 0.25 * deflection.axial_d_m
         frames = frames + 1 if leaning and (pressed or not dropped) else 0
         t = replace(t, seated_frames=frames)
         state = changed(state, touch=t)
@@ -143,15 +147,15 @@ def _search(
             state,
             0.0,
             0.0,
-            "Seam not found: the tip met a wall but no groove; check the plan and clear the work.",
+            "Seam not found: the tip met a wall but no groove; check the plan and clear the workpiece.",
             False,
         )
     if left - t.start_left > touch.range_m:
-        text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the work again."
+        text = f"Seam not found within {1e3 * touch.range_m:.0f} mm; check the plan, or scan the workpiece again."
         return state, 0.0, 0.0, text, False
-    # While the tip falls there is little holding it down: wait for the depth servo, or it climbs out over the far wall.
-    held = fresh * clip(2.0 * state.delta_axial / config.axial_d_m - 0.5, 0.0, 1.0)
-    lateral = clip(config.k_p * (config.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
+    # A tip falling into the groove is hardly pressed down: wait for the depth servo, or it climbs over the far wall.
+    held = fresh * clip(2.0 * state.delta_axial / deflection.axial_d_m - 0.5, 0.0, 1.0)
+    lateral = clip(deflection.k_p * (deflection.delta_d_m - state.delta_n), -touch.search_m_s, touch.search_m_s)
     return state, held * lateral, depth_servo, None, False
 
 
@@ -161,17 +165,18 @@ _LEGS = {"press up": ("press down", 1.0), "press down": ("press back", -1.0), "p
 def _press(
     state: WeldingState, sample: ServoSample, is_new: bool, left: float, seam: SeamFrame, config: ServoConfig
 ) -> tuple[WeldingState, float, float, str | None, bool]:
-    """Press against the seated tip and back: its wall does not move, so deflection per motion is the tag's gain."""
+    """Press the seated tip against the wall and back: the wall is fixed, so deflection per motion is the tag's gain."""
+    deflection = config.deflection
     touch, t = config.touch, state.touch
     following, sign = _LEGS[t.step]
     if is_new and state.measurement is not None and state.measurement.capture_time >= t.since - 1.0:
         x = dot(state.measurement.p_BT - seam.position, seam.normal)
         t = replace(t, gain_fit=_add(t.gain_fit, x, state.delta_n))
         state = changed(state, touch=t)
-    target = t.start_left + sign * (touch.press_ratio - 1.0) * config.delta_d_m
+    target = t.start_left + sign * (touch.press_ratio - 1.0) * deflection.delta_d_m
     gap = target - left
     if abs(gap) > 0.05e-3:
-        return state, clip(config.k_p * gap, -touch.press_m_s, touch.press_m_s), 0.0, None, False
+        return state, clip(deflection.k_p * gap, -touch.press_m_s, touch.press_m_s), 0.0, None, False
     if following:
         return _next(state, following, sample.time, t.start_left), 0.0, 0.0, None, False
     return changed(state, gain=_gain(t.gain_fit, config)), 0.0, 0.0, None, True
@@ -182,7 +187,7 @@ def _add(fit: GainFit, x: float, y: float) -> GainFit:
 
 
 def _gain(fit: GainFit, config: ServoConfig) -> float:
-    """The slope of deflection on motion, drawn to 1 by its prior."""
+    """Slope of deflection over motion, regularised towards 1."""
     if fit.n < 3:
         return 1.0
     sxx, sxy = fit.xx - fit.x**2 / fit.n, fit.xy - fit.x * fit.y / fit.n

@@ -1,4 +1,4 @@
-"""The guarded law: torch speed first, its place always, and the tip speed and turning the rigid chord then needs."""
+"""The guarded law: computes tip speed and turning rate that keep the torch on the seam at its speed."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.math import RigidTransform
 
+from weldcal.welding.numerics import Array, box_least_squares, clip, cross, dot, norm, unit
 from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 from weldcal.welding.seam.refinement import LocalFit, RefinedSeam, local_fit
 from weldcal.welding.servo.guards import SeamConditioning, seam_conditioning
-from weldcal.welding.servo.lsq import box_least_squares
-from weldcal.welding.servo.state import ServoConfig, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import WeldingState
 from weldcal.welding.servo.tool_axes import height_share, roll_rate, tool_axes
-from weldcal.welding.vectors import Array, clip, cross, dot, norm, unit
 
 _SHARP_PER_M = 100.0  # a planned radius of 10 mm: a corner that the plan has rounded
-_CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no point: too late to be confirmed
+_CARRY_M = 5.0e-3  # the last millimetres before the seam's end give no committed point
 _BEND_OVER_M = (
     3.0e-3,
     10.0e-3,
-)  # least and most of the path whose bend is carried on; 0.4 of the plan's radius between
+)  # least and most length of path whose bend is extrapolated; 0.4 of the plan's radius between
 _RISE = 0.05  # slope of the path against the plan's surface
 _WINDOW_M = 5.0e-3  # two sigma of the widest fit
 _EDGE_POINTS = 30  # points on a gap's side: 8 mm at the nominal speed and frame rate
 
 
 class TorchTarget(NamedTuple):
-    """Where the torch should be: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m;
-    `bend`: of the path to the left, 1/m; `rate`: how fast it is to swing to the left, m/s."""
+    """The torch's target: point m, tangent, normal, up (3,), path parameter m, plan arc m, residual (2,) m;
+    `bend`: of the path to the left, 1/m; `rate`: its wanted speed to the left, m/s."""
 
     point: Array
     tangent: Array
@@ -55,7 +55,7 @@ class Motion:
 
 
 def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: ServoConfig) -> TorchTarget:
-    """The refined path beside the torch; where the tip felt nothing, the moved plan plus what it was off nearby.
+    """The refined path at the torch; in gaps the moved plan plus the residual measured nearby.
 
     Args:
         curve: the tip line of the plan, registered to the tactile points.
@@ -73,7 +73,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
         radius = 1.0 / max(abs(plan.curvature), 1e-6)
         if _nearest_point(seam.arc, inside) < config.refinement.bridge_from_m:
             fit = local_fit(seam, inside, plan.tangent, radius, config.refinement, curve.least_radius(s, _WINDOW_M))
-        # Before the first point, and where the window is empty, the plan leads and carries the nearest residual.
+        # Before the first point, and where the window is empty, the plan plus the nearest residual is used.
         if fit is not None:
             here = curve.frame(curve.nearest(fit.point, s + inside - arc))
             off = fit.point - here.position
@@ -81,19 +81,19 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
             if inside != arc:
                 fit = _carried_on(seam, fit, inside, arc, plan, config) if arc > last else None
         else:
-            # The change is spread over the path, so that the torch is not asked to step.
+            # The change is spread over the path, so that the torch makes no step.
             step = 0.05 * abs(s - state.s_torch)
             residual = state.residual + np.clip(_bridged(state, curve, arc, s) - state.residual, -step, step)
             came_on = s - state.s_torch
             drift = (residual - state.residual) / came_on if came_on > 1e-6 else drift
     if fit is None:
-        # The torch heads where the target goes, not where the plan does.
+        # The torch follows the target's direction, not the plan's.
         t, bend = unit(plan.tangent + drift[0] * plan.normal + drift[1] * plan.up, plan.tangent), plan.curvature
         up = unit(plan.up - dot(plan.up, t) * t, plan.up)
         on_path = plan.position + residual[0] * plan.normal + residual[1] * up
         step = s - state.s_torch
     else:
-        # The plan knows its surface better than a few points beside a corner do: the path leaves it by three degrees at most.
+        # The plan gives the surface better than a few points near a corner: the path leaves it by three degrees at most.
         rise = dot(fit.tangent, plan.up)
         t = unit(fit.tangent + (clip(rise, -_RISE, _RISE) - rise) * plan.up, fit.tangent)
         on_path = fit.point
@@ -103,10 +103,10 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
     if fit is not None:
         bend = dot(fit.bend, n) / fit.speed**2
         if abs(plan.curvature) > _SHARP_PER_M:
-            # Round a sharp corner the bend here says little of the path a moment later, and a turn of the torch's way takes
+            # At a sharp corner the bend here does not describe the path a moment later, and turning the torch's path takes
             # a ramp at the limit of the turning rate, of which half counts as lag.
             speed = config.weld_speed_m_s
-            ramp = speed / (config.tool.torch_offset_m * config.omega_acceleration_rad_s2)
+            ramp = speed / (config.tool.torch_offset_m * config.limits.omega_acceleration_rad_s2)
             then = local_fit(
                 seam,
                 arc + speed * (config.lag_s + 0.5 * ramp),
@@ -117,7 +117,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
             if then is not None:
                 bend = math.asin(clip(dot(then.tangent, n), -1.0, 1.0)) / (speed * config.lag_s)
     if config.clearance_m:
-        # Where the surface twists along the seam, a line above or below it heads a little to the side.
+        # Where the surface twists along the seam, the direction of a line above or below it differs slightly.
         h = 2.0e-3
         twist = dot(curve.frame(s + h).up - curve.frame(s - h).up, n) / (2.0 * h)
         t = unit(t + config.clearance_m * twist * n, t)
@@ -130,7 +130,7 @@ def torch_target(state: WeldingState, curve: SeamCurve, p_BW: Array, config: Ser
 def _carried_on(
     seam: RefinedSeam, fit: LocalFit, inside: float, arc: float, plan: SeamFrame, config: ServoConfig
 ) -> LocalFit | None:
-    """The path a little past the last point, bending as the points before it do; None farther on, where the plan leads."""
+    """Extrapolate the path past the last point with the bend before it; None farther on, where the plan is used."""
     ahead = arc - inside
     if ahead > _CARRY_M:
         return None
@@ -144,13 +144,13 @@ def _carried_on(
 
 
 def _nearest_point(arcs: Array, arc: float) -> float:
-    """How far the nearest of ascending arcs is, m."""
+    """Distance to the nearest of ascending arcs, m."""
     i = int(np.searchsorted(arcs, arc))
     return min(abs(arc - float(arcs[k])) for k in (max(0, i - 1), min(i, len(arcs) - 1)))
 
 
 def _bridged(state: WeldingState, curve: SeamCurve, arc: float, s: float) -> Array:
-    """The residual (normal, up) m inside a gap: a cubic that leaves and meets the points on its two sides in line."""
+    """The residual (normal, up) m inside a gap: a cubic with the slopes of the points on its two sides."""
     seam = state.refined
     i = int(np.searchsorted(seam.arc, arc))
     edges: list[tuple[float, Array, Array]] = []
@@ -196,15 +196,16 @@ def guarded_motion(
         target: of the torch.
         servo: the tip's lateral and upward speeds, m/s.
     """
+    limits, torch, weights = config.limits, config.torch, config.weights
     axes = tool_axes(X_BT, tip.up, target.up, config)
     u, m, a, d, up = axes.along, axes.across, axes.yaw, axes.d, axes.up
     t, n, b = target.tangent, target.normal, target.up
     e = axes.torch - target.point
-    limit = config.feedback_limit_m
-    back_n = target.rate - config.k_b * clip(dot(e, n), -limit, limit)
-    back_b = -config.k_h * clip(dot(e, b), -limit, limit)
+    limit = torch.feedback_limit_m
+    back_n = target.rate - torch.k_b * clip(dot(e, n), -limit, limit)
+    back_b = -torch.k_h * clip(dot(e, b), -limit, limit)
 
-    # What is commanded now is done a robot's lag later: the rows look that far ahead along the path.
+    # A command takes effect after the robot's lag: the rows look that far ahead along the path.
     turn = clip(target.bend * config.weld_speed_m_s * config.lag_s, -0.6, 0.6)
     t, n = math.cos(turn) * t + math.sin(turn) * n, math.cos(turn) * n - math.sin(turn) * t
     swing = clip(state.omega * config.lag_s, -0.1, 0.1)
@@ -222,32 +223,32 @@ def guarded_motion(
 
     speed = config.weld_speed_m_s
     radius = 1.0 / max(abs(tip.curvature), 1e-6)
-    top = min(config.tip_speed_max_m_s, max(config.tip_speed_floor * speed, config.turn_rate_max_rad_s * radius))
-    dv, dw, w_top = config.tip_acceleration_m_s2 * dt, config.omega_acceleration_rad_s2 * dt, config.omega_max_rad_s
-    # Where the tip would have to move square to the torch's way, or against it, speed at the torch is no reason to
-    # stand: the tip creeps round, and the torch waits.
-    creep = config.creep * speed * clip(1.0 - 10.0 * dot(tb, u), 0.0, 1.0)
-    # Chord just past square to the torch's way: the rest point may give back a little, within what friction holds.
+    top = min(limits.tip_speed_max_m_s, max(limits.tip_speed_floor * speed, limits.turn_rate_max_rad_s * radius))
+    dv, dw, w_top = (limits.tip_acceleration_m_s2 * dt, limits.omega_acceleration_rad_s2 * dt, limits.omega_max_rad_s)
+    # Where the tip would have to move square to the torch's path, or against it, the tip must not stop for the torch's
+    # speed: the tip creeps round, and the torch waits.
+    creep = limits.creep * speed * clip(1.0 - 10.0 * dot(tb, u), 0.0, 1.0)
+    # Chord just past square to the torch's path: the rest point may move back a little, within what friction holds.
     given_back = state.furthest - state.progress
     least = (
-        creep if creep > 0.0 else -config.give_back_m_s * clip(2.0 - 2.0 * given_back / config.give_back_m, 0.0, 1.0)
+        creep if creep > 0.0 else -limits.give_back_m_s * clip(2.0 - 2.0 * given_back / limits.give_back_m, 0.0, 1.0)
     )
     v_low = min(max(least, state.v_tip - dv), state.v_tip + dv)
     v_high = max(v_low, min(top, state.v_tip + dv))
     w_low, w_high = max(-w_top, state.omega - dw), min(w_top, state.omega + dw)
     v, w = box_least_squares(
         (
-            (config.weight_lateral, n_v, n_w, back_n - n_0),
-            (config.weight_torch_speed, t_v, t_w, speed - t_0),
-            (config.weight_omega, 0.0, d, 0.0),
-            (config.weight_tip_speed, 1.0, 0.0, speed),
+            (weights.lateral, n_v, n_w, back_n - n_0),
+            (weights.torch_speed, t_v, t_w, speed - t_0),
+            (weights.omega, 0.0, d, 0.0),
+            (weights.tip_speed, 1.0, 0.0, speed),
         ),
         (v_low, v_high),
         (w_low, max(w_low, w_high)),
     )
-    w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -config.pitch_rate_max_rad_s, config.pitch_rate_max_rad_s)
+    w_p = clip(-(v * up_v + w * up_w + up_0) / (d * ab), -limits.pitch_rate_max_rad_s, limits.pitch_rate_max_rad_s)
 
-    # Roll about the level chord goes to the work angle; what yaw about a tilted tool axis adds to it is taken off.
+    # Roll about the level chord holds the work angle; the roll caused by yaw about a tilted tool axis is subtracted.
     level = unit(u - dot(u, up) * up, u)
     w_r = clip((roll_rate(axes, b, config) - w * dot(a, level)) / max(dot(u, level), 0.2), -w_top, w_top)
     V = np.concatenate([w * a + w_p * m + w_r * u, v * tb + base])

@@ -1,4 +1,4 @@
-"""Weaving: the torch swings across the seam and rests at its sides, while the tip keeps to its own path."""
+"""Computes the weave: the torch oscillates across the seam with a dwell at each side, and the tip keeps its path."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from weldcal.models.errors import InputError
 
 
 class WeaveError(InputError):
-    """A weave that no torch can swing."""
+    """A weave with invalid settings."""
 
 
 @dataclass(frozen=True)
 class WeaveConfig:
-    """The swing of the torch.
+    """Settings of the weave.
 
     Attributes:
         amplitude_m: to each side; 0 for a stringer bead. frequency_hz: swings a second, the rests not counted.
@@ -45,7 +45,7 @@ def weave_at(config: WeaveConfig, since: float) -> tuple[float, float]:
         return 0.0, 0.0
     half = 0.5 / config.frequency_hz
     period = 2.0 * half + config.dwell_left_s + config.dwell_right_s
-    # A swing begins in the middle, on its way to the left side.
+    # A swing starts in the middle, towards the left side.
     t = (since + 0.5 * half) % period
     slope = math.pi / half
     if t < half:

@@ -14,7 +14,7 @@ from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
-from weldcal.welding.vectors import within
+from weldcal.welding.numerics import within
 
 _LARGEST_MM = 1.0  # an arm that misses by more is broken, not unrepeatable
 

@@ -33,7 +33,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.wiring import Wiring
-from weldcal.welding.servo.state import ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
 
 # How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
 SHARES = {

@@ -20,7 +20,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.servo.state import ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
 
@@ -108,7 +108,7 @@ class SeamPlanner(LeafSystem):
             q_retract,
             points_B,
             sigma_m=found.sigma_m,
-            words=found.words,
+            words=found.summary,
         )
 
     def _output(self, context: Context, output: Any) -> None:

@@ -14,7 +14,7 @@ from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
 
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two against refused scans
 ZERO_FRAMES = 10  # of the tag while the tip hangs free: a third of a second before it comes down
@@ -50,8 +50,9 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
         tool=geometry,
         touch=TouchConfig(zero_frames=ZERO_FRAMES),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
-        delta_d_m=welding.deflection_mm * 1e-3,
-        axial_d_m=welding.axial_deflection_mm * 1e-3,
+        deflection=DeflectionControl(
+            delta_d_m=welding.deflection_mm * 1e-3, axial_d_m=welding.axial_deflection_mm * 1e-3
+        ),
         law=welding.law,
     )
 

@@ -14,7 +14,8 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import JobCommand, Message, PlannedSeam
-from weldcal.welding.servo.state import Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.step import welding_step
 
 TELEMETRY = (

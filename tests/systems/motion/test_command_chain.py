@@ -21,7 +21,8 @@ from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.guards import SlewLimits
-from weldcal.welding.servo.state import DeflectionSample, ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import DeflectionSample
 from weldcal.welding.servo.touch import touch_start_pose
 
 WELD = JobCommand(phase="weld", mode="weld", process_on=True)

@@ -15,7 +15,7 @@ from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
 from weldcal.tools.studies.seam_planning.trials import sideways
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.find_workpiece import find_workpiece
-from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planning import PlanningMethod, plan_root
 from weldcal.welding.locate.registration import WorkpieceNotFound, register_workpiece
 
@@ -112,7 +112,7 @@ def test_from_the_cloud_alone_the_root_follows_the_bend_and_its_normals_turn_wit
     assert np.sqrt(np.mean(side**2)) < 0.15e-3
     assert np.sqrt(np.mean(height**2)) < 0.3e-3
     assert groove.bend_radius == pytest.approx(RADIUS_M, rel=0.01)
-    assert "bent over a radius of 200 mm" in groove.words or "bent over a radius of 199 mm" in groove.words
+    assert "bent over a radius of 200 mm" in groove.summary or "bent over a radius of 199 mm" in groove.summary
     plan = plan_root(scene.cloud_B, PART, scene.X_BP, PlanningMethod(method="cloud"))
     turn = math.acos(float(plan.up[0] @ plan.up[-1]))
     expected = math.acos(float(PART.up_P[0] @ PART.up_P[-1]))

@@ -57,7 +57,7 @@ def test_an_l_groove_tells_its_own_turn_without_any_hint() -> None:
     found = find_workpiece(scene.cloud_B, CAD["l"])
     v, _ = _error(found, scene.X_BP)
     assert np.linalg.norm(v[:3]) < math.radians(0.1)
-    assert "groove tells" in found.words
+    assert "groove tells" in found.summary
     assert found.groove is not None
     assert found.turned_groove is not None
     assert found.groove > 0.8 > found.turned_groove

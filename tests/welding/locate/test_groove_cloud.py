@@ -22,8 +22,8 @@ from weldcal.models.workpieces import make_workpiece
 from weldcal.tools.studies.seam_planning import benchmark as seam_planning
 from weldcal.tools.studies.seam_planning.scenes import Scene, box, cast, looking_at, scan_part, table
 from weldcal.tools.studies.seam_planning.trials import sideways
-from weldcal.welding.locate.groove_cloud import extract_groove
-from weldcal.welding.locate.groove_seam import (
+from weldcal.welding.locate.groove.extract import extract_groove
+from weldcal.welding.locate.groove.seam import (
     GrooveNotFound,
     GrooveSeam,
     GrooveTooNarrow,
@@ -140,7 +140,7 @@ def test_an_arm_over_a_third_of_the_part_leaves_a_shorter_seam_that_says_so() ->
     groove = extract_groove(scene.cloud_B)
     assert groove.s[-1] < 0.25
     assert groove.ends_seen.count(False) == 1
-    assert "out of sight" in groove.words
+    assert "out of sight" in groove.summary
     side, _ = sideways(groove.root, part, scene.X_BP)
     assert np.abs(side).max() < 0.6e-3
     assert np.sqrt(np.mean((side / groove.sigma) ** 2)) < 1.7
@@ -158,7 +158,7 @@ def test_a_thin_bar_over_the_groove_is_a_named_gap_and_a_broad_one_ends_what_is_
     assert groove.s[-1] == pytest.approx(part.length_m, abs=2.6e-3)
     side, _ = sideways(groove.root, part, scene.X_BP)
     assert np.abs(side).max() < 0.6e-3
-    assert f"from {1e3 * a:.0f} to {1e3 * b:.0f} mm" in groove.words
+    assert f"from {1e3 * a:.0f} to {1e3 * b:.0f} mm" in groove.summary
 
 
 def test_of_two_grooves_a_point_near_it_chooses_and_without_it_neither_is_taken() -> None:

@@ -108,11 +108,11 @@ def test_a_tip_that_is_held_up_does_not_advance_the_path() -> None:
     noise = np.random.default_rng(3).normal(0.0, 0.05e-3, (len(x), 2))
     seam = felt(np.column_stack([x, noise]), arc)
     # Six frames pass before it is seen to be slow, and six more until it is seen to be quick again.
-    assert seam.sprung == pytest.approx(-2.4e-3, abs=1.2e-3)
+    assert seam.jumped == pytest.approx(-2.4e-3, abs=1.2e-3)
     assert np.all(np.diff(seam.arc) > 0.0)
     # What comes after a gap of 30 mm is no tip that was held up.
     on = np.concatenate([np.arange(0.0, 10e-3, 0.25e-3), np.arange(40e-3, 50e-3, 0.25e-3)])
-    assert felt(np.column_stack([on, 0 * on, 0 * on]), on).sprung == 0.0
+    assert felt(np.column_stack([on, 0 * on, 0 * on]), on).jumped == 0.0
 
 
 def test_the_torch_heads_where_the_fitted_point_goes() -> None:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from weldcal.welding.servo.chord import (
+from tests.welding.servo.planar_chord import (
     ChordMotion,
-    UnknownLaw,
     chord_axes,
     conditioning,
-    get_law,
     paper_as_printed,
     paper_corrected,
     projective_law,
@@ -44,9 +43,9 @@ def test_the_printed_law_gives_the_torch_twice_the_normal_velocity_it_should_rem
         assert corrected @ n == pytest.approx(0.0, abs=1e-12)
 
 
-def follow(law: str, radius: float, offset: float = 0.0, travel: float = 0.040) -> float:
+def follow(omega_of: Callable[..., float], radius: float, offset: float = 0.0, travel: float = 0.040) -> float:
     """How far the torch is off an arc in the end, m: tip exactly on it, torch starting `offset` to the left of it."""
-    omega_of, dt = get_law(law), 1e-3
+    dt = 1e-3
     centre = np.array([0.0, radius])
     turn = 2.0 * math.asin(D / (2.0 * radius))
     psi = turn  # the torch starts at the arc's lowest point, the tip a chord ahead
@@ -67,14 +66,14 @@ def follow(law: str, radius: float, offset: float = 0.0, travel: float = 0.040) 
 
 
 def test_as_printed_the_torch_leaves_an_arc_and_corrected_it_stays() -> None:
-    assert abs(follow("paper_as_printed", 0.100)) > 5e-3
+    assert abs(follow(paper_as_printed, 0.100)) > 5e-3
     # Euler at 1 ms: local error (V dt)^2/2R, damped at k_b = 2.5/s: below a micrometre.
-    assert abs(follow("paper_corrected", 0.100)) < 5e-6
+    assert abs(follow(paper_corrected, 0.100)) < 5e-6
 
 
 def test_only_position_feedback_takes_a_starting_offset_out() -> None:
     # 5 s at k = 2.5/s leave exp(-12.5) of 2 mm; at velocity level alone (k = 0) it would stay.
-    assert abs(follow("paper_corrected", 0.100, offset=2e-3)) < 10e-6
+    assert abs(follow(paper_corrected, 0.100, offset=2e-3)) < 10e-6
     omega = paper_corrected(np.array([V, 0.0]), np.array([0.0, 1.0]), 0.0, D, 2e-3, k=0.0)
     assert omega == 0.0
 
@@ -109,8 +108,3 @@ def test_only_a_u_turn_square_to_the_chord_is_ill_conditioned() -> None:
     for turn in np.linspace(0.0, math.radians(90.0), 10):
         for share in np.linspace(0.0, 1.0, 11):
             assert conditioning(share * turn, (1.0 - share) * turn) >= 1.0 - 1e-9
-
-
-def test_an_unknown_law_is_refused_by_name() -> None:
-    with pytest.raises(UnknownLaw, match="paper_corrected"):
-        get_law("magic")

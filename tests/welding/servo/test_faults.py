@@ -16,7 +16,8 @@ from weldcal.tools.studies.weld.budgets import NOMINAL
 from weldcal.tools.studies.weld.plant import simulate
 from weldcal.tools.studies.weld.seams import TrueSeam, arcs
 from weldcal.welding.seam.curve import SeamCurve, SeamError
-from weldcal.welding.servo.state import DeflectionSample, Phase, ServoConfig, ServoSample, TouchConfig, WeldingState
+from weldcal.welding.servo.settings import ServoConfig, TouchConfig
+from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
 
@@ -30,11 +31,13 @@ def bounded(command: object) -> None:
     V = command.V_BT  # type: ignore[attr-defined]
     d = command.diagnostics  # type: ignore[attr-defined]
     assert np.isfinite(V).all()
-    assert abs(d.omega) <= CONFIG.omega_max_rad_s + 1e-12
-    assert -CONFIG.give_back_m_s - 1e-12 <= d.tip_speed <= CONFIG.tip_speed_max_m_s + 1e-12
+    assert abs(d.omega) <= CONFIG.limits.omega_max_rad_s + 1e-12
+    assert -CONFIG.limits.give_back_m_s - 1e-12 <= d.tip_speed <= CONFIG.limits.tip_speed_max_m_s + 1e-12
     # omega about the tool's up, pitch and roll each within their own limits.
     assert np.linalg.norm(V[:3]) <= math.hypot(0.8, 0.3, 0.8 + 0.8) + 1e-9
-    assert np.linalg.norm(V[3:]) <= CONFIG.tip_speed_max_m_s + 2.0 * max(CONFIG.servo_speed_m_s, CONFIG.touch.fast_m_s)
+    assert np.linalg.norm(V[3:]) <= CONFIG.limits.tip_speed_max_m_s + 2.0 * max(
+        CONFIG.deflection.speed_m_s, CONFIG.touch.fast_m_s
+    )
 
 
 odd = st.one_of(st.floats(-0.3, 0.3), st.sampled_from([math.nan, math.inf, -math.inf, 0.0, 1e300]))
@@ -139,7 +142,7 @@ def test_one_picture_told_again_and_again_stops_the_weld(
             break
     assert command.phase == Phase.FAULT
     assert "repeats one picture" in (command.reason or "")
-    assert k <= CONFIG.contact.frozen_frames + 1
+    assert k <= CONFIG.faults.frozen_frames + 1
 
 
 def test_a_tag_that_reads_mirrored_never_passes_touch_on() -> None:
@@ -191,7 +194,7 @@ def test_a_torch_that_stands_is_stopped_by_name(half_way: tuple[WeldingState, Ri
             break
     assert command.phase == Phase.FAULT
     assert "stood" in (command.reason or "")
-    assert 0.008 * k <= CONFIG.stall_s + 0.1
+    assert 0.008 * k <= CONFIG.faults.stall_s + 0.1
 
 
 def test_a_clock_that_stands_still_stops_the_weld(half_way: tuple[WeldingState, RigidTransform, SeamCurve]) -> None:

@@ -15,15 +15,8 @@ from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.plan_fit import PlanFit
 from weldcal.welding.servo.feel_start import feel_start_step, with_touch_place
-from weldcal.welding.servo.state import (
-    Measurement,
-    Phase,
-    ServoConfig,
-    ServoSample,
-    TouchConfig,
-    TouchState,
-    WeldingState,
-)
+from weldcal.welding.servo.settings import ServoConfig, TouchConfig
+from weldcal.welding.servo.state import Measurement, Phase, ServoSample, TouchState, WeldingState
 
 MM = 1e-3
 UP = np.array([0.0, 0.0, 1.0])

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from weldcal.welding.numerics import box_least_squares
 from weldcal.welding.servo.guards import (
     ArmGuardConfig,
     GuardError,
@@ -16,7 +17,6 @@ from weldcal.welding.servo.guards import (
     seam_conditioning,
     slew_limit,
 )
-from weldcal.welding.servo.lsq import box_least_squares
 
 DT = 0.002
 LIMITS = SlewLimits(speed=1.0, acceleration=4.0, jerk=80.0)

@@ -11,10 +11,9 @@ from weldcal.tools.studies.weld.plant import simulate
 from weldcal.tools.studies.weld.rows import Case
 from weldcal.tools.studies.weld.seams import TrueSeam, arcs, corner
 from weldcal.tools.studies.weld.study import study_config
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.refinement import RefinedSeam
-from weldcal.welding.servo.chord import UnknownLaw
-from weldcal.welding.servo.laws import LAWS, get_law, literal_tangent
-from weldcal.welding.vectors import Array
+from weldcal.welding.servo.laws import LAWS, UnknownLaw, get_law, literal_tangent
 
 STRAIGHT = arcs((0.10, 0.0), spacing=2e-3)
 CORNER = corner(0.020, 90.0, 1.0, legs=0.07)
@@ -41,12 +40,12 @@ def test_as_printed_the_torch_is_thrown_off_the_seam() -> None:
     assert printed.max_mm > 10.0
 
 
-def test_with_its_sign_mended_it_keeps_the_offset_it_starts_with() -> None:
-    mended = welded(STRAIGHT, "open", KINEMATIC)
-    assert mended.completed
+def test_with_its_sign_corrected_it_keeps_the_offset_it_starts_with() -> None:
+    corrected = welded(STRAIGHT, "open", KINEMATIC)
+    assert corrected.completed
     # Touch-on pushes the rest point delta_d to the side, and the torch with it; nothing takes that back.
     # Touch-on is over once the tip leans by nine tenths of it.
-    assert 0.9 * 2.0 - 0.02 <= mended.mean_mm <= 2.0 + 0.02
+    assert 0.9 * 2.0 - 0.02 <= corrected.mean_mm <= 2.0 + 0.02
     fed_back = welded(STRAIGHT, "fixed", KINEMATIC)
     assert fed_back.mean_mm < 0.02
 

@@ -12,11 +12,12 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.tools.studies.weld.budgets import HARD, planned_seam
 from weldcal.tools.studies.weld.seams import arcs, get_seam, on_cylinder
+from weldcal.welding.numerics import changed
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import InfeasibleSeam, SeamWindows, assess_seam, check_feasible, split_seam
-from weldcal.welding.servo.evolve import changed
-from weldcal.welding.servo.state import Phase, ServoConfig, ServoSample, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
 

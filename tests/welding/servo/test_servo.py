@@ -18,16 +18,15 @@ from weldcal.tools.studies.weld.groove import SEAT_M as SEAT
 from weldcal.tools.studies.weld.seams import s_curve
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.state import (
-    DeflectionSample,
-    Phase,
+from weldcal.welding.servo.settings import (
+    DeflectionControl,
+    FaultLimits,
     ServoConfig,
     ServoConfigError,
-    ServoSample,
     ToolGeometry,
     TouchConfig,
-    WeldingState,
 )
+from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
 
@@ -280,13 +279,18 @@ def test_every_command_is_finite_wherever_the_tool_stands() -> None:
             state, command = welding_step(state, ServoSample(time, X, frame), plan, CALIBRATED)
             assert np.isfinite(command.V_BT).all()
             assert np.linalg.norm(command.V_BT[:3]) <= 1.5
-            assert np.linalg.norm(command.V_BT[3:]) <= CALIBRATED.tip_speed_max_m_s + 2 * CALIBRATED.servo_speed_m_s
+            assert (
+                np.linalg.norm(command.V_BT[3:])
+                <= CALIBRATED.limits.tip_speed_max_m_s + 2 * CALIBRATED.deflection.speed_m_s
+            )
 
 
 def test_settings_that_make_no_sense_are_refused() -> None:
     with pytest.raises(ServoConfigError, match="weld_speed_m_s"):
         ServoConfig(weld_speed_m_s=0.0)
     with pytest.raises(ServoConfigError, match="k_p"):
-        ServoConfig(k_p=math.nan)
+        DeflectionControl(k_p=math.nan)
+    with pytest.raises(ServoConfigError, match="hidden_s"):
+        FaultLimits(hidden_s=math.nan)
     with pytest.raises(ServoConfigError, match="trail"):
         ServoConfig(tool=ToolGeometry(torch_offset_m=0.0))

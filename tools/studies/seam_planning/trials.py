@@ -20,7 +20,7 @@ from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece
 from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
 from weldcal.welding.locate.find_workpiece import find_workpiece
-from weldcal.welding.locate.groove_cloud import extract_groove
+from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats, into
 
 WIDEST_PX = 824

@@ -10,8 +10,8 @@ from pydrake.math import RotationMatrix
 from scipy.ndimage import gaussian_filter1d
 
 from weldcal.tools.studies.weld.seams import TrueSeam
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from weldcal.welding.numerics import Array, dot
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.vectors import Array, dot
 
 RADIUS_M = 2.5e-3
 HALF_ANGLE_RAD = math.radians(22.5)

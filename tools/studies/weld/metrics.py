@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.tools.studies.weld.plant import PHASES, StudyRun
+from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import ProcessLogError, path_error, speed_statistics
 from weldcal.welding.seam.chord_map import chord_map
 from weldcal.welding.servo.state import Phase
-from weldcal.welding.vectors import Array
 
 _WELDING = [PHASES.index(p) for p in (Phase.TRACK, Phase.COAST, Phase.FINISH)]
 

@@ -11,12 +11,13 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.tools.studies.weld.budgets import Budget, planned_seam, roughness
 from weldcal.tools.studies.weld.groove import DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.weld.seams import TrueSeam
+from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place
-from weldcal.welding.servo.state import DeflectionSample, Phase, ServoConfig, ServoSample, WeldingCommand, WeldingState
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingCommand, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
-from weldcal.welding.vectors import Array
 
 FRAME_PERIOD_S = 1.0 / 30.0
 COLUMNS = (

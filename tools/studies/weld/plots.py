@@ -10,7 +10,8 @@ from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.tools.studies.weld.plant import PHASES, StudyRun
 from weldcal.welding.record.process import path_error, speed_along
 from weldcal.welding.seam.chord_map import chord_map
-from weldcal.welding.servo.state import Phase, ServoConfig
+from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 _EVERY = 4  # ticks per plotted point: 0.26 mm at 8 mm/s
 _BENT_RAD = math.radians(1.0)  # a surface whose normal turns by less is flat
@@ -34,7 +35,7 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
             np.arcsin(np.clip(np.sum(run.points(name)[keep] * up, axis=1), -1.0, 1.0)) for name in ("left", "ahead")
         )
         chart = chord_map(
-            line, config.tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=config.delta_d_m
+            line, config.tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=config.deflection.delta_d_m
         )
         work, travel = (np.where(seen, angle, np.nan) for angle in (lean, pitch))
         foretold = np.where(seen, chart.travel_at(off.s), np.nan)
@@ -56,9 +57,9 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
         omega=run.column("omega_rad_s")[keep],
         n_d_dot_n_t=run.column("n_d_dot_n_t")[keep],
         weld_speed=config.weld_speed_m_s,
-        delta_d=config.delta_d_m,
-        axial_d=config.axial_d_m,
-        omega_max=config.omega_max_rad_s,
+        delta_d=config.deflection.delta_d_m,
+        axial_d=config.deflection.axial_d_m,
+        omega_max=config.limits.omega_max_rad_s,
         work=work,
         travel=travel,
         foretold=foretold,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array
+from weldcal.welding.numerics import Array
 
 LENGTH_M = 0.300
 

@@ -13,7 +13,7 @@ from weldcal.tools.studies.weld.plant import StudyRun, simulate
 from weldcal.tools.studies.weld.rows import Case, Row, Target
 from weldcal.tools.studies.weld.seams import get_seam
 from weldcal.welding.seam.feasibility import SeamWindows
-from weldcal.welding.servo.state import ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
 
 Progress = Callable[[str, float], None]
 
@@ -94,7 +94,12 @@ def study_config(case: Case) -> ServoConfig:
     if case.law == "guarded":
         return config
     open_wide = SeamWindows(travel_rad=math.pi, work_rad=math.pi)
-    return replace(config, ignition_error_m=1.0, torch_error_max_m=1.0, windows=open_wide)
+    return replace(
+        config,
+        torch=replace(config.torch, ignition_error_m=1.0),
+        faults=replace(config.faults, torch_error_m=1.0),
+        windows=open_wide,
+    )
 
 
 def run_case(case: Case, seed: int) -> tuple[StudyRun, RunMetrics]:

@@ -1,4 +1,4 @@
-"""A measured V-groove: its lines with their sigmas, the limits it is held to, and the named reasons to refuse it."""
+"""Data of a V-groove: the expected profile, the measured seam with its sigmas, limits, and the errors that refuse it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
-from weldcal.welding.locate.groove_search import SearchConfig
+from weldcal.welding.locate.groove.search import SearchConfig
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -19,7 +19,7 @@ class GrooveNotFound(WeldcalError):
 
 
 class SeveralGrooves(WeldcalError):
-    """The cloud shows more than one V-groove and nothing says which is meant."""
+    """The cloud shows more than one V-groove and no point selects one."""
 
 
 class GrooveTooNarrow(WeldcalError):
@@ -27,19 +27,19 @@ class GrooveTooNarrow(WeldcalError):
 
 
 class GrooveUncertain(WeldcalError):
-    """The groove is there, but not known well enough to weld."""
+    """The groove was found, but its position is not accurate enough to weld."""
 
 
 @dataclass(frozen=True)
 class GrooveConfig:
-    """Limits of the extraction.
+    """Limits of the groove extraction.
 
     least_pitches  a groove must be this many point distances wide
     smoothing_m    width of the Gaussian along the seam
     most_sigma_m   a root that is less certain than this, outside gaps, is refused
     longest_gap_m, most_missing   one gap, and the share of the whole seam, that may be bridged
     steepest_wall_rad             steeper walls cannot be measured from above: an opening that has them is a gap
-    ground_reach_m                lower ground is looked for so far beyond an end, to tell the plate's end from the view's
+    ground_reach_m                search length beyond an end for lower ground, which distinguishes the plate's end from the view's
     most_bridge_sigma_m           how uncertain the line may be where it is bridged
     """
 
@@ -54,9 +54,19 @@ class GrooveConfig:
     ground_reach_m: float = 0.009
 
 
+@dataclass(frozen=True)
+class Profile:
+    """The expected cross-section: slopes of the walls and depth, with their sigmas."""
+
+    slopes: tuple[float, float]
+    depth: float
+    slope_sigma: float = 0.15  # relative
+    depth_sigma: float = 0.30
+
+
 @dataclass(frozen=True, eq=False)
 class GrooveSeam:
-    """A V-groove, by arc length from its start, every millimetre; metres and radians, in the cloud's frame A.
+    """A measured V-groove, sampled every millimetre of arc length from its start; metres, radians, in the cloud's frame A.
 
     curve                the root as a seam; at a sharp corner it and `root` are rounded with a radius of 0.5 mm
     root, left, right    (N,3) root and shoulder lines, left as one travels; s (N,) arc length of the root
@@ -65,7 +75,7 @@ class GrooveSeam:
     gaps                 (from, to) arc lengths that were bridged and not seen;
     corners, apexes      arc lengths of tight corners, and (K,3) where the two sides meet there
     ends_seen            whether first and last end lie at the edge of the face, not at the edge of what was seen
-    start                in words, which end is the start
+    start                a phrase that says which end is the start
     X_AF                 the face: origin on it, z up out of it; bend_radius of a face bent over a cylinder, negative for a hollow one
     """
 
@@ -107,13 +117,13 @@ class GrooveSeam:
 
     @property
     def confidence(self) -> float:
-        """Share of the seam that was seen and not bridged, 0 to 1; an end that may lie out of sight takes a tenth."""
+        """Share of the seam that was seen, 0 to 1, less a tenth for each end that may be out of view."""
         hidden = sum(b - a for a, b in self.gaps) / float(self.s[-1])
         return max(0.0, 1.0 - hidden - 0.1 * self.ends_seen.count(False))
 
     @property
-    def words(self) -> str:
-        """What was found, for a person."""
+    def summary(self) -> str:
+        """One sentence that describes the result."""
         kind = "closed V-groove" if self.closed else "V-groove"
         text = (
             f"a {kind} {1e3 * self.s[-1]:.0f} mm long, {1e3 * self.width:.1f} mm wide, "
@@ -126,5 +136,5 @@ class GrooveSeam:
         for a, b in self.gaps:
             text += f"; not seen from {1e3 * a:.0f} to {1e3 * b:.0f} mm"
         for seen, end in zip(self.ends_seen, ("beginning", "end"), strict=True):
-            text += "" if seen else f"; its {end} is not at the plate's edge and may lie out of sight"
+            text += "" if seen else f"; its {end} is not at the plate's edge and may be out of view"
         return text

@@ -1,4 +1,4 @@
-"""One groove measured: its coarse line moved to the sections' centres, ends, gaps and corners found, every figure with a sigma."""
+"""Measures one groove from its coarse line: root and shoulder lines, ends, gaps and corners, each with a sigma."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from weldcal.welding.locate.groove_corner import Corner, round_corners, split_legs
-from weldcal.welding.locate.groove_extent import ends_at_edges, refuse_gap, seen_extent
-from weldcal.welding.locate.groove_follow import (
+from weldcal.welding.locate.groove.line import Corner, Line, round_corners, smoothing_weights, split_legs
+from weldcal.welding.locate.groove.seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain, Profile
+from weldcal.welding.locate.groove.search import CoarseGroove
+from weldcal.welding.locate.groove.section import (
+    BAND_M,
+    ENOUGH,
     STATION_M,
     Slices,
     agreed,
@@ -20,30 +23,25 @@ from weldcal.welding.locate.groove_follow import (
     followed,
     measured_profile,
 )
-from weldcal.welding.locate.groove_line import Line, smoothing_weights
-from weldcal.welding.locate.groove_seam import GrooveConfig, GrooveNotFound, GrooveSeam, GrooveUncertain
-from weldcal.welding.locate.groove_search import CoarseGroove
-from weldcal.welding.locate.groove_section import BAND_M, ENOUGH, Profile
 from weldcal.welding.locate.planes import Floats, into, point_pitch, thinned
 from weldcal.welding.seam.curve import SeamCurve
 
 MOST_POINTS = 400_000  # about one groove
-THINNED = 0.9  # a smaller pitch than that of the cloud it was found in is that of a cloud which was thinned for it
-SIGMA_SCALE = 1.1  # of the slices' own sigmas: what neighbouring slices err together
+THINNED = 0.9  # a pitch smaller than this times that of the search means that the cloud was thinned for the search
+SIGMA_SCALE = 1.1  # on the slices' own sigmas, for errors common to neighbouring slices
 SIGMA_FLOOR_PITCHES = 0.04
 SIGMA_FLOOR_NOISE = 0.20
-HEIGHT_FLOOR_NOISE = 0.25  # of the root: what flies off the walls near it is the more, the noisier the scanner
+HEIGHT_FLOOR_NOISE = 0.25  # of the root: flying points off the walls increase with the scanner's noise
 ONE_SIDED_PITCHES = 0.2
 END_PITCHES, END_REACH_M = 0.12, 0.006
 CORNER_REACH_M = 0.004
 GAP_ENDS = 0.6
-LEAST_NOISE_M = 3e-5  # what a smooth profile itself misses
 
 
 def measure_groove(
     points: Floats, groove: CoarseGroove, config: GrooveConfig, start_A: npt.ArrayLike | None
 ) -> GrooveSeam:
-    """The groove's lines, refined from its coarse centre line."""
+    """Refine a coarse centre line to the groove's root and shoulder lines."""
     f = into(groove.X_AQ, points)
     low = groove.line_Q.min(axis=0) - 0.03
     high = groove.line_Q.max(axis=0) + 0.03
@@ -51,10 +49,10 @@ def measure_groove(
     around = f[near & (f[:, 2] < 0.003)]
     near &= (f[:, 2] > -config.search.max_depth_m) & (f[:, 2] < max(5.0 * groove.sigma_m, 0.003))
     f = f[near]
-    # Later lines stay within a few millimetres of this one: all that lies further off is left here.
+    # Later lines stay within a few millimetres of this one: points further away are not needed.
     rough = cKDTree(groove.line_Q[::4]).query(f[:, :2], distance_upper_bound=0.5 * groove.width_m + BAND_M + 0.012)[0]
     f = f[np.isfinite(rough)]
-    # The openings were found in a thinned cloud: here all of its points count.
+    # The openings were found in a thinned cloud; the measurement uses all points.
     f = thinned(f, MOST_POINTS)
     fine = point_pitch(f[np.abs(f[:, 2]) < 0.003][:, :2])
     groove = replace(groove, pitch_m=fine) if fine < THINNED * groove.pitch_m else groove
@@ -63,7 +61,7 @@ def measure_groove(
     if groove.closed:
         line = Line(np.vstack([groove.line_Q, groove.line_Q[:1]])).even()
     else:
-        # The farthest cells of an opening are its corners: the coarse line's ends lead there and not along it.
+        # The farthest cells of an opening are its corners: the ends of the coarse line lead there, not along the groove.
         trim = min(groove.width_m, 0.25 * line.length)
         inner = (line.s >= trim) & (line.s <= line.length - trim)
         line = Line(line.points[inner]).extended(trim + 0.006, trim + 0.006)
@@ -75,7 +73,7 @@ def measure_groove(
         bends = [c.apex for c in corners if c.wide]
         if not bends:
             break
-        # What noise made look like a corner is a bend: the line is followed anew round it.
+        # A corner that turns out to be a bend: follow the line again without a corner there.
         wide += bends
     corners = [c for c in corners if not c.wide]
     slices = agreed(cut_slices(f, whole, profile, sigma, pitch, half_slice, corners))
@@ -91,19 +89,19 @@ def _traced(
     config: GrooveConfig,
     wide: list[Floats],
 ) -> tuple[Line, list[Corner], Profile]:
-    """The coarse line moved to the groove, in legs between its corners; these joined, and the common profile."""
+    """Move the coarse line onto the groove in legs between its corners; the joined line, the corners and the common profile."""
     pitch, sigma = groove.pitch_m, groove.sigma_m
     lines: list[Line] = [line]
     corners: list[Corner] = []
     for step in range(4):
         lines = [followed(f, one, profile, sigma, pitch, half_slice, config, step > 0) for one in lines]
         if groove.closed:
-            # The joint of a ring is measured from one side only: each round it lies elsewhere.
+            # The joint of a ring is measured from one side only, so it is moved at each iteration.
             lines = [lines[0].rolled()]
         elif step == 0:
             lines, corners = split_legs(lines[0], profile, wide)
         if step > 0:
-            # One cutter made the whole groove: its angle and depth, once known, steady every slice.
+            # The groove has one profile: its angle and depth, once known, constrain every slice.
             longest = max(lines, key=lambda one: one.length)
             slices = cut_slices(f, longest, profile, sigma, pitch, half_slice, [])
             profile = common_profile(f, longest, slices, profile, sigma, pitch)
@@ -136,7 +134,7 @@ def _finish(
     ends_seen = (True, True)
     if not groove.closed:
         ends_seen = ends_at_edges(around, (first, last), line, profile, config.ground_reach_m)
-        # At the edge of a shadow the last section is not to be trusted.
+        # The last section at the edge of a shadow is not reliable.
         first = first if ends_seen[0] else max(first, float(slices.s[1]))
         last = last if ends_seen[1] else min(last, float(slices.s[-2]))
     missing = sum(b - a for a, b in gaps)
@@ -175,16 +173,16 @@ def _finish(
     for a, b in gaps:
         hidden = (at > a) & (at < b)
         bend = max(line.tightest_bend((a, b)), 2.0)
-        # Sections beside a shadow are few: towards its ends a bridge is not much better known than in its middle.
+        # Sections next to a shadow are few: a bridge is not much better known at its ends than in its middle.
         lever = np.maximum((at[hidden] - a) * (b - at[hidden]), GAP_ENDS * (0.5 * (b - a)) ** 2)
         errors["centre"][hidden] += 0.25 * bend * lever
-    # Where one wall was not measured the edge of the face stands in for it, and errs alike all along.
-    lame = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
-    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(lame)), width) @ lame, 0.0, 1.0)
+    # Where one wall was not measured the edge of the face replaces it, with an error common to the whole line.
+    one_walled = np.array([float(min(x.on_walls) < ENOUGH) for x in slices.sections])
+    one_sided = np.clip(smoothing_weights(at, slices.s, np.ones(len(one_walled)), width) @ one_walled, 0.0, 1.0)
     sigma = np.hypot(errors["centre"], math.hypot(SIGMA_FLOOR_PITCHES * pitch, SIGMA_FLOOR_NOISE * groove.sigma_m))
     sigma = np.hypot(sigma, ONE_SIDED_PITCHES * pitch * one_sided)
     if not groove.closed:
-        # The last sections have neighbours on one side only, and points of the plate's edge among their own.
+        # The last sections have neighbours on one side only, and contain points of the plate's edge.
         sigma = np.hypot(sigma, END_PITCHES * pitch * np.exp(-np.minimum(at - first, last - at) / END_REACH_M))
     for corner in corners:
         reach = max(corner.blind, corner.radius, CORNER_REACH_M)
@@ -269,7 +267,7 @@ def _finish(
 
 
 def _unmeasured(gap: tuple[float, float], slices: Slices) -> tuple[float, float]:
-    """A gap, as wide as there are no sections to both sides of it."""
+    """The gap widened to the nearest sections on both sides."""
     before, after = slices.s[slices.s <= gap[0]], slices.s[slices.s >= gap[1]]
     low = min(gap[0], float(before[-1]) + slices.half_slice) if len(before) else gap[0]
     high = max(gap[1], float(after[0]) - slices.half_slice) if len(after) else gap[1]
@@ -277,8 +275,74 @@ def _unmeasured(gap: tuple[float, float], slices: Slices) -> tuple[float, float]
 
 
 def _close(line: Floats, over: int = 8) -> None:
-    """Makes the ends of a ring (N,3) meet, in place, the difference spread over the stations beside them."""
+    """Close a ring (N,3) in place, with the difference spread over the stations next to its ends."""
     gap = line[0] - line[-1]
     share = np.linspace(0.5, 0.0, over)[:, None]
     line[:over] -= share * gap
     line[-over:] += share[::-1] * gap
+
+
+def seen_extent(
+    f: Floats, line: Line, profile: Profile, slices: Slices, groove: CoarseGroove
+) -> tuple[float, float, list[tuple[float, float]]]:
+    """Arc lengths where the groove begins and ends, and the gaps in between that were not seen."""
+    half_width = profile.depth / min(profile.slopes)
+    s, n, beside = line.coordinates(f[:, :2])
+    centre = np.interp(s, slices.s, slices.column("centre"))
+    run = np.abs(n - centre)
+    expected = -profile.depth + min(profile.slopes) * run
+    beside &= (run < 0.75 * half_width) & (np.abs(f[:, 2] - expected) < 0.35 * profile.depth)
+    cell = max(0.0005, 0.75 * groove.pitch_m)
+    counts = np.bincount((s[beside] / cell).astype(int), minlength=3)
+    filled = np.flatnonzero(counts >= 1)
+    sturdy = filled[[np.count_nonzero(counts[max(0, k - 2) : k + 3]) >= 3 for k in filled]]
+    inside = np.sort(s[beside])
+    first = float(inside[np.searchsorted(inside, sturdy[0] * cell)])
+    last = float(inside[np.searchsorted(inside, (sturdy[-1] + 1) * cell) - 1])
+    # Beyond the last valid section single points do not show where the groove runs.
+    first = max(first, float(slices.s[0]) - 3.0 * slices.half_slice)
+    last = min(last, float(slices.s[-1]) + 3.0 * slices.half_slice)
+    jump = np.flatnonzero(np.diff(inside) > max(0.003, 5.0 * groove.pitch_m))
+    gaps = [(float(inside[k]), float(inside[k + 1])) for k in jump if first <= inside[k] and inside[k + 1] <= last]
+    # Half a pitch is lost at each end, less with many rows of points.
+    rows = max(1.0, 1.5 * half_width / groove.pitch_m)
+    loss = groove.pitch_m / (rows + 1.0)
+    return first - loss, last + loss, gaps
+
+
+def ends_at_edges(
+    f: Floats, ends: tuple[float, float], line: Line, profile: Profile, reach_m: float
+) -> tuple[bool, bool]:
+    """Whether lower ground is seen within `reach_m` beyond each end, so that the plate ends there and not only the view."""
+    half_width = profile.depth / min(profile.slopes)
+    tail = line.extended(reach_m + 0.001, reach_m + 0.001)
+    s, n, beside = tail.coordinates(f[:, :2])
+    s = s - (reach_m + 0.001)
+    strip = beside & (np.abs(n) < half_width + BAND_M)
+    seen = []
+    for end, sign in zip(ends, (-1.0, 1.0), strict=True):
+        beyond = sign * (s - end)
+        out = strip & (beyond > 0.002) & (beyond < reach_m)
+        ground = out & (f[:, 2] < -1.3 * profile.depth)
+        seen.append(bool(np.count_nonzero(ground) > max(5.0, 0.5 * np.count_nonzero(out))))
+    return seen[0], seen[1]
+
+
+def refuse_gap(f: Floats, line: Line, slices: Slices, profile: Profile, steepest_rad: float) -> None:
+    """Raise GrooveNotFound for a flat floor (as deep half-way to the shoulders as in the middle) or vertical walls."""
+    if max(profile.slopes) > math.tan(steepest_rad):
+        raise GrooveNotFound(
+            f"An opening {1e3 * profile.depth:.1f} mm deep was seen with vertical walls: it is a gap or a slot, not a "
+            "V-groove."
+        )
+    s, n, beside = line.coordinates(f[:, :2])
+    run = np.abs(n - np.interp(s, slices.s, slices.column("centre"))) / (0.5 * float(np.median(slices.column("width"))))
+    middle, half_way = beside & (run < 0.15), beside & (run > 0.4) & (run < 0.7)
+    if np.count_nonzero(middle) < 20 or np.count_nonzero(half_way) < 20:
+        return
+    ratio = float(np.median(f[half_way, 2]) / np.median(f[middle, 2]))
+    if ratio > 0.8:
+        raise GrooveNotFound(
+            f"An opening {1e3 * profile.depth:.1f} mm deep was seen with a flat floor: it is a gap or a slot, not a "
+            "V-groove."
+        )

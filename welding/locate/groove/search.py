@@ -1,4 +1,4 @@
-"""Where in a cloud a groove runs, to a pixel or two: cells below a flat face with face on both sides, joined to lines."""
+"""Searches a cloud for grooves to a pixel or two: cells below a flat face, with face on both sides, joined to lines."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from weldcal.welding.locate.planes import Floats, Mask, into, point_pitch, robus
 
 @dataclass(frozen=True)
 class SearchConfig:
-    """What counts as a face and as a groove in it; metres and radians.
+    """Thresholds for a face and for a groove in it; metres and radians.
 
     max_width_m   wider openings are not grooves; shortest_m: shorter ones neither; max_depth_m: of the groove
     max_gap_m     two pieces that continue each other across at most this, with no face seen between them, are one groove
@@ -51,7 +51,7 @@ class CoarseGroove:
 
 
 def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroove], float, float]:
-    """Every groove-like opening in faces of a cloud (N,3) m whose z is up; the largest noise and the widest distance of
+    """Find every groove-like opening in faces of a cloud (N,3) m whose z is up; the largest noise and the widest distance of
     points on the faces seen, m.
     """
     rng = np.random.default_rng(config.seed)
@@ -68,7 +68,7 @@ def find_grooves(points: Floats, config: SearchConfig) -> tuple[list[CoarseGroov
 
 
 def _distinct(found: list[CoarseGroove]) -> list[CoarseGroove]:
-    """Without those seen again in a second plane through the same face."""
+    """The grooves without those found again in a second plane through the same face."""
     kept: list[CoarseGroove] = []
     for groove in sorted(found, key=lambda g: -len(g.line_Q)):
         middle = _lifted(groove)[len(groove.line_Q) // 2]
@@ -119,7 +119,7 @@ def _in_plane(points: Floats, X_AQ: RigidTransform, config: SearchConfig) -> tup
         inside = cv2.erode((labels == label).astype(np.uint8), _disc(5))
         opening = cv2.morphologyEx(cv2.bitwise_and(opening, inside), cv2.MORPH_CLOSE, _disc(5))
         below = cv2.bitwise_or(below, cv2.bitwise_and(opening, inside))
-    # Lower ground in view outside every face ends a groove as a face does.
+    # Lower ground outside every face ends a groove as a face does.
     ground = (label_of == 0) & (q[:, 2] < -0.004)
     level[index[ground, 1], index[ground, 0]] = 1
     found = []
@@ -213,7 +213,7 @@ def _centre_line(mask: Mask) -> tuple[Floats, bool]:
     out = way(everything)
     if not out:
         return np.empty((0, 2)), False
-    # A ring has a second way between its two farthest points that keeps clear of the first.
+    # A ring has a second path between its two farthest points that stays away from the first.
     margin = 2.0 * float(depth.max()) + 1.0
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy[out], axis=0), axis=1))])
     middle = xy[out][(along > 2.0 * margin) & (along < along[-1] - 2.0 * margin)]
@@ -221,7 +221,7 @@ def _centre_line(mask: Mask) -> tuple[Floats, bool]:
         gap = np.min(np.linalg.norm(xy[:, None] - middle[None, ::3], axis=2), axis=1)
         second = way(gap > margin)
         if second:
-            # Both ways run into the corners of the opening at their ends: there the ring is closed across.
+            # Both paths run into the corners of the opening at their ends: there the ring is closed straight across.
             return np.vstack([_trimmed(xy[out], margin), _trimmed(xy[second[::-1]], margin)]), True
     return xy[out], False
 
@@ -239,7 +239,7 @@ def _finite(distance: Floats) -> Floats:
 def _joined(
     pieces: list[tuple[Floats, bool, int]], level: Mask, cell: float, config: SearchConfig
 ) -> list[tuple[Floats, bool, int]]:
-    """Pieces that continue each other, with no face seen between them, made one by a smooth bridge."""
+    """Join pieces that continue each other, with no face seen between them, by a smooth bridge."""
     pieces = list(pieces)
     while len(pieces) > 1:
         best: tuple[float, int, int, Floats] | None = None
@@ -270,7 +270,7 @@ def _bridge(a: Floats, b: Floats, level: Mask, cell: float, config: SearchConfig
     out, into_b = out / np.linalg.norm(out), into_b / np.linalg.norm(into_b)
     ahead = gap / distance
     turn = max(math.acos(np.clip(out @ ahead, -1.0, 1.0)), math.acos(np.clip(into_b @ ahead, -1.0, 1.0)))
-    # Across a few cells the directions are noise.
+    # Over a few cells the directions are noise.
     if turn > math.radians(50.0) and distance * cell > 0.012:
         return none
     t = np.linspace(0.0, 1.0, max(3, round(distance)))[1:-1, None]
@@ -297,7 +297,7 @@ def _even(line: Floats, spacing: float, closed: bool) -> Floats:
 
 
 def _smooth(line: Floats, width: float, closed: bool) -> Floats:
-    """A Gaussian over the points of a line; straight on beyond open ends."""
+    """Gaussian smoothing of a line's points, with the line extended straight beyond open ends."""
     if closed:
         return np.asarray(gaussian_filter1d(line, width, axis=0, mode="wrap"))
     n = min(len(line) - 1, math.ceil(3 * width))

@@ -1,19 +1,13 @@
-"""The rigid link from torch to tip: what the paper's Eq. 14-18 say, what they should say, and the projective law."""
+"""Planar kinematics of the rigid torch-to-tip chord: Eq. 14-18 of the paper, the corrected law and the projective law."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from weldcal.models.errors import InputError
-from weldcal.welding.vectors import Array
-
-
-class UnknownLaw(InputError):
-    """No steering law has this name."""
+from weldcal.welding.numerics import Array
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,7 @@ def projective_law(
 
 
 def paper_as_printed(v_tip: Array, n_torch: Array, alpha: float, d: float, e_torch: float = 0.0) -> float:
-    """Line 13 of Algorithm 2 as printed: omega = -(V_r . n_t)/(|d| n_d . n_t), rad/s. Kept for comparison: it diverges.
+    """Line 13 of Algorithm 2 as printed: omega = -(V_r . n_t)/(|d| n_d . n_t), rad/s. It diverges.
 
     Args:
         v_tip: (2,) m/s.
@@ -96,7 +90,7 @@ def paper_as_printed(v_tip: Array, n_torch: Array, alpha: float, d: float, e_tor
 def paper_corrected(
     v_tip: Array, n_torch: Array, alpha: float, d: float, e_torch: float = 0.0, k: float = 2.5
 ) -> float:
-    """The same, its sign put right and position fed back: omega = (V_r . n_t + k e_t)/(|d| n_d . n_t), rad/s.
+    """The same, with its sign corrected and position fed back: omega = (V_r . n_t + k e_t)/(|d| n_d . n_t), rad/s.
 
     Args:
         v_tip: (2,) m/s.
@@ -105,21 +99,6 @@ def paper_corrected(
         k: feedback gain, 1/s.
     """
     return (float(v_tip @ n_torch) + k * e_torch) / (d * _off_zero(float(chord_axes(alpha)[1] @ n_torch)))
-
-
-Law = Callable[[Array, Array, float, float, float], float]
-LAWS: dict[str, Law] = {"paper_as_printed": paper_as_printed, "paper_corrected": paper_corrected}
-
-
-def get_law(name: str) -> Law:
-    """The steering law of that name (v_tip, n_torch, alpha, d, e_torch) -> omega.
-
-    Raises:
-        UnknownLaw: naming the known ones.
-    """
-    if name not in LAWS:
-        raise UnknownLaw(f"Unknown steering law '{name}'; use one of {', '.join(LAWS)}.")
-    return LAWS[name]
 
 
 def _off_zero(value: float) -> float:

@@ -1,17 +1,25 @@
-"""Lines in the face's plane along which a groove is measured: arc length and offset of points, smoothing, corners."""
+"""Lines in the plane of a face: arc length and lateral offset of points, smoothing, and sharp corners with their radius."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from weldcal.welding.locate.groove.seam import Profile
 from weldcal.welding.locate.planes import Floats, Mask
 
 STEP_M = 0.0005
+SIDE_M = 0.015  # length of a side that is extended
+LEAST_RADIUS_M = 0.0005  # a seam curve needs a radius: at a right angle its apex is then 0.2 mm off
+RADII_M = np.array([0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0]) * 1e-3
+CROWD = 4.0  # number of points near a corner whose errors are correlated
+LEAST_SPREAD_PITCHES = 0.3
+WIDE_M = 0.010  # a bend of a larger radius is not a corner: the cross-sections follow it
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,23 +36,23 @@ class Line:
 
     @property
     def length(self) -> float:
-        """m."""
+        """Length of the line, m."""
         return float(self.s[-1])
 
     @cached_property
     def tangents(self) -> Floats:
-        """(N,2) unit."""
+        """Unit tangents (N,2)."""
         t = np.gradient(self.points, self.s, axis=0)
         return np.asarray(t / np.linalg.norm(t, axis=1, keepdims=True))
 
     @cached_property
     def normals(self) -> Floats:
-        """(N,2) unit, to the left."""
+        """Unit normals (N,2), to the left."""
         return np.column_stack([-self.tangents[:, 1], self.tangents[:, 0]])
 
     @cached_property
     def curvatures(self) -> Floats:
-        """(N,) 1/m, positive to the left."""
+        """Curvatures (N,) 1/m, positive to the left."""
         return np.asarray(np.sum(np.gradient(self.tangents, self.s, axis=0) * self.normals, axis=1))
 
     def tightest_bend(self, gap: tuple[float, float], over_m: float = 0.016) -> float:
@@ -69,7 +77,7 @@ class Line:
         return points + (s - inside)[:, None] * along, normals
 
     def extended(self, before: float, after: float) -> Line:
-        """Straight on beyond both ends, as the last 10 mm head."""
+        """The line extended straight beyond both ends, in the direction of its last 10 mm."""
         points = self.points
         for distance, end in ((before, 0), (after, -1)):
             if distance <= 0.0:
@@ -88,20 +96,20 @@ class Line:
         return Line(np.column_stack([np.interp(s, self.s, self.points[:, k]) for k in range(2)]))
 
     def coordinates(self, xy: Floats) -> tuple[Floats, Floats, Mask]:
-        """(s, n) of points (M,2) by their nearest point on the line, and which lie within 30 mm beside it."""
+        """Arc length and offset (s, n) of points (M,2) by the nearest point on the line, and a mask of those within 30 mm."""
         nearest = np.asarray(cKDTree(self.points).query(xy, distance_upper_bound=0.03)[1])
         far = nearest == len(self.points)
         nearest = np.where(far, 0, nearest)
         gap = xy - self.points[nearest]
         along = np.sum(gap * self.tangents[nearest], axis=1)
         n = np.sum(gap * self.normals[nearest], axis=1)
-        # Towards the centre of a bend the line runs faster than the point.
+        # On the inside of a bend a step along the line is longer than the step of the point.
         along = np.clip(along / np.maximum(1.0 - n * self.curvatures[nearest], 0.3), -2.0 * STEP_M, 2.0 * STEP_M)
         beside = ~far & (((nearest > 0) & (nearest < len(self.points) - 1)) | (np.abs(along) < STEP_M))
         return self.s[nearest] + along, n, beside
 
     def rolled(self) -> Line:
-        """A ring that begins and ends half a turn further on; its former joint is closed to the mean of both ends."""
+        """The closed line with its start moved half-way round; its former joint is closed to the mean of both ends."""
         points = self.points.copy()
         gap, over = points[0] - points[-1], min(20, len(points) // 4)
         share = np.linspace(0.5, 0.0, over)[:, None]
@@ -185,6 +193,109 @@ def filleted(a: Floats, apex: Floats, b: Floats, radius: float) -> Floats:
 
 
 def meeting_point(p: Floats, t: Floats, q: Floats, w: Floats) -> Floats:
-    """Where the lines p + a t and q + b w meet in the plane."""
+    """Intersection of the lines p + a t and q + b w in the plane."""
     a, _ = np.linalg.solve(np.column_stack([t, -w]), q - p)
     return np.asarray(p + a * t)
+
+
+@dataclass(frozen=True, eq=False)
+class Corner:
+    """A corner at arc length s m of the whole line, its apex (2,) m, its radius m, and how far to each side of s no
+    cross-section has points of its own, m; sigma: of the line sideways at s, m, as far as the radius is not known; wide: it is
+    certainly a bend."""
+
+    s: float
+    apex: Floats
+    radius: float
+    blind: float
+    sigma: float = 0.0
+    wide: bool = False
+
+
+def split_legs(line: Line, profile: Profile, wide: list[Floats]) -> tuple[list[Line], list[Corner]]:
+    """Split the line at its tight turns into straight legs, and return the corners between them; turns near
+    the places (2,) in `wide` are not corners."""
+    turns = [
+        s for s in tight_turns(line) if all(np.linalg.norm(line.at(np.array([s]))[0][0] - p) > SIDE_M for p in wide)
+    ]
+    if not turns:
+        return [line], []
+    half_width = profile.depth / min(profile.slopes)
+    blind = 2.0 * half_width + 0.002
+    bounds = [0.0, *turns, line.length]
+    legs, corners = [], []
+    for k, (a, b) in enumerate(pairwise(bounds)):
+        low = a + blind if k > 0 else a
+        high = b - blind if k < len(turns) else b
+        inside = (line.s >= low) & (line.s <= high)
+        if np.count_nonzero(inside) * line.length / len(line.s) < SIDE_M:
+            return [line], []
+        legs.append(Line(line.points[inside]).even())
+    for turn in turns:
+        corners.append(Corner(turn, line.at(np.array([turn]))[0][0], 0.0, blind))
+    return legs, corners
+
+
+def round_corners(
+    f: Floats, legs: list[Line], corners: list[Corner], profile: Profile, sigma: float, pitch: float
+) -> tuple[Line, list[Corner]]:
+    """Join the legs over their corners, each with the radius that fits the points (N,3) m near it best."""
+    half_width = profile.depth / min(profile.slopes)
+    whole = legs[0].points
+    met: list[tuple[Floats, Floats, float, float, bool]] = []
+    for leg in legs[1:]:
+        apex = meeting_point(*_side(whole[::-1]), *_side(leg.points))
+        radius, spread = _radius(f, whole, apex, leg.points, profile, sigma, pitch)
+        u, v = (p - apex for p in (whole[-1], leg.points[0]))
+        half = 0.5 * np.arccos(np.clip(u @ v / np.linalg.norm(u) / np.linalg.norm(v), -1.0, 1.0))
+        bend = filleted(whole[-1], apex, leg.points[0], max(radius, LEAST_RADIUS_M))
+        # How far the bend's middle moves with the radius.
+        met.append(
+            (apex, bend[len(bend) // 2], radius, spread * (1.0 / np.sin(half) - 1.0), radius - 2.0 * spread > WIDE_M)
+        )
+        whole = np.vstack([whole[:-1], bend, leg.points[1:]])
+    line = Line(whole).even(0.00025)
+    out = []
+    for (apex, place, radius, aside, wide), corner in zip(met, corners, strict=True):
+        s = float(line.s[int(np.argmin(np.linalg.norm(line.points - place, axis=1)))])
+        # Coordinates along and across the line are valid round a bend this wide, so sections may be cut there.
+        blind = 0.0 if radius > 1.3 * half_width else min(corner.blind, 1.5 * half_width + radius)
+        out.append(Corner(s, apex, radius, blind, float(aside), bool(wide)))
+    return line, out
+
+
+def _side(points: Floats) -> tuple[Floats, Floats]:
+    """A point and the direction of the straight line through the first part of points (N,2)."""
+    reach = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(points, axis=0), axis=1)))
+    some = points[reach <= SIDE_M]
+    middle = some.mean(axis=0)
+    return middle, np.linalg.svd(some - middle, full_matrices=False)[2][0]
+
+
+def _radius(
+    f: Floats, before: Floats, apex: Floats, after: Floats, profile: Profile, sigma: float, pitch: float
+) -> tuple[float, float]:
+    """Estimate the corner radius from the points near it, and its sigma, m.
+
+    Both are the mean and the spread of the candidates by their likelihood: few or noisy points fit many radii
+    equally well.
+    """
+    near = f[np.linalg.norm(f[:, :2] - apex, axis=1) < SIDE_M]
+    if len(near) < 40:
+        return 0.0, float(RADII_M[-1]) / 4.0
+    slope = float(np.mean(profile.slopes))
+    scale = 2.5 * max(2.0 * sigma, 5e-5)
+    costs = []
+    for radius in RADII_M:
+        bend = filleted(before[-1], apex, after[0], float(radius))
+        path = Line(np.vstack([before[:-1], bend, after[1:]])).even(0.0001)
+        away = np.asarray(cKDTree(path.points).query(near[:, :2])[0])
+        off = near[:, 2] - np.minimum(0.0, slope * away - profile.depth)
+        costs.append(float(np.mean(np.square(off) / (np.square(off) + scale**2))))
+    # The cost is a share of c^2 = 2.5^2 sigma^2: where it is small, half the sum of squares over sigma^2 is 3.125 n of it.
+    fine = np.arange(0.0, RADII_M[-1] + 1e-9, 0.00025)
+    log_likelihood = -0.5 * 2.5**2 * len(near) / CROWD * np.interp(fine, RADII_M, costs)
+    weight = np.exp(log_likelihood - log_likelihood.max())
+    weight /= weight.sum()
+    mean = float(weight @ fine)
+    return mean, float(np.hypot(np.sqrt(weight @ np.square(fine - mean)), LEAST_SPREAD_PITCHES * pitch))
