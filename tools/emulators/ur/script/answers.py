@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,10 @@ from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
 from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
+from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.compiler import Pose
+from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
-
-if TYPE_CHECKING:
-    from weldcal.tools.emulators.ur.controller.core import Controller
-    from weldcal.tools.emulators.ur.script.program import Program
 
 Array = NDArray[np.float64]
 
@@ -44,7 +42,7 @@ def positive(value: Any, what: str) -> float:
 class Answers:
     """Functions that answer at once."""
 
-    def __init__(self, controller: Controller, program: Program) -> None:
+    def __init__(self, controller: ControllerState, program: Program) -> None:
         self._controller = controller
         self._program = program
 

@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.answers import Answers
 from weldcal.tools.emulators.ur.script.dynamics import Dynamics
 from weldcal.tools.emulators.ur.script.motions import Motions
+from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
-
-if TYPE_CHECKING:
-    from weldcal.tools.emulators.ur.controller.core import Controller
-    from weldcal.tools.emulators.ur.script.program import Program
 
 BLOCKING = frozenset(
     {
@@ -58,7 +56,7 @@ NO_EFFECT = {
 
 
 def script_functions(
-    controller: Controller, program: Program
+    controller: ControllerState, program: Program
 ) -> tuple[Mapping[str, Callable[..., Any]], Iterable[str]]:
     """All functions by their URScript name, and the names of those that are generators."""
     functions = Motions(controller, program)
@@ -74,7 +72,7 @@ def script_functions(
     return named, BLOCKING
 
 
-def _no_effect(controller: Controller, name: str, value: Any) -> Callable[..., Any]:
+def _no_effect(controller: ControllerState, name: str, value: Any) -> Callable[..., Any]:
     noted = False
 
     def function(*arguments: Any, **keywords: Any) -> Any:
