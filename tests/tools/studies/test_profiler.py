@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.profiler.command import ProfilerStudyOptions, run_profiler_study
+from weldcal.tools.studies.profiler.command import run_profiler_study
 from weldcal.tools.studies.profiler.edge import edge_rows
 from weldcal.tools.studies.profiler.fixed import fixed_lines, told
 from weldcal.tools.studies.profiler.pieces import groove_mesh, scan_groove
+from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
 from weldcal.tools.studies.profiler.sets import made_edge_trials
 from weldcal.tools.studies.profiler.sphere import METHODS, WorldData, measure
 from weldcal.tools.studies.profiler.worlds import SphereWorld, sphere_trial

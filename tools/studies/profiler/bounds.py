@@ -1,7 +1,7 @@
-"""What a calibration by a sphere and touches can promise in a made world: its errors foretold from the Cramer-Rao bound.
+"""Predicts the errors of a calibration by a sphere and touches in a simulated world from the Cramer-Rao bound.
 
 The bound is that of the whole model (pose, tip, sensor, arm) with each prior as wide as the errors really are; a draw from it is
-carried to the points, the seam and the boss that are measured afterwards, with the sensor's and the robot's own noise.
+carried to the points, the seam and the frustum that are measured afterwards, with the sensor's and the robot's own noise.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _apart(e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floa
     return sensed - touch.rotation @ e.tip - touch.translation, X
 
 
-def foretold_mm(
+def predicted_mm(
     e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats, rng: np.random.Generator
 ) -> float:
     """Mean distance that points seen and touched will have, by the bound and by the noise of seeing them."""
@@ -70,17 +70,17 @@ def foretold_mm(
 
 
 def world_bounds(world: WorldData, features: Floats | None, seed: int) -> dict[str, Floats]:
-    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound foretells; the last two where the world has them."""
+    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound predicts; the last two where the world has them."""
     data, tests = world.trial.data, world.trial.tests
     assert data.arm is not None
     assert tests is not None
     rng = np.random.default_rng([seed, 76])
     e = sphere_joint(data, "affine+joints", REAL)
-    found = {"points": np.array(foretold_mm(e, data.arm, tests.q_view, tests.seen, tests.q_touch, rng))}
+    found = {"points": np.array(predicted_mm(e, data.arm, tests.q_view, tests.seen, tests.q_touch, rng))}
     if world.groove is not None and features is not None:
         g = world.groove
         found["seam"] = np.array(
-            [foretold_mm(e, data.arm, g.q, features[:, j], g.q_touch[:, j], rng) for j in range(3)]
+            [predicted_mm(e, data.arm, g.q, features[:, j], g.q_touch[:, j], rng) for j in range(3)]
         )
     if world.boss is not None:
         arm = data.arm

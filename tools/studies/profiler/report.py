@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.profiler import edge, plots, sphere
 from weldcal.tools.studies.profiler.fixed import told
-
-if TYPE_CHECKING:
-    from weldcal.tools.studies.profiler.command import ProfilerStudy
+from weldcal.tools.studies.profiler.results import ProfilerStudy
 
 Lines = list[tuple[str, ...]]
 
 
 def target_lines(study: ProfilerStudy) -> Lines:
     """What, reached, target, verdict."""
-    return [(what, told(v, unit), f"≤ {limit:g} {unit}", verdict) for what, unit, v, limit, verdict in study.targets()]
+    return [(t.what, told(t.value, t.unit), t.wanted, t.verdict) for t in study.targets()]
 
 
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:

@@ -72,6 +72,11 @@ TABLE_NUMBER = {("htm", 1): 7, ("dh", 1): 8, ("htm", 2): 10, ("dh", 2): 11}
 TOUCHING_MM = {9: (1.23, 1.29, 1.26, 1.21, 1.26), 12: (0.98, 1.02, 0.99, 1.03, 1.03)}
 
 
+def printed_stage(model: Model, stage: int) -> PrintedStage:
+    """The results table of one stage of one chain."""
+    return (STAGE_1 if stage == 1 else STAGE_2)[model]
+
+
 def published_touches() -> TabletTouches:
     """The paper's nine touches, SI units."""
     return TabletTouches(

@@ -1,17 +1,13 @@
-"""The tablet study's report page: targets, the paper's tables beside ours, the sign, the models."""
+"""Report page of the tablet study: targets, the paper's tables and ours, the sign, the models."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.studies.tablet.paper import STAGE_1, STAGE_2, TABLE_NUMBER, TOUCHING_MM, published_touches
+from weldcal.tools.studies.tablet.paper import TABLE_NUMBER, TOUCHING_MM, printed_stage, published_touches
 from weldcal.tools.studies.tablet.plots import SIGN_WORDS, sign_residuals, unseen_errors
+from weldcal.tools.studies.tablet.results import TabletStudy, limit_words
 from weldcal.tools.studies.tablet.study import Reproduced
-
-if TYPE_CHECKING:
-    from weldcal.tools.studies.tablet.command import TabletStudy
 
 _TITLES = {
     ("htm", 1): "six-parameter transforms, stage 1", ("dh", 1): "Denavit-Hartenberg, stage 1",
@@ -21,15 +17,18 @@ _TITLES = {
 
 def table_rows(r: Reproduced) -> list[tuple[str, ...]]:
     """One of the paper's tables: name, printed, ours, by differential evolution (first seed)."""
-    printed = (STAGE_1 if r.stage == 1 else STAGE_2)[r.model]
+    printed = printed_stage(r.model, r.stage)
     ours, evolved = r.ours, r.evolved[0] if r.evolved else None
     rows: list[tuple[str, ...]] = []
+
+    def row(name: str, digits: int, printed_value: float, our_value: float, evolved_value: float | None) -> None:
+        rows.append((name, fixed(printed_value), fixed(our_value, digits), fixed(evolved_value, digits)))
+
     for k, name in enumerate(("F", "f1", "f2")):
-        de = fixed(getattr(evolved.fitness, name), 4) if evolved else "–"
-        rows.append((f"{name}, mm", fixed(printed.fitness[k]), fixed(getattr(ours.fitness, name), 4), de))
+        de = getattr(evolved.fitness, name) if evolved else None
+        row(f"{name}, mm", 4, printed.fitness[k], getattr(ours.fitness, name), de)
     for k, name in enumerate(printed.names):
-        de = fixed(float(evolved.parameters[k]), 2) if evolved else "–"
-        rows.append((name, fixed(float(printed.parameters[k])), fixed(float(ours.parameters[k]), 2), de))
+        row(name, 2, printed.parameters[k], ours.parameters[k], evolved.parameters[k] if evolved else None)
     return rows
 
 
@@ -48,10 +47,8 @@ def tablet_report(study: TabletStudy) -> str:
         "tablet_study.html.j2",
         study=study,
         tables=tables,
-        targets=[
-            (what, fixed(value, 4), limit, "met" if met else "MISSED") for what, value, limit, met in study.targets
-        ],
-        missed=sum(not met for *_, met in study.targets),
+        targets=[(t.what, fixed(t.value, 4), limit_words(t), t.verdict) for t in study.targets],
+        missed=sum(not t.met for t in study.targets if t.decides),
         signs=[
             (SIGN_WORDS[s.sign], fixed(s.rigid_mm, 3), fixed(s.scaled_mm, 3), fixed(s.left_out_mm, 2))
             for s in study.signs

@@ -1,18 +1,14 @@
-"""The study's report page: the target table, then the pictures of every seam, then the laws side by side."""
+"""Report page of the weld study: targets, pictures of every seam, and the comparison of the laws."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.plots_weld import along_the_weld, paths
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.studies.weld.files import FIGURE_NAMES, compared_lines, table_lines
 from weldcal.tools.studies.weld.plots import weld_trace
+from weldcal.tools.studies.weld.results import Study
 from weldcal.tools.studies.weld.study import study_config
-
-if TYPE_CHECKING:
-    from weldcal.tools.studies.weld.command import Study
+from weldcal.tools.studies.weld.tables import FIGURE_NAMES, compared_lines, table_lines, turn_lines
 
 TITLES = {
     "straight": "Straight", "s_r60": "S of radius 60 mm", "l_r20_convex": "Corner of 20 mm, convex",
@@ -53,6 +49,7 @@ def study_report(study: Study) -> str:
         missed=missed,
         total=total,
         seams=seams,
+        turns=turn_lines(study.turns),
         compared=compared_lines(study.compared),
         software=software_version(),
     )

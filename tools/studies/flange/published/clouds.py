@@ -1,9 +1,10 @@
-"""Both methods on the same real scans: circles, registrations, Algorithm 1 run again, and errors on scans kept aside."""
+"""Compares both methods on the same real scans: circles, registrations, Algorithm 1, and errors on held-out scans."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,6 +102,20 @@ class CloudsOutcome:
     path_true: Array
     splits: tuple[SplitRow, ...]
     n_fit: int
+
+    @property
+    def circle_repeat_mm(self) -> float:
+        """Rms (3-D) of the published centres of one cloud over seeds."""
+        return 1e3 * float(np.sqrt(np.mean([r.repeat_m**2 for r in self.circles])))
+
+    @property
+    def circle_bias_R_mm(self) -> Array:
+        """Mean offset (3,) of the published centres in the axes of the flange."""
+        return np.asarray(1e3 * np.mean([r.offset_R for r in self.circles], axis=0))
+
+    def halves_mm(self, method: Literal["published", "ours"]) -> float:
+        """Median distance between the centres from two halves of a cloud."""
+        return 1e3 * float(np.median([getattr(r, f"halves_{method}_m") for r in self.circles]))
 
 
 @dataclass(frozen=True, eq=False)
