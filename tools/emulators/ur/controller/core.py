@@ -17,6 +17,8 @@ from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 from weldcal.tools.emulators.ur.versions import Version
 
+WORDS = ("stop program", "power on", "power off", "set robotmode run", "set unlock protective stop")
+
 
 class Controller(ControllerState):
     """Everything but the wire; the wire's faults live in the servers."""
@@ -34,13 +36,7 @@ class Controller(ControllerState):
         """Text of one program from a script port: runs it where the state allows, or drops it without a word."""
         line = source.strip()
         words = line.rstrip("()").strip()
-        if self.version.takes_scripts and words in (
-            "stop program",
-            "power on",
-            "power off",
-            "set robotmode run",
-            "set unlock protective stop",
-        ):
+        if self.version.takes_scripts and words in WORDS:
             self._word(words)
             return
         if not line or line.startswith("#"):
@@ -72,7 +68,7 @@ class Controller(ControllerState):
 
     def start(self, source: str) -> bool:
         """Starts a program in place of the running one; a `sec` runs beside it."""
-        if self.robot_mode != RobotMode.RUNNING or self.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+        if not self.ready:
             self.note("program ignored: the robot is not running or a safety stop is active")
             return False
         try:
@@ -111,8 +107,7 @@ class Controller(ControllerState):
 
     def resume_program(self) -> bool:
         """Dashboard `play`, also after a protective stop: the program goes on with whatever its registers hold."""
-        ready = self.robot_mode == RobotMode.RUNNING and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
-        if self.program is None or not ready or not self.remote:
+        if self.program is None or not self.ready or not self.remote:
             return False
         self.runtime_state = RuntimeState.PLAYING
         for watchdog in self.watchdogs.values():
@@ -181,13 +176,8 @@ class Controller(ControllerState):
                     return
 
     def _move(self) -> None:
-        driven = (
-            self.runtime_state == RuntimeState.PLAYING
-            and self.program is not None
-            and self.program.owner is not None
-            and self.robot_mode == RobotMode.RUNNING
-            and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
-        )
+        playing = self.runtime_state == RuntimeState.PLAYING and self.ready
+        driven = playing and self.program is not None and self.program.owner is not None
         try:
             self.arm.step(driven, self.speed_scaling)
         except MotionRefused as refused:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
-from weldcal.tools.emulators.ur.controller.modes import POWERLESS, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.controller.registers import Payload, Registers, Terminals, Watchdog
 from weldcal.tools.emulators.ur.versions import Version
@@ -56,6 +56,11 @@ class ControllerState:
         """Share of the commanded speed that the slider lets through."""
         return self.terminals.speed_slider
 
+    @property
+    def ready(self) -> bool:
+        """The arm has power and no safety stop is active."""
+        return self.robot_mode == RobotMode.RUNNING and self.safety_mode in MOVING
+
     def note(self, text: str) -> None:
         """Writes to the log."""
         self.log.append(f"{self.time_s:.3f} {text}")
@@ -71,7 +76,7 @@ class ControllerState:
 
     def protective_stop(self, reason: str) -> None:
         """The arm brakes and the program pauses until somebody unlocks."""
-        if self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+        if self.safety_mode in MOVING:
             self.set_safety_mode(SafetyMode.PROTECTIVE_STOP)
             self.note(f"protective stop: {reason}")
 
@@ -80,7 +85,7 @@ class ControllerState:
         self.safety_mode = mode
         if mode == SafetyMode.PROTECTIVE_STOP:
             self.protective_since = self.frame
-        if mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+        if mode not in MOVING:
             self.pause_program()
         if mode in POWERLESS:
             self.robot_mode = RobotMode.POWER_OFF

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -39,30 +40,45 @@ def positive(value: Any, what: str) -> float:
     return float(value)
 
 
+READS: dict[str, Callable[[ControllerState], Any]] = {
+    "get_steptime": lambda c: STEP_S,
+    "get_actual_joint_positions": lambda c: c.arm.q.tolist(),
+    "get_target_joint_positions": lambda c: c.arm.q_target.tolist(),
+    "get_actual_joint_speeds": lambda c: c.arm.qd.tolist(),
+    "get_target_joint_speeds": lambda c: c.arm.qd_target.tolist(),
+    "get_actual_tcp_pose": lambda c: Pose(c.arm.tool_pose()),
+    "get_target_tcp_pose": lambda c: Pose(c.arm.tool_pose(target=True)),
+    "get_target_waypoint": lambda c: Pose(c.arm.tool_pose(target=True)),
+    "get_actual_tcp_speed": lambda c: list(c.arm.tool_speed()),
+    "get_target_tcp_speed": lambda c: list(c.arm.tool_speed(target=True)),
+    "get_actual_tool_flange_pose": lambda c: Pose(pose_of(c.arm.flange(c.arm.q))),
+    "get_tcp_force": lambda c: [0.0] * 6,
+    "get_joint_torques": lambda c: [0.0] * 6,
+    "get_tcp_offset": lambda c: Pose(c.tcp_offset),
+    "get_target_payload": lambda c: c.payload.mass,
+    "get_target_payload_cog": lambda c: list(c.payload.center),
+    "get_target_payload_inertia": lambda c: list(c.payload.inertia),
+    "is_steady": lambda c: c.arm.at_rest,
+}
+"""Functions without arguments, by their URScript name."""
+REGISTERS = {
+    f"read_{bank}_{kind}_register": (f"{bank}s", numbers, count)
+    for bank in ("input", "output")
+    for kind, numbers, count in (
+        ("integer", "integers", N_NUMBERS),
+        ("float", "doubles", N_NUMBERS),
+        ("boolean", "bits", N_BITS),
+    )
+}
+"""Functions that read a register: direction, type and number of its bank."""
+
+
 class Answers:
     """Functions that answer at once."""
 
     def __init__(self, controller: ControllerState, program: Program) -> None:
         self._controller = controller
         self._program = program
-
-    def read_input_integer_register(self, index: int) -> int:
-        return self._controller.inputs.integers[register_index(index, N_NUMBERS)]
-
-    def read_input_float_register(self, index: int) -> float:
-        return self._controller.inputs.doubles[register_index(index, N_NUMBERS)]
-
-    def read_input_boolean_register(self, index: int) -> bool:
-        return self._controller.inputs.bits[register_index(index, N_BITS)]
-
-    def read_output_integer_register(self, index: int) -> int:
-        return self._controller.outputs.integers[register_index(index, N_NUMBERS)]
-
-    def read_output_float_register(self, index: int) -> float:
-        return self._controller.outputs.doubles[register_index(index, N_NUMBERS)]
-
-    def read_output_boolean_register(self, index: int) -> bool:
-        return self._controller.outputs.bits[register_index(index, N_BITS)]
 
     def write_output_integer_register(self, index: int, value: int) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float) or not -(2**31) <= value < 2**31:
@@ -84,54 +100,12 @@ class Answers:
         period = 1.0 / positive(min_frequency, "The frequency of a watchdog")
         self._controller.watchdogs[variable] = Watchdog(period, action, self._controller.frame)
 
-    def get_steptime(self) -> float:
-        return STEP_S
-
-    def get_actual_joint_positions(self) -> list[float]:
-        return list(self._controller.arm.q.tolist())
-
-    def get_target_joint_positions(self) -> list[float]:
-        return list(self._controller.arm.q_target.tolist())
-
-    def get_actual_joint_speeds(self) -> list[float]:
-        return list(self._controller.arm.qd.tolist())
-
-    def get_target_joint_speeds(self) -> list[float]:
-        return list(self._controller.arm.qd_target.tolist())
-
     def get_actual_joint_positions_history(self, steps: int = 0) -> list[float]:
         history = self._controller.arm.history
         return list((history[-1 - min(int(steps), len(history) - 1)] if history else self._controller.arm.q).tolist())
 
-    def get_actual_tcp_pose(self) -> Pose:
-        return Pose(self._controller.arm.tool_pose())
-
-    def get_target_tcp_pose(self) -> Pose:
-        return Pose(self._controller.arm.tool_pose(target=True))
-
-    def get_actual_tcp_speed(self) -> list[float]:
-        return list(self._controller.arm.tool_speed())
-
-    def get_target_tcp_speed(self) -> list[float]:
-        return list(self._controller.arm.tool_speed(target=True))
-
-    def get_actual_tool_flange_pose(self) -> Pose:
-        return Pose(pose_of(self._controller.arm.flange(self._controller.arm.q)))
-
-    def get_target_waypoint(self) -> Pose:
-        return self.get_target_tcp_pose()
-
-    def get_tcp_force(self) -> list[float]:
-        return [0.0] * 6
-
-    def get_joint_torques(self) -> list[float]:
-        return [0.0] * 6
-
     def set_tcp(self, pose: Any) -> None:
         self._controller.set_tcp(six(pose, "set_tcp").tolist())
-
-    def get_tcp_offset(self) -> Pose:
-        return Pose(self._controller.tcp_offset)
 
     def set_payload(self, m: float, cog: Any = None) -> None:
         self._controller.payload.mass = float(m)
@@ -142,15 +116,6 @@ class Answers:
         self.set_payload(m, cog)
         if inertia is not None:
             self._controller.payload.inertia = [float(value) for value in inertia]
-
-    def get_target_payload(self) -> float:
-        return self._controller.payload.mass
-
-    def get_target_payload_cog(self) -> list[float]:
-        return list(self._controller.payload.center)
-
-    def get_target_payload_inertia(self) -> list[float]:
-        return list(self._controller.payload.inertia)
 
     def get_forward_kin(self, q: Any = None, tcp: Any = None) -> Pose:
         arm = self._controller.arm
@@ -206,9 +171,6 @@ class Answers:
 
     def point_dist(self, p_from: Any, p_to: Any) -> float:
         return math.dist(p_from[:3], p_to[:3])
-
-    def is_steady(self) -> bool:
-        return self._controller.arm.at_rest
 
     def is_within_safety_limits(self, pose: Any) -> bool:
         if isinstance(pose, Pose):
