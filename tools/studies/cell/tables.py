@@ -1,12 +1,11 @@
-"""The weld in the cell for a person at a terminal: every run, and the targets."""
+"""Tables of the cell study for the terminal: every run, and the targets."""
 
 from __future__ import annotations
 
-from rich.console import Console
-from rich.table import Table
-
 from weldcal.tools.report.render import fixed
-from weldcal.tools.studies.cell.study import AT_LEAST, TARGETS, CellStudy
+from weldcal.tools.studies.cell.study import AT_LEAST, TARGETS, WALL_CLOCK, CellStudy
+from weldcal.tools.studies.output import print_note, print_table
+from weldcal.tools.studies.targets import Target, print_targets
 
 FIGURES = (
     ("seam points, sd mm", "point_sd_mm", 4), ("seam points, offset mm", "point_offset_mm", 4),
@@ -23,20 +22,26 @@ NAMES = {
 
 def print_cell_study(study: CellStudy) -> None:
     """Write the tables on stdout."""
-    console = Console()
-    table = Table("", *(f"{run.scenario.removesuffix('_groove')}\nseed {run.seed}" for run in study.runs))
-    for title, name, digits in FIGURES:
-        table.add_row(title, *(fixed(getattr(run, name), digits) for run in study.runs))
-    console.print(table)
+    header = ("", *(f"{run.scenario.removesuffix('_groove')}\nseed {run.seed}" for run in study.runs))
+    print_table(
+        "", header, [(title, *(fixed(getattr(run, name), k) for run in study.runs)) for title, name, k in FIGURES]
+    )
     for run in study.runs:
         if not run.completed:
-            console.print(f"{run.scenario}, seed {run.seed}, was not completed: {run.reason}", highlight=False)
-    targets = Table("figure", "target", "reached", "", title=f"Law: {study.options.law}", title_justify="left")
-    units = {name: (over, unit) for name, over, _, unit in TARGETS}
-    for name, value, limit, ok in study.reached:
-        over, unit = units[name]
-        sign = "≥" if name in AT_LEAST else "≤"
-        verdict = "[green]met[/]" if ok else "[bold red]MISSED[/]"
-        targets.add_row(NAMES[name], f"{over} {sign} {limit:g} {unit}".rstrip(), fixed(value, 3), verdict)
-    console.print(targets)
-    console.print(f"written to {study.options.folder}", highlight=False, soft_wrap=True)
+            print_note(f"{run.scenario}, seed {run.seed}, was not completed: {run.reason}")
+    reached = {name: value for name, value, _, _ in study.reached}
+    targets = [
+        Target(
+            NAMES[name],
+            unit,
+            reached[name],
+            limit,
+            "≥" if name in AT_LEAST else "≤",
+            over=over,
+            decides=name not in WALL_CLOCK,
+        )
+        for name, over, limit, unit in TARGETS
+        if name in reached
+    ]
+    print_targets(f"Law: {study.options.law}", targets)
+    print_note(f"written to {study.options.folder}")

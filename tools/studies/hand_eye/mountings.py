@@ -1,8 +1,7 @@
-"""weldcal benchmark mountings: every mounting live over several seeds, as the table of docs/hand_eye.md."""
+"""Benchmark of the mountings: every mounting scenario live over several seeds, as the table of docs/hand_eye.md."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,12 +13,13 @@ from weldcal.tools.commands.demo import DemoOptions
 from weldcal.tools.commands.mounting_live import MountingReport, run_mounting_live
 from weldcal.tools.console import Progress
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import markdown_table, write_json
 
 HEADER = (
-    "| scenario | runs | scans | point at best distance, mm: expected / true median / worst "
-    "| kept aside, mm: median / worst | unknown off the truth: worst mm, deg "
-    "| squared error per covariance: mean / worst (99.7 % bound) |\n|---|---|---|---|---|---|---|\n"
-)
+    "scenario", "runs", "scans", "point at best distance, mm: expected / true median / worst",
+    "held out, mm: median / worst", "unknown off the truth: worst mm, deg",
+    "squared error per covariance: mean / worst (99.7 % bound)",
+)  # fmt: skip
 
 
 def run_mountings(
@@ -31,12 +31,12 @@ def run_mountings(
         InputError: a scenario that is not a mounting job.
     """
     chosen = names or tuple(n for n in scenario_names() if load_scenario(n).mounting is not None)
-    rows, table = [], HEADER
+    rows, failed_by = [], dict[str, list[str]]()
     for k, name in enumerate(chosen):
         if load_scenario(name).mounting is None:
             raise InputError(f"Scenario '{name}' has no mounting part; choose one that has.")
         reports: list[MountingReport] = []
-        failed: list[str] = []
+        failed = failed_by[name] = []
         for i, seed in enumerate(seeds):
             progress(f"{name}, seed {seed}", (k + i / len(seeds)) / len(chosen))
             options = DemoOptions(scenario=name, out=folder / name / f"seed{seed}", seed=seed)
@@ -49,24 +49,19 @@ def run_mountings(
                 reports.append(report)
             else:
                 failed.append(f"seed {seed}: {report.reason}")
-        row = _row(name, reports, failed)
-        rows.append(row)
-        table += _line(row)
+        rows.append(_row(name, reports, failed))
     summary: dict[str, object] = {
         "state": "done" if all(not row["failed"] for row in rows) else "failed",
         "seeds": list(seeds),
         "mountings": rows,
     }
-    failures = [f"{row['scenario']} {text}" for row in rows for text in _texts(row["failed"])]
+    failures = [f"{name} {text}" for name, texts in failed_by.items() for text in texts]
     if failures:
         summary["reason"] = failures[0]
-    write_atomic(folder / "mountings.json", json.dumps(summary, indent=2) + "\n")
+    table = markdown_table(HEADER, map(_line, rows))
+    write_json(folder / "mountings.json", summary)
     write_atomic(folder / "mountings.md", table)
     return summary, table
-
-
-def _texts(value: object) -> list[str]:
-    return [str(v) for v in value] if isinstance(value, list) else []
 
 
 def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[str, object]:
@@ -95,13 +90,16 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
     }
 
 
-def _line(row: dict[str, object]) -> str:
+def _line(row: dict[str, object]) -> tuple[str, ...]:
     if row["runs"] == 0:
-        return f"| {row['scenario']} | 0 | - | - | - | - | - |\n"
+        return (str(row["scenario"]), "0", *("-",) * 5)
     r = {k: v for k, v in row.items() if isinstance(v, int | float)}
     return (
-        f"| {row['scenario']} | {r['runs']:.0f} | {r['scans']:.1f} "
-        f"| {r['expected_mm']:.3f} / {r['work_median_mm']:.3f} / {r['work_worst_mm']:.3f} "
-        f"| {r['aside_median_mm']:.3f} / {r['aside_worst_mm']:.3f} | {r['worst_mm']:.3f}, {r['worst_deg']:.4f} "
-        f"| {r['nees_mean']:.1f} / {r['nees_worst']:.1f} ({r['bound']:.1f}) |\n"
+        str(row["scenario"]),
+        f"{r['runs']:.0f}",
+        f"{r['scans']:.1f}",
+        f"{r['expected_mm']:.3f} / {r['work_median_mm']:.3f} / {r['work_worst_mm']:.3f}",
+        f"{r['aside_median_mm']:.3f} / {r['aside_worst_mm']:.3f}",
+        f"{r['worst_mm']:.3f}, {r['worst_deg']:.4f}",
+        f"{r['nees_mean']:.1f} / {r['nees_worst']:.1f} ({r['bound']:.1f})",
     )

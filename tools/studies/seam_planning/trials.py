@@ -1,13 +1,11 @@
-"""Trials of seam planning: a part under a scanner preset in a random pose, planned by a method, compared with the truth."""
+"""Trials of seam planning: a part in a random pose under a scanner preset, planned and compared with the truth."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,32 +22,37 @@ from weldcal.welding.locate.groove_cloud import extract_groove
 from weldcal.welding.locate.planes import Floats, into
 
 WIDEST_PX = 824
-SHAPES = (
-    "straight",
-    "s",
-    "l",
-    "corner",
-    "bent",
-)  # l: its corner rounded with 20 mm; corner: with 4 mm; bent: s over 200 mm
+SHAPES = ("straight", "s", "l", "corner", "bent")  # l: corner radius 20 mm; corner: 4 mm; bent: s over 200 mm
 CORNER_M, BEND_M = 0.004, 0.200
 FIRST_HELD_OUT = 1000  # seeds from here on were not used while the figures of the algorithms were set
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One scan planned by one method; lengths in mm, empty (nan) where it was refused."""
+COLUMNS = (
+    "preset", "method", "shape", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma", "seconds",
+)  # fmt: skip
 
-    preset: str
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The plan of one scan by one method; lengths in mm, NaN where it was refused; processor seconds."""
+
     method: str
-    shape: str
     seed: int
     refused: str
-    rms_mm: float
-    worst_mm: float
-    sigma_mm: float
-    chi: float
-    within_2_sigma: float
-    seconds: float
+    rms_mm: float = math.nan
+    worst_mm: float = math.nan
+    sigma_mm: float = math.nan
+    chi: float = math.nan
+    within_2_sigma: float = math.nan
+    seconds: float = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial(Plan):
+    """One scan of a part under a scanner preset."""
+
+    preset: str
+    shape: str
 
 
 def sideways(points_B: Floats, part: Workpiece, X_BP: RigidTransform) -> tuple[Floats, Floats]:
@@ -111,26 +114,30 @@ METHODS = {"cad": try_cad, "cloud": try_cloud}
 
 
 def run_trial(scene: Scene, preset: str, shape: str, seed: int, method: str) -> Trial:
-    """One scan planned by one method; a named refusal is a result."""
+    """Plan one scan by one method; a named refusal is a result."""
+    return Trial(preset=preset, shape=shape, method=method, seed=seed, **figures(lambda: METHODS[method](scene)))
+
+
+def figures(plan: Callable[[], tuple[Floats, Floats]]) -> dict[str, Any]:
+    """Run `plan`, which returns errors and sigmas (N,) m; the fields of a Plan that follow from it."""
     began = time.process_time()
     try:
-        error, sigma = METHODS[method](scene)
+        error, sigma = plan()
     except WeldcalError as refusal:
-        nothing = (*[math.nan] * 5, time.process_time() - began)
-        return Trial(preset, method, shape, seed, f"{type(refusal).__name__}: {refusal}", *nothing)
-    return Trial(
-        preset,
-        method,
-        shape,
-        seed,
-        "",
-        1e3 * float(np.sqrt(np.mean(np.square(error)))),
-        1e3 * float(np.abs(error).max()),
-        1e3 * float(np.sqrt(np.mean(np.square(sigma)))),
-        float(np.sqrt(np.mean(np.square(error / sigma)))),
-        float(np.mean(np.abs(error) < 2.0 * sigma)),
-        time.process_time() - began,
-    )
+        return {"refused": f"{type(refusal).__name__}: {refusal}", "seconds": time.process_time() - began}
+    return {
+        "refused": "",
+        "rms_mm": 1e3 * _rms(error),
+        "worst_mm": 1e3 * float(np.abs(error).max()),
+        "sigma_mm": 1e3 * _rms(sigma),
+        "chi": _rms(error / sigma),
+        "within_2_sigma": float(np.mean(np.abs(error) < 2.0 * sigma)),
+        "seconds": time.process_time() - began,
+    }
+
+
+def _rms(values: Any) -> float:
+    return math.sqrt(float(np.mean(np.square(values))))
 
 
 def summary_rows(trials: list[Trial]) -> dict[str, str]:
@@ -140,24 +147,17 @@ def summary_rows(trials: list[Trial]) -> dict[str, str]:
         for method in METHODS:
             mine = [t for t in trials if t.preset == preset and t.method == method]
             done = [t for t in mine if not t.refused]
-            key = f"{preset} {method}"
-            if not done:
-                rows[key] = f"0 of {len(mine)} planned; {mine[0].refused}"
-                continue
-            rms = math.sqrt(float(np.mean([t.rms_mm**2 for t in done])))
-            sigma = math.sqrt(float(np.mean([t.sigma_mm**2 for t in done])))
-            within = 100.0 * float(np.mean([t.within_2_sigma for t in done]))
-            rows[key] = (
-                f"{len(done)} of {len(mine)} planned; error rms {rms:.3f}, worst {max(t.worst_mm for t in done):.2f} mm; "
-                f"sigma stated {sigma:.3f} mm ({within:.0f} % of the line within 2 sigma); {np.mean([t.seconds for t in done]):.2f} s CPU"
-            )
+            seconds = f"; {np.mean([t.seconds for t in done]):.2f} s CPU" if done else f"; {mine[0].refused}"
+            rows[f"{preset} {method}"] = f"{len(done)} of {len(mine)} planned{error_text(done)}{seconds}"
     return rows
 
 
-def table_text(trials: Sequence[Any]) -> str:
-    """Dataclasses of one kind as CSV."""
-    table = io.StringIO()
-    writer = csv.DictWriter(table, [f.name for f in fields(trials[0])], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows([vars(t) for t in trials])
-    return table.getvalue()
+def error_text(planned: Sequence[Plan]) -> str:
+    """Errors and stated sigmas of the plans, as a part of a sentence; empty for none."""
+    if not planned:
+        return ""
+    within = 100.0 * float(np.mean([t.within_2_sigma for t in planned]))
+    return (
+        f"; error rms {_rms([t.rms_mm for t in planned]):.3f}, worst {max(t.worst_mm for t in planned):.2f} mm; sigma stated "
+        f"{_rms([t.sigma_mm for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
+    )

@@ -1,9 +1,8 @@
-"""Troubles of seam planning: something in front of the part, things around it, and parts that are not the one drawn."""
+"""Hard cases of seam planning: occlusion, clutter, and parts that are not the one in the drawing."""
 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,12 +10,11 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.bent_workpiece import bend
-from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece
 from weldcal.tools.studies.seam_planning.scenes import Scene, box, scan_part
-from weldcal.tools.studies.seam_planning.trials import BEND_M, WIDEST_PX, try_cad, try_cloud
+from weldcal.tools.studies.seam_planning.trials import BEND_M, WIDEST_PX, Plan, error_text, figures, try_cad, try_cloud
 
 PRESET = "phoxi_m"
 PLANNED, REFUSED = "planned", "refused"
@@ -36,20 +34,22 @@ class Trouble:
     drawing: Callable[[], Workpiece] | None = None
 
 
-@dataclass(frozen=True)
-class TroubleTrial:
-    """One scan in one kind of trouble; lengths in mm, nan where it was refused. ok: the answer is what it has to be."""
+COLUMNS = (
+    "name", "method", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "within_2_sigma", "ok", "seconds",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class TroubleTrial(Plan):
+    """One scan in one kind of trouble; must: as in Trouble."""
 
     name: str
-    method: str
-    seed: int
-    refused: str
-    rms_mm: float
-    worst_mm: float
-    sigma_mm: float
-    within_2_sigma: float
-    ok: bool
-    seconds: float
+    must: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the answer is what it has to be."""
+        return self.must in ("", REFUSED if self.refused else PLANNED)
 
 
 def _bar(width_m: float) -> Callable[[np.random.Generator], list[TriMesh]]:
@@ -81,8 +81,12 @@ def _s() -> Workpiece:
     return make_workpiece("s", length_m=0.250)
 
 
+def _flat() -> Workpiece:
+    return make_workpiece("s", length_m=0.200)
+
+
 def _bent(radius_m: float) -> Callable[[], Workpiece]:
-    return lambda: bend(make_workpiece("s", length_m=0.200), radius_m)
+    return lambda: bend(_flat(), radius_m)
 
 
 TROUBLES = (
@@ -96,24 +100,17 @@ TROUBLES = (
         )
         for method in ("cad", "cloud")
     ),
-    Trouble(
-        "wrong: 6 mm wider", lambda: make_workpiece("s", length_m=0.250, width_m=0.206), REFUSED, "cad", drawing=_s
+    *(
+        Trouble(f"wrong: {name}", part, REFUSED, "cad", drawing=drawing)
+        for name, part, drawing in (
+            ("6 mm wider", lambda: make_workpiece("s", length_m=0.250, width_m=0.206), _s),
+            ("5 mm longer", lambda: make_workpiece("s", length_m=0.255), _s),
+            ("another groove", lambda: make_workpiece("straight", length_m=_s().size_m[0]), _s),
+            ("bent, drawn flat", _bent(BEND_M), _flat),
+            ("flat, drawn bent", _flat, _bent(BEND_M)),
+            ("bent over 230 mm, drawn 200", _bent(0.230), _bent(BEND_M)),
+        )
     ),
-    Trouble("wrong: 5 mm longer", lambda: make_workpiece("s", length_m=0.255), REFUSED, "cad", drawing=_s),
-    Trouble(
-        "wrong: another groove",
-        lambda: make_workpiece("straight", length_m=_s().size_m[0]),
-        REFUSED,
-        "cad",
-        drawing=_s,
-    ),
-    Trouble(
-        "wrong: bent, drawn flat", _bent(BEND_M), REFUSED, "cad", drawing=lambda: make_workpiece("s", length_m=0.200)
-    ),
-    Trouble(
-        "wrong: flat, drawn bent", lambda: make_workpiece("s", length_m=0.200), REFUSED, "cad", drawing=_bent(BEND_M)
-    ),
-    Trouble("wrong: bent over 230 mm, drawn 200", _bent(0.230), REFUSED, "cad", drawing=_bent(BEND_M)),
 )
 
 
@@ -122,18 +119,8 @@ def trouble_trial(trouble: Trouble, seed: int) -> TroubleTrial:
     scanner = get_scanner(PRESET).resized(WIDEST_PX)
     others = trouble.others(np.random.default_rng([seed, 97]))
     scene = scan_part(trouble.part(), scanner, seed, tilt_rad=math.radians(5.0), spread_m=0.02, others=others)
-    began = time.process_time()
-    refused, rms, worst, known, within = "", *[math.nan] * 4
-    try:
-        error, sigma = _plan(scene, trouble)
-        rms, worst = 1e3 * float(np.sqrt(np.mean(np.square(error)))), 1e3 * float(np.abs(error).max())
-        known, within = 1e3 * float(np.sqrt(np.mean(np.square(sigma)))), float(np.mean(np.abs(error) < 2.0 * sigma))
-    except WeldcalError as refusal:
-        refused = f"{type(refusal).__name__}: {refusal}"
-    ok = trouble.must in ("", REFUSED if refused else PLANNED)
-    return TroubleTrial(
-        trouble.name, trouble.method, seed, refused, rms, worst, known, within, ok, time.process_time() - began
-    )
+    plan = figures(lambda: _plan(scene, trouble))
+    return TroubleTrial(name=trouble.name, must=trouble.must, method=trouble.method, seed=seed, **plan)
 
 
 def _plan(scene: Scene, trouble: Trouble) -> tuple[np.ndarray, np.ndarray]:
@@ -153,14 +140,6 @@ def trouble_rows(trials: list[TroubleTrial]) -> dict[str, str]:
     for name, method in dict.fromkeys((t.name, t.method) for t in trials):
         mine = [t for t in trials if (t.name, t.method) == (name, method)]
         done = [t for t in mine if not t.refused]
-        text = f"{len(done)} of {len(mine)} planned, {sum(t.ok for t in mine)} as they have to be"
-        if done:
-            rms = math.sqrt(float(np.mean([t.rms_mm**2 for t in done])))
-            sigma = math.sqrt(float(np.mean([t.sigma_mm**2 for t in done])))
-            within = 100.0 * float(np.mean([t.within_2_sigma for t in done]))
-            text += (
-                f"; error rms {rms:.3f}, worst {max(t.worst_mm for t in done):.2f} mm; sigma stated {sigma:.3f} mm "
-                f"({within:.0f} % of the line within 2 sigma)"
-            )
-        rows[f"{name}, {method}"] = text
+        right = f"{sum(t.ok for t in mine)} as they have to be"
+        rows[f"{name}, {method}"] = f"{len(done)} of {len(mine)} planned, {right}{error_text(done)}"
     return rows
