@@ -1,4 +1,4 @@
-"""How good a calibration from few scans is: random draws of a recorded dataset, judged on the scans that were not drawn."""
+"""Errors of calibrations from few scans: random draws of a recorded dataset, judged on the scans that were not drawn."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.dataset import load_dataset
-from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
-from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection
 from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -21,14 +18,13 @@ from weldcal.calibration.eye_on_base.validation import position_errors, tilt_err
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.studies.flange.ingredients import median_sigma, usable_scans
 
 Array = NDArray[np.float64]
 
 SIZES = (1, 2, 3, 4, 6, 8, 12)
 KEPT = 4  # scans that at least are left to judge by
-_BOOTSTRAPS = 2000
 
 
 @dataclass(frozen=True)
@@ -44,8 +40,7 @@ class Draws:
 
     def median_sigma_m(self, seed: int = 0) -> float:
         """How well so many draws tell their median (bootstrap standard deviation, m); that all are of the same scans is not in it."""
-        draws = np.random.default_rng(seed).choice(self.position_m, (_BOOTSTRAPS, len(self.position_m)))
-        return float(np.median(draws, axis=1).std())
+        return median_sigma(self.position_m, seed)
 
 
 def study_few_scans(
@@ -53,28 +48,21 @@ def study_few_scans(
 ) -> list[Draws]:
     """One row a size, as far as KEPT scans remain. From one scan the pose rests on the turn of the drilled holes about the flange's axis,
     which a calibration from all scans told before. Raises InputError for a folder that is none, TooFewPoses where nothing remains."""
-    data = load_dataset(folder)
-    seen = see_flanges(
-        data, get_flange(data.header.flange), seed=seed, tell=lambda f: progress("fitting flanges", 0.3 * f)
-    )
-    everything = list(seen.observations)
-    if len(everything) < ENOUGH + KEPT:
-        raise TooFewPoses(f"Draws need {ENOUGH + KEPT} usable scans and more, and there are {len(everything)}.")
-    rough = estimate_eye_on_base(everything, SolveConfig(seed=seed, allow_coplanar=True, leave_one_out=False))
-    good = [o for o, keep in zip(everything, rough.inliers, strict=True) if keep]
-    turn = axis_turn(good, seen.patterns, rough.X_BC)[0] if any(o.id in seen.patterns for o in good) else None
+    refusal = f"Draws need {ENOUGH + KEPT} usable scans and more"
+    good, patterns, X_rough = usable_scans(folder, ENOUGH + KEPT, refusal, seed, progress, 0.3, allow_coplanar=True)
+    turn = axis_turn(good, patterns, X_rough)[0] if any(o.id in patterns for o in good) else None
     sizes = [n for n in sizes if n <= len(good) - KEPT and (n > 1 or turn is not None)]
     rng = np.random.default_rng(seed)
     rows = []
     for k, n in enumerate(sizes):
         errors, tilts, corrected = [], [], 0
-        first = [i for i, o in enumerate(good) if n > 1 or o.id in seen.patterns]
+        first = [i for i, o in enumerate(good) if n > 1 or o.id in patterns]
         for d in range(draws):
             progress(f"{n} scans", 0.3 + 0.7 * (k + d / draws) / len(sizes))
             drawn = set(rng.choice(first, n, replace=False).tolist())
             used, kept = ([o for i, o in enumerate(good) if (i in drawn) == mine] for mine in (True, False))
             try:
-                X, correction = _calibrated(used, seen.patterns, turn, seed)
+                X, correction = _calibrated(used, patterns, turn, seed)
             except InputError:
                 continue
             judged = [correction.observation(o) for o in kept]

@@ -1,8 +1,9 @@
-"""Is the flange found whenever it is there, and never when it is not? Ray-cast frames with clutter, and the centre's error."""
+"""Detection rate of the flange in ray-cast frames with clutter, false detections, and the centre's error."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,11 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.studies.flange.frames import empty_frame, flange_frame
+from weldcal.tools.studies.flange.frames import Frame, empty_frame, flange_frame
 
 Array = NDArray[np.float64]
 
-_SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it
+SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +36,29 @@ class Found:
     @property
     def rms_mm(self) -> float:
         """Root mean square (3-D) of the centre errors, mm."""
-        return float(1e3 * np.sqrt(np.mean(self.errors_m**2))) if len(self.errors_m) else float("nan")
+        return rms_mm(self.errors_m)
+
+
+class FrameFit(NamedTuple):
+    """The centre's error (m), its square per axis in units of the stated covariance, and the share of the edge that was seen."""
+
+    error_m: float
+    normalised: float
+    coverage: float
+
+
+def fit_frame(frame: Frame, standard: FlangeStandard) -> FrameFit:
+    """Fit the flange of a frame and compare with the truth. Raises FlangeNotFound."""
+    assert frame.X_CR is not None
+    fit = fit_flange(frame.points_C, standard)
+    e_C = fit.center_C - frame.X_CR.translation()
+    normalised = float(e_C @ np.linalg.solve(fit.center_covariance, e_C)) / 3.0
+    return FrameFit(float(np.linalg.norm(e_C)), normalised, fit.coverage)
+
+
+def rms_mm(errors_m: Array) -> float:
+    """Root mean square in mm; NaN for none."""
+    return float(1e3 * np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("nan")
 
 
 def study_frames(
@@ -54,18 +77,16 @@ def study_frames(
     for k in range(frames):
         progress("frames with a flange", k / max(frames + empty, 1))
         frame = flange_frame(scanner, standard, np.random.default_rng([seed, k]))
-        assert frame.X_CR is not None
         try:
-            fit = fit_flange(frame.points_C, standard)
+            fit = fit_frame(frame, standard)
         except FlangeNotFound as e:
             missed.append((k, e.reason))
             continue
-        e_C = fit.center_C - frame.X_CR.translation()
-        if float(np.linalg.norm(e_C)) > _SAME_PLACE_M:
+        if fit.error_m > SAME_PLACE_M:
             mistaken += 1
             continue
-        errors.append(float(np.linalg.norm(e_C)))
-        normalised.append(float(np.sqrt(e_C @ np.linalg.solve(fit.center_covariance, e_C) / 3.0)))
+        errors.append(fit.error_m)
+        normalised.append(float(np.sqrt(fit.normalised)))
     for k in range(empty):
         progress("frames without one", (frames + k) / max(frames + empty, 1))
         try:

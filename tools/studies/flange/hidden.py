@@ -1,4 +1,4 @@
-"""Scanner frames in which about half of the flange is hidden: by a plate before it, by the image's border, by missing readings."""
+"""Frames with a half-hidden flange: behind a plate, beyond the image's border, or with missing readings."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import FlangeNotFound
-from weldcal.calibration.flange.fit import fit_flange
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.studies.flange.found import SAME_PLACE_M, FrameFit, fit_frame, rms_mm
 from weldcal.tools.studies.flange.frames import Frame, box, flange_frame, random_place
 
 Array = NDArray[np.float64]
 WAYS = ("plate", "border", "missing")
-_SAME_PLACE_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ class Hidden:
     @property
     def rms_mm(self) -> float:
         """Root mean square (3-D) of the centre errors, mm."""
-        return float(1e3 * np.sqrt(np.mean(self.errors_m**2))) if len(self.errors_m) else float("nan")
+        return rms_mm(self.errors_m)
 
     @property
     def mean_normalised(self) -> float:
@@ -107,21 +106,18 @@ def study_hidden(
     progress: Progress = no_progress,
 ) -> Hidden:
     """Fit ``frames`` half-hidden flanges. Deterministic for ``seed``."""
-    errors, normalised, coverage, missed = [], [], [], []
+    fits, missed = list[FrameFit](), []
     for k in range(frames):
         progress(f"half hidden: {way}", k / frames)
         frame = hidden_frame(way, scanner, standard, np.random.default_rng([seed, k]), share=share)
-        assert frame.X_CR is not None
         try:
-            fit = fit_flange(frame.points_C, standard)
+            fit = fit_frame(frame, standard)
         except FlangeNotFound as e:
             missed.append(e.reason)
             continue
-        e_C = fit.center_C - frame.X_CR.translation()
-        if float(np.linalg.norm(e_C)) > _SAME_PLACE_M:
-            missed.append(f"found {1e3 * float(np.linalg.norm(e_C)):.1f} mm off")
+        if fit.error_m > SAME_PLACE_M:
+            missed.append(f"found {1e3 * fit.error_m:.1f} mm off")
             continue
-        errors.append(float(np.linalg.norm(e_C)))
-        normalised.append(float(e_C @ np.linalg.solve(fit.center_covariance, e_C)) / 3.0)
-        coverage.append(fit.coverage)
-    return Hidden(way, frames, np.array(errors), np.array(normalised), np.array(coverage), tuple(missed))
+        fits.append(fit)
+    errors, normalised, coverage = (np.array([f[i] for f in fits]) for i in range(3))
+    return Hidden(way, frames, errors, normalised, coverage, tuple(missed))

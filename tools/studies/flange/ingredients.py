@@ -1,4 +1,4 @@
-"""What each ingredient of a calibration is worth on recorded scans: held-out errors, step by step, and the floor under them."""
+"""Ablation of a calibration on recorded scans: held-out errors, ingredient by ingredient, and the floor under them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.math import RigidTransform
 from scipy.stats import chi
 
 from weldcal.calibration.data.dataset import load_dataset
@@ -41,20 +42,39 @@ class Ingredient:
 
     def median_sigma_m(self, seed: int = 0) -> float:
         """How well so many errors tell their median (bootstrap standard deviation, m)."""
-        draws = np.random.default_rng(seed).choice(self.position_m, (_DRAWS, len(self.position_m)))
-        return float(np.median(draws, axis=1).std())
+        return median_sigma(self.position_m, seed)
+
+
+def median_sigma(values: Array, seed: int) -> float:
+    """Bootstrap standard deviation of the median of values (n,)."""
+    draws = np.random.default_rng(seed).choice(values, (_DRAWS, len(values)))
+    return float(np.median(draws, axis=1).std())
+
+
+def usable_scans(
+    folder: Path, least: int, refusal: str, seed: int, progress: Progress, share: float, *, allow_coplanar: bool = False
+) -> tuple[list[Observation], dict[str, HolePattern], RigidTransform]:
+    """Observations of a dataset without outliers, the hole patterns by their ids, and a rough X_BC.
+
+    Raises InputError for a folder that is no dataset, TooFewPoses with `refusal` below `least` scans.
+    """
+    data = load_dataset(folder)
+    standard = get_flange(data.header.flange)
+    seen = see_flanges(data, standard, seed=seed, tell=lambda done: progress("fitting flanges", share * done))
+    if len(seen.observations) < least:
+        raise TooFewPoses(f"{refusal}, and there are {len(seen.observations)}.")
+    config = SolveConfig(seed=seed, allow_coplanar=allow_coplanar, leave_one_out=False)
+    rough = estimate_eye_on_base(seen.observations, config)
+    good = [o for o, keep in zip(seen.observations, rough.inliers, strict=True) if keep]
+    return good, dict(seen.patterns), rough.X_BC
 
 
 def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progress) -> list[Ingredient]:
     """Step by step on one dataset of scans. Raises InputError for a folder that is none, TooFewPoses below twelve usable scans."""
-    data = load_dataset(folder)
-    seen = see_flanges(
-        data, get_flange(data.header.flange), seed=seed, tell=lambda f: progress("fitting flanges", 0.5 * f)
-    )
-    _enough(len(seen.observations))
-    rough = estimate_eye_on_base(seen.observations, SolveConfig(seed=seed, leave_one_out=False))
-    good = [o for o, keep in zip(seen.observations, rough.inliers, strict=True) if keep]
-    _enough(len(good))
+    refusal = f"The comparison leaves every scan out in turn: it needs {LEAST} usable scans"
+    good, patterns, _ = usable_scans(folder, LEAST, refusal, seed, progress, 0.5)
+    if len(good) < LEAST:
+        raise TooFewPoses(f"{refusal}, and there are {len(good)}.")
     rows = []
     for k, (name, normals) in enumerate((("centres, scanner as it is", False), ("and face normals", True))):
         progress(name, 0.5 + 0.05 * k)
@@ -63,25 +83,15 @@ def study_ingredients(folder: Path, seed: int = 0, progress: Progress = no_progr
         tilt = e.held_out.tilt_rad if normals else _tilts(good, config)
         rows.append(Ingredient(name, e.held_out.position_m, tilt, _floor(e.sigma_position_m)))
     progress("hole circle alone", 0.6)
-    if from_holes(good, seen.patterns) is not None:
-        rows.append(_holes_alone(good, seen.patterns, seed))
-    for order, name in (
-        (1, "scale and gradient, hole circle and motion"),
-        (2, "and bends of order 2"),
-        (3, "and bends of order 3"),
-    ):
+    if from_holes(good, patterns) is not None:
+        rows.append(_holes_alone(good, patterns, seed))
+    names = ("scale and gradient, hole circle and motion", "and bends of order 2", "and bends of order 3")
+    for order, name in enumerate(names, 1):
         progress(name, 0.55 + 0.12 * order)
-        position, tilt = held_out_errors(good, seen.patterns, seed, order)
-        sigma = from_motion(good, seen.patterns, seed=seed, order=order, usual=True).sigma_position_m
+        position, tilt = held_out_errors(good, patterns, seed, order)
+        sigma = from_motion(good, patterns, seed=seed, order=order, usual=True).sigma_position_m
         rows.append(Ingredient(name, position, tilt, _floor(sigma)))
     return rows
-
-
-def _enough(n: int) -> None:
-    if n < LEAST:
-        raise TooFewPoses(
-            f"The comparison leaves every scan out in turn: it needs {LEAST} usable scans, and there are {n}."
-        )
 
 
 def _floor(sigma_m: float) -> float:

@@ -1,4 +1,4 @@
-"""The same live calibrations with the noise of arm and scanner drawn anew: what share of them is good enough, and at the bound."""
+"""Repeats live calibrations with redrawn noise: the share within the target, and the share at the Cramer-Rao bound."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Station:
-    """What made the sightings: arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms), the true X_BC,
+    """What made the observations: arm (its joints (n, 6) rad at each of them), how well the flange repeats (m, rms), the true X_BC,
     and the work point (3,) m in B."""
 
     arm: ArmModel
@@ -48,7 +48,7 @@ class Redrawn:
 
 
 def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Array) -> Array:
-    """Joints (n, 6) rad in which a bare flange stands where each sighting says: the solution nearest to ``q_home``."""
+    """Joints (n, 6) rad in which a bare flange stands where each observation says: the solution nearest to ``q_home``."""
     out = []
     for o in observations:
         solutions = inverse_kinematics(arm, o.X_BR)
@@ -57,12 +57,12 @@ def joints_of(observations: tuple[Observation, ...], arm: ArmModel, q_home: Arra
 
 
 def redraw(observations: tuple[Observation, ...], station: Station, count: int, seed: int = 0) -> Redrawn:
-    """``count`` calibrations from the poses of these sightings, each with noise of its own: joint offsets that displace the flange
+    """``count`` calibrations from the poses of these observations, each with noise of its own: joint offsets that displace the flange
     by the repeatability, and fits that err as they state. Deterministic for ``seed``."""
     rng = np.random.default_rng(seed)
     errors = np.empty((2, count))
     for k in range(count):
-        drawn = [_sighting(o, q, station, rng) for o, q in zip(observations, station.joints, strict=True)]
+        drawn = [_redrawn(o, q, station, rng) for o, q in zip(observations, station.joints, strict=True)]
         estimate = estimate_eye_on_base(drawn, SolveConfig(leave_one_out=False))
         e = calibration_error(estimate.X_BC, station.X_BC, station.p_BWork)
         errors[:, k] = e.at_work_m, e.rotation_rad
@@ -79,7 +79,7 @@ def joined(parts: list[Redrawn]) -> Redrawn:
 
 def bound_covariance(observations: tuple[Observation, ...], station: Station) -> Array:
     """Cramer-Rao: the least covariance (6, 6) [rotation rad; displacement of the work point m] that an unbiased calibration from
-    these sightings of a bare flange can have.
+    these observations of a bare flange can have.
 
     The arm's error is six independent joint offsets that displace the flange by the repeatability (rms); the scanner's is what
     each fit states of itself. Centre and normal of a pose err together, as one offset of the joints moves both.
@@ -105,8 +105,8 @@ def _joint_sigma(station: Station, J: Array) -> float:
     return station.repeatability_m / float(np.linalg.norm(J[3:]))
 
 
-def _sighting(o: Observation, q: Array, station: Station, rng: np.random.Generator) -> Observation:
-    """The sighting with noise of its own; where the robot says that it stands remains."""
+def _redrawn(o: Observation, q: Array, station: Station, rng: np.random.Generator) -> Observation:
+    """The observation with noise of its own; the robot's reported pose stays."""
     offset = _joint_sigma(station, jacobian(station.arm, q)) * rng.standard_normal(6)
     X_CR = station.X_BC.inverse() @ forward_kinematics(station.arm, q + offset)
     z = X_CR.rotation().matrix()[:, 2]

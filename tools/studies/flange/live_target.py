@@ -1,4 +1,4 @@
-"""How near the live calibration comes to the truth with few scans, beside what its arm and scanner let any method reach."""
+"""Errors of live calibrations with few scans, compared with the Cramer-Rao bound of arm and scanner."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TARGET_M, TARGET_RAD = 6e-5, float(np.radians(0.01))
 @dataclass(frozen=True)
 class LiveRow:
     """One seed: scans used, error of a point at the work point (m) and of the rotation (rad), what the estimate expected of the
-    former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with noise drawn anew."""
+    former (rms), the least that these poses, arm and scanner allow (rms), and the same calibration with noise redrawn."""
 
     seed: int
     scans: int
@@ -91,7 +91,7 @@ def study_live(
 
 
 def live_picture(rows: list[LiveRow]) -> bytes:
-    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise drawn anew, and at the bound."""
+    """Share of the calibrations whose error is no larger than that: live ones (steps), their noise redrawn, and at the bound."""
     again = joined([r.redrawn for r in rows])
     mm, deg = 1e3, float(np.degrees(1.0))
     figure = Figure(figsize=(8.2, 3.6), layout="constrained")
@@ -109,7 +109,7 @@ def live_picture(rows: list[LiveRow]) -> bytes:
     )
     for ax, (drawn, least, live, unit, target, name) in zip(axes, panels, strict=True):
         ax.ecdf(unit * least, color="#777", linewidth=1.2, linestyle="--", label="the least possible (Cramer-Rao)")
-        ax.ecdf(unit * drawn, color="#1d5f8a", linewidth=1.6, label=f"noise drawn anew, {len(drawn)} times")
+        ax.ecdf(unit * drawn, color="#1d5f8a", linewidth=1.6, label=f"noise redrawn, {len(drawn)} times")
         ax.ecdf(unit * np.array(live), color="#b08a2e", linewidth=1.2, label=f"live, {len(live)} worlds")
         ax.axvline(unit * target, color="#444", linewidth=1)
         ax.annotate("target", (unit * target, 0.04), xytext=(-4, 0), textcoords="offset points", ha="right", fontsize=9)
