@@ -44,6 +44,6 @@ def flange(
     if json:
         console.emit_json(found)
         return
-    from weldcal.tools.studies.flange.published.tables import print_study
+    from weldcal.tools.studies.flange.published.report import print_study
 
     print_study(study)

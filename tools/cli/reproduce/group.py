@@ -58,7 +58,7 @@ def weld(
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.weld.tables import print_study
+        from weldcal.tools.studies.weld.report import print_study
 
         print_study(study)
     if not study.met:

@@ -14,14 +14,15 @@ from weldcal.tools.studies.seam_planning.trials import (
     FIRST_HELD_OUT,
     METHODS,
     SHAPES,
+    TROUBLE_COLUMNS,
     WIDEST_PX,
     Trial,
     run_trial,
+    run_troubles,
     scan,
     summary_rows,
+    trouble_rows,
 )
-from weldcal.tools.studies.seam_planning.troubles import COLUMNS as TROUBLE_COLUMNS
-from weldcal.tools.studies.seam_planning.troubles import run_troubles, trouble_rows
 
 
 def run_seam_planning_benchmark(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,10 +62,6 @@ class RunMetrics:
     start_mm: float = math.nan
     stop_mm: float = math.nan
     gain: float = math.nan
-
-    def as_row(self) -> dict[str, object]:
-        """The figures by name."""
-        return asdict(self)
 
 
 def judge(

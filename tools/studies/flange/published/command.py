@@ -12,8 +12,13 @@ from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
-from weldcal.tools.studies.flange.published.kinect import KinectOutcome, study_kinect
-from weldcal.tools.studies.flange.published.pairs import PairsOutcome, load_runs, study_pairs
+from weldcal.tools.studies.flange.published.pairs import (
+    KinectOutcome,
+    PairsOutcome,
+    load_runs,
+    study_kinect,
+    study_pairs,
+)
 from weldcal.tools.studies.flange.published.report import pictures, study_report
 from weldcal.tools.studies.flange.published.results import Study, StudyOptions
 from weldcal.tools.studies.flange.published.simulation import simulate

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome
-from weldcal.tools.studies.flange.published.kinect import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome
-from weldcal.tools.studies.flange.published.pairs import PairsOutcome
+from weldcal.tools.studies.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Errors, Simulation
 
 Array = NDArray[np.float64]
