@@ -94,9 +94,9 @@ def profiler(
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.profiler.fixed import told
+        from weldcal.tools.studies.profiler.fixed import figure_text
 
-        rows = {t.what: f"{told(t.value, t.unit)}, target {t.limit:g}: {t.verdict}" for t in study.targets()}
+        rows = {t.what: f"{figure_text(t.value, t.unit)}, target {t.limit:g}: {t.verdict}" for t in study.targets()}
         console.emit_summary("reproduce profiler: done", {**rows, "written to": str(folder)})
     if not study.met:
         console.emit_warning(

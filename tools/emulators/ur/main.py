@@ -1,4 +1,4 @@
-"""The emulator's process: every port, one loop, 500 frames a second."""
+"""Process of the emulator: opens every port and runs 500 control frames a second."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def run_emulator(
     parent: int | None = None,
     ready: Callable[[str], None] | None = None,
 ) -> None:
-    """Runs until it is told to quit, by signal or on the control channel, or until process `parent` is gone.
+    """Runs until it is asked to quit, by signal or on the control channel, or until process `parent` is gone.
 
     Args:
         host: the loopback address to listen on.

@@ -139,7 +139,7 @@ def run_cell_study(options: CellStudyOptions, progress: Progress = no_progress) 
 
 
 def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progress = no_progress) -> CellRun:
-    """One weld of a scenario whose scanner stands where the cell is told it does."""
+    """One weld of a scenario whose camera pose is known exactly."""
     scenario: Scenario = known_camera(name)
     scenario.welding.seam_length_mm = options.seam_mm
     scenario.welding.law = options.law

@@ -148,7 +148,7 @@ def study_few_scans(
     folder: Path, draws: int = 60, seed: int = 0, sizes: Sequence[int] = SIZES, progress: Progress = no_progress
 ) -> list[Draws]:
     """One row a size, as far as KEPT scans remain. From one scan the pose rests on the turn of the drilled holes about the flange's axis,
-    which a calibration from all scans told before. Raises InputError for a folder that is none, TooFewPoses where nothing remains."""
+    which is known from a calibration with all scans. Raises InputError for a folder that is none, TooFewPoses where nothing remains."""
     refusal = f"Draws need {ENOUGH + KEPT} usable scans and more"
     good, patterns, X_rough = usable_scans(folder, ENOUGH + KEPT, refusal, seed, progress, 0.3, allow_coplanar=True)
     turn = axis_turn(good, patterns, X_rough)[0] if any(o.id in patterns for o in good) else None

@@ -205,7 +205,7 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]
     all three unknowns, the worst error, and the rms error over all starts, both in units of the bound.
 
     The error of an unknown is the root of its squared error in units of the bound's covariance, per number. (An error
-    norm beside the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
+    norm compared with the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
     """
     turn, shift = float(np.radians(0.02)), 1e-4
     ratios = []

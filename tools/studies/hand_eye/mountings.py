@@ -68,7 +68,7 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
     if not reports:
         return {"scenario": name, "runs": 0, "failed": failed}
     work = np.array([r.work_error_mm() or np.nan for r in reports])
-    aside = np.array([1e3 * k.error_m for r in reports for k in r.run.status.kept_aside])
+    held_out = np.array([1e3 * k.error_m for r in reports for k in r.run.status.kept_aside])
     errors = [e for r in reports for e in r.truth_errors().values()]
     return {
         "scenario": name,
@@ -79,8 +79,8 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
         "expected_mm": float(np.median([1e3 * r.run.status.sigma_work_m for r in reports])),
         "work_median_mm": float(np.median(work)),
         "work_worst_mm": float(work.max()),
-        "aside_median_mm": float(np.median(aside)),
-        "aside_worst_mm": float(aside.max()),
+        "aside_median_mm": float(np.median(held_out)),
+        "aside_worst_mm": float(held_out.max()),
         "worst_mm": max(e.mm for e in errors),
         "worst_deg": max(e.deg for e in errors),
         "nees_mean": float(np.mean([e.nees for e in errors])),

@@ -45,8 +45,8 @@ FEATURES = (0.02, 0.035, 0.02)
 PUBLISHED = {METHODS[0]: 4.523, METHODS[1]: 0.840}
 
 
-def told(value: float, unit: str) -> str:
-    """A figure with its unit, as tables show it: counts whole, what is tiny by its power of ten."""
+def figure_text(value: float, unit: str) -> str:
+    """A figure with its unit: counts as whole numbers, tiny values as powers of ten."""
     if unit == "points" or unit.startswith("of "):
         return f"{value:.0f} {unit}"
     return (f"{value:.3f}" if value >= 5e-4 or value == 0.0 else f"{value:.1e}") + (f" {unit}" if unit else "")

@@ -109,7 +109,7 @@ def seam(results: list[WorldResult]) -> bytes:
     return svg(picture)
 
 
-def boss(result: WorldResult) -> bytes:
+def frustum(result: WorldResult) -> bytes:
     """The frustum's cloud by plane, with the slanted edges that were measured (Fig. 7 and 8)."""
     assert result.cloud is not None
     assert result.boss is not None

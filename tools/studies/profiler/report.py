@@ -1,4 +1,4 @@
-"""The profiler study's report page: targets, then the tables of both papers with ours beside them, and the pictures."""
+"""Report page of the profiler study: targets, both papers' tables compared with ours, and pictures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.profiler import edge, plots, sphere
-from weldcal.tools.studies.profiler.fixed import told
+from weldcal.tools.studies.profiler.fixed import figure_text
 from weldcal.tools.studies.profiler.results import ProfilerStudy
 
 Lines = list[tuple[str, ...]]
@@ -15,7 +15,7 @@ Lines = list[tuple[str, ...]]
 
 def target_lines(study: ProfilerStudy) -> Lines:
     """What, reached, target, verdict."""
-    return [(t.what, told(t.value, t.unit), t.wanted, t.verdict) for t in study.targets()]
+    return [(t.what, figure_text(t.value, t.unit), t.wanted, t.verdict) for t in study.targets()]
 
 
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
@@ -103,7 +103,7 @@ def profiler_report(study: ProfilerStudy) -> str:
         fig_error=plots.true_error(rows, study.names, _short()),
         fig_ball=plots.ball(study.ball),
         fig_seam=plots.seam(list(study.sphere)),
-        fig_boss=plots.boss(with_boss),
+        fig_boss=plots.frustum(with_boss),
         command="weldcal reproduce profiler" + (" --data FOLDER" if fixed_files else f" --seed {study.options.seed}") + (" --quick" if study.options.quick else ""),
         software=software_version(),
     )  # fmt: skip

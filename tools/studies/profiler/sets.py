@@ -200,8 +200,10 @@ def _outlier(_kind: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTria
 
 def _observed(poses: FlangePoses, truth: EdgeState, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
     points = _noisy(predicted(truth, poses)[0], noise, rng)
-    told = FlangePoses(poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape))
-    return EdgeTrial(told, points, truth, noise)
+    reported = FlangePoses(
+        poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape)
+    )
+    return EdgeTrial(reported, points, truth, noise)
 
 
 def _arcs(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:

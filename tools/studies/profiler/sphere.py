@@ -23,7 +23,7 @@ from weldcal.tools.studies.profiler.worlds import SphereTests, SphereTrial, Sphe
 
 MM = 1e-3
 METHODS = ("linear", "compensated", "joint, affine", "joint, affine+joints")
-# as printed: mean deviations before and after (Table 1), after (Table 2), boss length and angle (Table 3)
+# as printed: mean deviations before and after (Table 1), after (Table 2), frustum length and angle (Table 3)
 PRINTED_POINTS = {"linear": (4.3132, 4.5731, 4.0331), "compensated": (0.8183, 0.7069, 0.6371)}
 PRINTED_SEAM = (0.4567, 0.6374, 0.4856)
 PRINTED_BOSS = (0.5071, 0.2145)

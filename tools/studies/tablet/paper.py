@@ -1,4 +1,4 @@
-"""What the tablet paper prints: its data (Tables 2 and 3) and its results (Tables 7 to 12).
+"""Data of the tablet paper (Tables 2 and 3) and its results (Tables 7 to 12).
 
 J. Sato, "Hand-Eye Calibration Using a Tablet Computer", Math. Comput. Appl. 2023, 28(1), 22, doi 10.3390/mca28010022, CC BY 4.0.
 The tablet's grid and the turn at the first landmark are not printed; both are inferred from the printed results.

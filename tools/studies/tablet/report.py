@@ -43,7 +43,7 @@ def sign_residuals(touches: TabletTouches) -> bytes:
 
 
 def unseen_errors(models: tuple[ModelRow, ...], unseen: tuple[HeldOutRow, ...]) -> bytes:
-    """Bars: left-out error on the published data, in-sample beside it; error on simulated queries."""
+    """Bars: left-out and in-sample error on the published data; error on simulated queries."""
     picture = Figure(figsize=(9.0, 0.42 * (len(models) + len(unseen)) + 1.6), layout="constrained")
     left, queries = picture.subplots(2, 1, height_ratios=[len(models), len(unseen)], sharex=True)
     y = np.arange(len(models))

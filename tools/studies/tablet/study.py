@@ -1,4 +1,4 @@
-"""The tablet paper's tables done again: every stage, sign and model, their cost, and how well each predicts what it did not see."""
+"""Reproduces the tablet paper's tables: every stage, sign and model, their cost, and their prediction errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The study's world around the servo: a robot that lags, a tag that is late, noisy and wrong, a tip in its groove."""
+"""Plant of the weld study: a lagging robot, a late and noisy tag, a tip in its groove."""
 
 from __future__ import annotations
 

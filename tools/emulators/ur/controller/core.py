@@ -33,7 +33,7 @@ class Controller(ControllerState):
     # programs
 
     def submit(self, source: str) -> None:
-        """Text of one program from a script port: runs it where the state allows, or drops it without a word."""
+        """Text of one program from a script port: runs it where the state allows, or drops it."""
         line = source.strip()
         words = line.rstrip("()").strip()
         if self.version.takes_scripts and words in WORDS:
@@ -67,7 +67,7 @@ class Controller(ControllerState):
                 self.later(POWER_STEP_S + STEP_S, self.release_brakes)
 
     def start(self, source: str) -> bool:
-        """Starts a program in place of the running one; a `sec` runs beside it."""
+        """Starts a program in place of the running one; a `sec` runs in parallel."""
         if not self.ready:
             self.note("program ignored: the robot is not running or a safety stop is active")
             return False

@@ -1,4 +1,4 @@
-"""The controller's enumerations, as RTDE numbers them."""
+"""Enumerations of the controller, numbered as in RTDE."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How URScript's motions move the joints: each turns the state of the arm into the joint velocity of the next 2 ms.
+"""URScript motions: each computes the joint velocity of the next 2 ms from the arm's state.
 
 Marked [M] in docs/ur_emulator.md: profiles are trapezoids without jerk limit, blends are stops, servoj is a first-order
 chase, and the reaction to limits is a protective stop.

@@ -1,4 +1,4 @@
-"""Registers and terminals: what RTDE inputs write and scripts read, and the other way round. Values outlive programs."""
+"""Registers and terminals that RTDE and scripts read and write; values outlive programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URScript's functions that answer at once, by their own names: registers, states, kinematics, poses."""
+"""URScript functions that return at once: registers, states, kinematics, poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URScript's own functions, as far as the client's script and a guard script call them, bound to one program.
+"""URScript functions of the controller, as far as the client's script and a guard script call them.
 
 Motions and the reads of sockets are generators that take frames; all other functions answer at once. What the emulator has no
 physics for (force mode, freedrive ...) is accepted and noted in the log.

@@ -1,4 +1,4 @@
-"""A URScript tree into Python generator functions: every routine yields where its slice of the 2 ms frame is over.
+"""Compiles a URScript tree into Python generator functions; each yields at the end of its 2 ms slice.
 
 Variables assigned in the main body or declared global are global, all others belong to their routine. URScript names
 are prefixed (v_, f_, b_), since scripts call variables `async` or `time`. Assignment copies lists.

@@ -1,4 +1,4 @@
-"""URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
+"""Parses URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
 
 from __future__ import annotations
 

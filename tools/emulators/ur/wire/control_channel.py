@@ -1,4 +1,4 @@
-"""The control channel: one JSON object a line injects a fault or asks a question, one JSON object a line answers."""
+"""Control channel: a line of JSON injects a fault or asks a question, a line of JSON answers."""
 
 from __future__ import annotations
 

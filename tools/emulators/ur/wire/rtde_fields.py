@@ -1,4 +1,4 @@
-"""Every RTDE field with its type and where its value comes from, as Universal Robots' RTDE guide lists them."""
+"""RTDE fields, their types and their values, as in Universal Robots' RTDE guide."""
 
 from __future__ import annotations
 

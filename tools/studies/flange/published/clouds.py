@@ -75,7 +75,7 @@ class SightRow:
 
 @dataclass(frozen=True, eq=False)
 class SplitRow:
-    """One way to calibrate, over all splits: errors (m) on scans kept aside, and what it reports itself, by split (NaN: no
+    """One way to calibrate, over all splits: errors (m) on held-out scans, and what it reports itself, by split (NaN: no
     figure of its own)."""
 
     name: str
@@ -120,7 +120,7 @@ class CloudsOutcome:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What both methods see of one folder: our sightings and the published circles of the same scans, and the CAD."""
+    """What both methods see of one folder: our observations and the published circles of the same scans, and the CAD."""
 
     data: Dataset
     standard: FlangeStandard
@@ -150,8 +150,8 @@ def study_clouds(
     progress: Progress,
     circles: int | None = None,
 ) -> CloudsOutcome:
-    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on scans kept
-    aside, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
+    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on held-out
+    scans, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
     flange to both methods."""
     progress("circles and edges", 0.0)
     material = read_material(data, standard, seed)

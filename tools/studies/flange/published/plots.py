@@ -54,7 +54,7 @@ def fig10(s: Simulation) -> bytes:
 
 
 def fig11_stored(p: PairsOutcome) -> bytes:
-    """The authors' stored runs: what they reported step by step, and beside it the truth of the ends."""
+    """The authors' stored runs: their reported errors step by step, and the true errors at the end."""
     assert p.runs is not None
     picture, true = _steps(np.arange(5, 5 + p.runs.components.shape[1]), p.runs.components, REPORTED)
     rows = [
@@ -103,7 +103,7 @@ def held_out(c: CloudsOutcome) -> bytes:
 
 
 def costs(s: Simulation) -> bytes:
-    """Simulated, 1 mm of noise: error at the camera's origin, which the cost looks at, beside the error at the flanges."""
+    """Simulated, 1 mm of noise: error at the camera's origin, which the cost uses, and at the flanges."""
     picture = Figure(figsize=(7.6, 2.9), layout="constrained")
     axes = picture.subplots()
     names = {
@@ -113,7 +113,7 @@ def costs(s: Simulation) -> bytes:
     y = np.arange(len(s.costs))[::-1]
     camera = [1e3 * float(np.linalg.norm(e.e[:, 3:], axis=1).mean()) for e in s.costs.values()]
     flanges = [1e3 * float(e.at_tcp.mean()) for e in s.costs.values()]
-    axes.barh(y + 0.19, camera, 0.36, color=THEIRS, label="at the camera's origin, which the cost looks at")
+    axes.barh(y + 0.19, camera, 0.36, color=THEIRS, label="at the camera's origin, which the cost uses")
     axes.barh(y - 0.19, flanges, 0.36, color=TRUTH, label="at the 75 flange centres, where the robot works")
     axes.set_yticks(y, [names[n] for n in s.costs])
     _plain(axes, "mean error, mm (1 mm of noise)", "")
