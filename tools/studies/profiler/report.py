@@ -21,24 +21,26 @@ def target_lines(study: ProfilerStudy) -> Lines:
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
     """Tables 1 to 3 of the edge paper, over 10 to 25 rotations: as printed for its three objects, then every set and method."""
     n = edge.COUNTS
-    alpha: Lines = []
-    d: Lines = []
-    radius: Lines = []
+
+    def pair(mean: float, std: float, digits: int) -> str:
+        return f"{fixed(mean, digits)} ± {fixed(std, digits)}"
+
+    tables: tuple[Lines, Lines, Lines] = ([], [], [])
     for j, thing in enumerate(("bar", "scale", "blade")):
-        head = ("printed" if j == 0 else "", thing)
-        alpha.append(
-            (*head, *(f"{fixed(edge.PRINTED_ALPHA[k][j], 2)} ± {fixed(edge.PRINTED_ALPHA_STD[k][j], 2)}" for k in n))
-        )
-        d.append((*head, *(f"{fixed(edge.PRINTED_D[k][j], 2)} ± {fixed(edge.PRINTED_D_STD[k][j], 2)}" for k in n)))
-        radius.append((*head, *(fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)))
+        alpha = (pair(edge.PRINTED_ALPHA[k][j], edge.PRINTED_ALPHA_STD[k][j], 2) for k in n)
+        d = (pair(edge.PRINTED_D[k][j], edge.PRINTED_D_STD[k][j], 2) for k in n)
+        radius = (fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)
+        for table, cells in zip(tables, (alpha, d, radius), strict=True):
+            table.append(("printed" if j == 0 else "", thing, *cells))
     for name in study.names:
         for method in edge.METHODS:
-            r = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
-            head = (edge.TITLES[name] if method == edge.METHODS[0] else "", method)
-            alpha.append((*head, *(f"{fixed(r[k].alpha_mean_deg, 2)} ± {fixed(r[k].alpha_std_deg, 2)}" for k in n)))
-            d.append((*head, *(f"{fixed(r[k].d_mean_mm, 3)} ± {fixed(r[k].d_std_mm, 3)}" for k in n)))
-            radius.append((*head, *(fixed(r[k].radius_mm, 3) for k in n)))
-    return alpha, d, radius
+            by = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
+            rows = [by[k] for k in n]
+            alpha = (pair(r.alpha_mean_deg, r.alpha_std_deg, 2) for r in rows)
+            d = (pair(r.d_mean_mm, r.d_std_mm, 3) for r in rows)
+            for table, cells in zip(tables, (alpha, d, (fixed(r.radius_mm, 3) for r in rows)), strict=True):
+                table.append((edge.TITLES[name] if method == edge.METHODS[0] else "", method, *cells))
+    return tables
 
 
 def error_lines(study: ProfilerStudy) -> Lines:

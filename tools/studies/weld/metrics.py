@@ -147,8 +147,7 @@ def _angles(
     if not on_seam.any():
         return {}
     up = run.torch_line.up(s[on_seam])
-    lean = np.degrees(np.arcsin(np.clip(np.sum(run.points("left")[moving][on_seam] * up, axis=1), -1.0, 1.0)))
-    pitch = np.degrees(np.arcsin(np.clip(np.sum(run.points("ahead")[moving][on_seam] * up, axis=1), -1.0, 1.0)))
+    lean, pitch = (np.degrees(a) for a in run.angles(np.flatnonzero(moving)[on_seam], up))
     chart = chord_map(run.torch_line, chord_m, 0.008, spacing=1e-3, tip_left=deflection_m)
     predicted = np.degrees(chart.travel_at(s[on_seam]))
     return {

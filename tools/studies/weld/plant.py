@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.tools.studies.weld.budgets import Budget, planned_seam, roughness
@@ -53,6 +54,13 @@ class StudyRun:
         """Points (N,3) m of "torch", "robot" or "tip", the velocity "v", or the tool's axes "ahead" (x_T) and "left" (y_T)."""
         first = COLUMNS.index(f"{name}_x")
         return np.asarray(self.table[:, first : first + 3])
+
+    def angles(self, rows: NDArray[np.bool_] | NDArray[np.int64], up: Array) -> tuple[Array, Array]:
+        """Work and travel angle (n,) rad of the tool at these ticks, against surface normals (n,3)."""
+        left, ahead = (
+            np.arcsin(np.clip(np.sum(self.points(name)[rows] * up, axis=1), -1.0, 1.0)) for name in ("left", "ahead")
+        )
+        return left, ahead
 
     @property
     def phase(self) -> Phase:

@@ -30,9 +30,7 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
     up = line.up(np.clip(off.s, 0.0, line.length))
     if float(np.min(up @ up[0], initial=1.0)) < math.cos(_BENT_RAD):
         seen = on & (off.s <= line.length - config.tool.torch_offset_m)
-        lean, pitch = (
-            np.arcsin(np.clip(np.sum(run.points(name)[keep] * up, axis=1), -1.0, 1.0)) for name in ("left", "ahead")
-        )
+        lean, pitch = run.angles(keep, up)
         chart = chord_map(
             line, config.tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=config.delta_d_m
         )

@@ -61,6 +61,20 @@ READS: dict[str, Callable[[ControllerState], Any]] = {
     "is_steady": lambda c: c.arm.at_rest,
 }
 """Functions without arguments, by their URScript name."""
+CALCULATIONS: dict[str, Callable[..., Any]] = {
+    "pose_trans": lambda p_from, p_from_to: Pose(pose_of(matrix(p_from) @ matrix(p_from_to))),
+    "pose_inv": lambda p_from: Pose(pose_of(inverse(matrix(p_from)))),
+    "pose_dist": lambda pose_from, pose_to: math.dist(pose_from[:3], pose_to[:3]),
+    "point_dist": lambda p_from, p_to: math.dist(p_from[:3], p_to[:3]),
+    "norm": lambda a: math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a)),
+    "length": lambda v: len(v),
+    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(l)],  # noqa: E741  (URScript's own name)
+    "d2r": lambda d: math.radians(d),
+    "r2d": lambda r: math.degrees(r),
+    "pow": lambda base, exponent: float(base**exponent),
+    "to_str": lambda val: str(val),
+}
+"""Functions of their arguments alone, by their URScript name, with URScript's argument names."""
 REGISTERS = {
     f"read_{bank}_{kind}_register": (f"{bank}s", numbers, count)
     for bank in ("input", "output")
@@ -148,12 +162,6 @@ class Answers:
         except InputError as error:
             raise ScriptError(str(error)) from error
 
-    def pose_trans(self, p_from: Any, p_from_to: Any) -> Pose:
-        return Pose(pose_of(matrix(p_from) @ matrix(p_from_to)))
-
-    def pose_inv(self, p_from: Any) -> Pose:
-        return Pose(pose_of(inverse(matrix(p_from))))
-
     def pose_add(self, p_1: Any, p_2: Any) -> Pose:
         X, Y = matrix(p_1), matrix(p_2)
         X[:3, :3] = X[:3, :3] @ Y[:3, :3]
@@ -165,12 +173,6 @@ class Answers:
         X[:3, :3] = X[:3, :3] @ Y[:3, :3].T
         X[:3, 3] -= Y[:3, 3]
         return Pose(pose_of(X))
-
-    def pose_dist(self, pose_from: Any, pose_to: Any) -> float:
-        return math.dist(pose_from[:3], pose_to[:3])
-
-    def point_dist(self, p_from: Any, p_to: Any) -> float:
-        return math.dist(p_from[:3], p_to[:3])
 
     def is_within_safety_limits(self, pose: Any) -> bool:
         if isinstance(pose, Pose):
@@ -195,27 +197,6 @@ class Answers:
 
     def get_standard_digital_in(self, n: int) -> bool:
         return bool(self._controller.terminals.digital_inputs >> register_index(n, 8) & 1)
-
-    def norm(self, a: Any) -> float:
-        return math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a))
-
-    def length(self, v: Any) -> int:
-        return len(v)
-
-    def integer_to_binary_list(self, x: int, l: int = 32) -> list[bool]:  # noqa: E741  (URScript's own name)
-        return [bool(x >> i & 1) for i in range(l)]
-
-    def d2r(self, d: float) -> float:
-        return math.radians(d)
-
-    def r2d(self, r: float) -> float:
-        return math.degrees(r)
-
-    def pow(self, base: float, exponent: float) -> float:
-        return float(base**exponent)
-
-    def to_str(self, val: Any) -> str:
-        return str(val)
 
     def textmsg(self, s1: Any, s2: Any = "") -> None:
         self._controller.note(f"script: {s1}{s2}")

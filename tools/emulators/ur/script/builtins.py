@@ -12,7 +12,7 @@ from typing import Any
 
 from weldcal.tools.emulators.ur.controller.registers import register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
-from weldcal.tools.emulators.ur.script.answers import READS, REGISTERS, Answers
+from weldcal.tools.emulators.ur.script.answers import CALCULATIONS, READS, REGISTERS, Answers
 from weldcal.tools.emulators.ur.script.dynamics import Dynamics
 from weldcal.tools.emulators.ur.script.motions import Motions
 from weldcal.tools.emulators.ur.script.program import Program
@@ -33,6 +33,7 @@ SINCE = {
     ),
     **dict.fromkeys((name for name in vars(Dynamics) if not name.startswith("_")), ((5, 23), (10, 9))),
 }
+MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sqrt", "floor", "ceil", "log")
 NO_EFFECT: dict[str, int | None] = {
     **dict.fromkeys(("force_mode", "end_force_mode", "force_mode_set_damping", "force_mode_set_gain_scaling")),
     **dict.fromkeys(("freedrive_mode", "end_freedrive_mode", "teach_mode", "end_teach_mode", "direct_torque", "popup")),
@@ -61,8 +62,7 @@ def script_functions(
     }
     named |= {name: _read(controller, name, read) for name, read in READS.items() if known(name)}
     named |= {name: _register(controller, *bank) for name, bank in REGISTERS.items()}
-    named |= {name: _real(getattr(math, name)) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")}
-    named |= {name: _real(getattr(math, name)) for name in ("sqrt", "floor", "ceil", "log")}
+    named |= {name: _real(getattr(math, name)) for name in MATH} | CALCULATIONS
     return named, BLOCKING
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from weldcal.tools.emulators.ur.script import syntax
 from weldcal.tools.emulators.ur.script.lexer import Token, tokenize
 from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
@@ -246,32 +248,33 @@ class _Parser:
         self.expect("(")
         arguments: list[Expression] = []
         keywords: list[tuple[str, Expression]] = []
-        self.skip_newlines()
-        while not self.at(")"):
+
+        def take_one() -> None:
             following = self._tokens[min(self._position + 1, len(self._tokens) - 1)]
             if self.token.kind == "word" and following.text == "=":
                 key = self.word()
                 self.take()
                 keywords.append((key, self.expression()))
+            elif keywords:
+                raise self.error("a positional argument after a named one")
             else:
-                if keywords:
-                    raise self.error("a positional argument after a named one")
                 arguments.append(self.expression())
-            self.skip_newlines()
-            if not self.at(")"):
-                self.expect(",")
-                self.skip_newlines()
-        self.expect(")")
+
+        self.listed(")", take_one)
         return syntax.Call(name, tuple(arguments), tuple(keywords))
 
     def items(self, closing: str) -> tuple[Expression, ...]:
         found: list[Expression] = []
+        self.listed(closing, lambda: found.append(self.expression()))
+        return tuple(found)
+
+    def listed(self, closing: str, take_one: Callable[[], object]) -> None:
+        """Items with commas between them, newlines allowed, up to and with the closing sign."""
         self.skip_newlines()
         while not self.at(closing):
-            found.append(self.expression())
+            take_one()
             self.skip_newlines()
             if not self.at(closing):
                 self.expect(",")
                 self.skip_newlines()
         self.expect(closing)
-        return tuple(found)
