@@ -12,9 +12,8 @@ from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.flanges import STANDARDS, face_points, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.flange.coverage import study_coverage
-from weldcal.tools.studies.flange.found import study_frames
+from weldcal.tools.studies.flange.found import WAYS, hidden_frame, study_frames, study_hidden
 from weldcal.tools.studies.flange.frames import facing, flange_frame
-from weldcal.tools.studies.flange.hidden import WAYS, hidden_frame, study_hidden
 
 Array = NDArray[np.float64]
 ISO_50 = "iso9409-1-50-4-m6"

@@ -23,8 +23,14 @@ from weldcal.models.flanges import face_points, get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.flange.published.clouds import METHODS, study_clouds
 from weldcal.tools.studies.flange.published.command import find_datasets, title
-from weldcal.tools.studies.flange.published.kinect import PAPER_E_XYZ_MM, paper_error, study_kinect
-from weldcal.tools.studies.flange.published.pairs import find_pools, load_runs, study_pairs
+from weldcal.tools.studies.flange.published.pairs import (
+    PAPER_E_XYZ_MM,
+    find_pools,
+    load_runs,
+    paper_error,
+    study_kinect,
+    study_pairs,
+)
 from weldcal.tools.studies.flange.published.simulation import (
     X_BC_TRUE,
     algorithm1_batch,

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.profiler.command import ProfilerStudyOptions, run_profiler_study
+from weldcal.tools.studies.profiler.command import run_profiler_study
 from weldcal.tools.studies.profiler.edge import edge_rows
-from weldcal.tools.studies.profiler.fixed import fixed_lines, told
+from weldcal.tools.studies.profiler.fixed import figure_text, fixed_lines
 from weldcal.tools.studies.profiler.pieces import groove_mesh, scan_groove
+from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
 from weldcal.tools.studies.profiler.sets import made_edge_trials
 from weldcal.tools.studies.profiler.sphere import METHODS, WorldData, measure
 from weldcal.tools.studies.profiler.worlds import SphereWorld, sphere_trial
@@ -62,7 +63,7 @@ def test_a_fixed_file_that_is_missing_is_named_before_any_work(tmp_path: Path) -
     [(0.0, "of 12", "0 of 12"), (3.0, "points", "3 points"), (0.1234, "mm", "0.123 mm"), (2.6e-13, "deg", "2.6e-13 deg"), (5.918, "", "5.918")],
 )  # fmt: skip
 def test_a_figure_is_told_with_its_unit(value: float, unit: str, text: str) -> None:
-    assert told(value, unit) == text
+    assert figure_text(value, unit) == text
 
 
 def test_everything_random_follows_from_the_seed() -> None:

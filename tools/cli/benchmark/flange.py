@@ -117,7 +117,7 @@ def hidden(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-hidden") as progress:
         from weldcal.models.flanges import get_flange
         from weldcal.models.scanners import get_scanner
-        from weldcal.tools.studies.flange.hidden import WAYS, study_hidden
+        from weldcal.tools.studies.flange.found import WAYS, study_hidden
 
         scanner, standard = get_scanner("phoxi_m", width), get_flange(flange)
         rows = [study_hidden(w, scanner, standard, count, share=share, seed=seed, progress=progress) for w in WAYS]
@@ -213,8 +213,7 @@ def live(
         import numpy as np
 
         from weldcal.tools.report.render import write_atomic
-        from weldcal.tools.studies.flange.live_redraw import joined
-        from weldcal.tools.studies.flange.live_target import TARGET_M, TARGET_RAD, live_picture, study_live
+        from weldcal.tools.studies.flange.live import TARGET_M, TARGET_RAD, joined, live_picture, study_live
 
         rows = study_live(
             seeds, first=seed, scans=scans, repeatability_mm=repeatability, redraws=redraws, progress=progress
@@ -280,7 +279,7 @@ def ingredients(
     ):
         import numpy as np
 
-        from weldcal.tools.studies.flange.ingredients import study_ingredients
+        from weldcal.tools.studies.flange.recorded import study_ingredients
 
         found = study_ingredients(dataset, seed, progress)
         rows: list[dict[str, object]] = []
@@ -320,7 +319,7 @@ def few(
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark flange-few") as progress:
         import numpy as np
 
-        from weldcal.tools.studies.flange.few_scans import study_few_scans
+        from weldcal.tools.studies.flange.recorded import study_few_scans
 
         found = study_few_scans(dataset, draws, seed, progress=progress)
         rows: list[dict[str, object]] = []

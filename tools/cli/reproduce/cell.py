@@ -40,7 +40,7 @@ def cell(
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.cell.tables import print_cell_study
+        from weldcal.tools.studies.cell.study import print_cell_study
 
         print_cell_study(study)
     if not study.met:

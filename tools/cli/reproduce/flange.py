@@ -35,15 +35,15 @@ def flange(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce flange") as progress:
-        from weldcal.tools.studies.flange.published.command import StudyOptions, run_study
-        from weldcal.tools.studies.flange.published.rows import summary
+        from weldcal.tools.studies.flange.published.command import run_study
+        from weldcal.tools.studies.flange.published.results import StudyOptions
 
         folder = out or fresh_folder("reproduce", "flange", seed)
         study = run_study(StudyOptions(folder, data, seed, quick), progress)
-        found = summary(study)
+        found = study.summary()
     if json:
         console.emit_json(found)
         return
-    from weldcal.tools.studies.flange.published.tables import print_study
+    from weldcal.tools.studies.flange.published.report import print_study
 
     print_study(study)

@@ -49,7 +49,8 @@ def weld(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce weld") as progress:
-        from weldcal.tools.studies.weld.command import StudyOptions, run_study
+        from weldcal.tools.studies.weld.command import run_study
+        from weldcal.tools.studies.weld.results import StudyOptions
 
         wanted = tuple(name.strip() for name in rows.split(",") if name.strip())
         folder = out or fresh_folder("reproduce", "weld", seed)
@@ -57,7 +58,7 @@ def weld(
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.weld.tables import print_study
+        from weldcal.tools.studies.weld.report import print_study
 
         print_study(study)
     if not study.met:
@@ -85,18 +86,17 @@ def profiler(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce profiler") as progress:
-        from weldcal.tools.studies.profiler.command import ProfilerStudyOptions, run_profiler_study
+        from weldcal.tools.studies.profiler.command import run_profiler_study
+        from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
 
         folder = out or fresh_folder("reproduce", "profiler", seed)
         study = run_profiler_study(ProfilerStudyOptions(folder, data, seed, quick), progress)
     if json:
         console.emit_json(study.summary())
     else:
-        from weldcal.tools.studies.profiler.fixed import told
+        from weldcal.tools.studies.profiler.fixed import figure_text
 
-        rows = {
-            what: f"{told(v, unit)}, target {limit:g}: {verdict}" for what, unit, v, limit, verdict in study.targets()
-        }
+        rows = {t.what: f"{figure_text(t.value, t.unit)}, target {t.limit:g}: {t.verdict}" for t in study.targets()}
         console.emit_summary("reproduce profiler: done", {**rows, "written to": str(folder)})
     if not study.met:
         console.emit_warning(

@@ -41,16 +41,15 @@ def reproduce_tablet(
     from weldcal.tools.cli.options import fresh_folder
 
     with console.boundary(json_wanted=json, debug=debug), console.progress_bar("reproduce tablet") as progress:
-        from weldcal.tools.studies.tablet.command import TabletOptions, run_tablet_study
+        from weldcal.tools.studies.tablet.command import run_tablet_study
+        from weldcal.tools.studies.tablet.results import TabletOptions, limit_words
 
         folder = out or fresh_folder("reproduce", "tablet", seed)
         study = run_tablet_study(TabletOptions(folder, seed, evolution_seeds, trials), progress)
     if json:
         console.emit_json(study.summary())
     else:
-        rows = {
-            what: f"{value:.4f}  ({limit}: {'met' if met else 'MISSED'})" for what, value, limit, met in study.targets
-        }
+        rows = {t.what: f"{t.value:.4f}  ({limit_words(t)}: {t.verdict})" for t in study.targets}
         minutes = study.cost.published / 60.0
         rows["the paper's 1e8 evaluations"] = f"{minutes:.0f} min, extrapolated from one"
         console.emit_summary("reproduce tablet: done", {**rows, "written to": str(folder)})

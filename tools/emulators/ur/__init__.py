@@ -1,1 +1,1 @@
-"""A Universal Robots controller on loopback: it runs the URScript it is sent and lies only where a test asks it to."""
+"""Emulated Universal Robots controller on loopback: runs URScript and injects faults that a test asks for."""

@@ -1,4 +1,4 @@
-"""The invariant checker: records every frame's motion and says whether the arm moved when nobody asked it to."""
+"""Invariant checker: records the motion of every frame and counts motions without a command."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The emulator's process: every port, one loop, 500 frames a second."""
+"""Process of the emulator: opens every port and runs 500 control frames a second."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def run_emulator(
     parent: int | None = None,
     ready: Callable[[str], None] | None = None,
 ) -> None:
-    """Runs until it is told to quit, by signal or on the control channel, or until process `parent` is gone.
+    """Runs until it is asked to quit, by signal or on the control channel, or until process `parent` is gone.
 
     Args:
         host: the loopback address to listen on.
@@ -116,9 +116,7 @@ class _Emulator:
         if ready is not None:
             ready(self._sentence)
         gc.freeze()
-        with suppress(
-            OSError
-        ):  # a controller has a computer of its own: run before everything else, where that is allowed
+        with suppress(OSError):  # a controller has a computer of its own: run first, where that is allowed
             os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
         try:
             self._loop(parent)
@@ -175,7 +173,7 @@ def _alive(process: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass
     return True
 
 
@@ -197,17 +195,7 @@ def main() -> None:
         sys.stdout.flush()
 
     try:
-        run_emulator(
-            host=options.host,
-            control_port=options.control_port,
-            polyscope=options.polyscope,
-            kinematics=options.kinematics,
-            q=tuple(options.q),
-            pace=options.pace,
-            seed=options.seed,
-            parent=options.parent,
-            ready=ready,
-        )
+        run_emulator(**vars(options) | {"q": tuple(options.q)}, ready=ready)
     except WeldcalError as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(1)

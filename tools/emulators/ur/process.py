@@ -1,4 +1,4 @@
-"""An emulated controller as a child process: one at a time per loopback address, and always ended."""
+"""Starts an emulated controller as a child process, one at a time per loopback address, and always ends it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PolyScope versions that the emulator can pretend to be, and what depends on them."""
+"""PolyScope versions that can be emulated, and the features that depend on them."""
 
 from __future__ import annotations
 

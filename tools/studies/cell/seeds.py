@@ -1,9 +1,7 @@
-"""The demo over many seeds: does every run end done, and how far off are calibration and torch, at worst."""
+"""Runs the demo over many seeds: how many runs end done, and the worst errors of calibration and torch."""
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +11,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.demo import run_demo
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import csv_text
 
 COLUMNS = (
     "seed", "state", "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "expected_error_mm",
@@ -31,18 +30,10 @@ def run_seeds(scenario: str, out: Path, seeds: range, progress: Progress = no_pr
         folder = out / f"seed{seed:02d}"
         options = replace(RunOptions(scenario, folder, seed), recording=False)
         rows.append(run_demo(options, lambda stage, share, k=k: progress(stage, (k + share) / len(seeds))).summary())  # type: ignore[misc]
-        write_atomic(out / "seeds.csv", _table(rows))
+        write_atomic(out / "seeds.csv", csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows)))
     worst = {
         f"worst_{name}": float(np.max([float(row[name]) for row in rows if name in row], initial=0.0))  # type: ignore[arg-type]
         for name in COLUMNS[2:-1]
     }
     done = sum(row["state"] == "done" for row in rows)
     return {"state": "done" if done == len(rows) else "held", "runs": len(rows), "runs_done": done, **worst}
-
-
-def _table(rows: list[dict[str, object]]) -> str:
-    table = io.StringIO()
-    writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return table.getvalue()

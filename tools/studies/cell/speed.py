@@ -1,4 +1,4 @@
-"""How fast the whole cell runs: the S groove with the finger camera on, phase by phase, against the wall clock."""
+"""Measures the real-time factor of the whole cell, phase by phase, on the S groove with the finger camera on."""
 
 from __future__ import annotations
 

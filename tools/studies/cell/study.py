@@ -1,12 +1,9 @@
-"""The weld in the cell, over seeds: contact and rendered tag against the truth, and how fast the whole of it runs."""
+"""Runs the weld in the whole simulated cell over seeds: seam points and torch against the truth, and speed."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +15,12 @@ from weldcal.systems.runner import Progress, no_progress, run_cell
 from weldcal.systems.scenario.loading import scenario_names
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import known_camera, measure
-from weldcal.tools.console import plain
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.render import fixed, write_atomic
+from weldcal.tools.studies.output import print_note, print_table, records_csv, write_json
+from weldcal.tools.studies.targets import Target, print_targets
 from weldcal.welding.servo.laws import get_law
 
 Array = NDArray[np.float64]
@@ -33,7 +31,7 @@ TARGETS = (
     ("torch_max_mm", "worst", 0.3, "mm"),
     ("real_time_factor", "mean", 1.0, ""),
 )
-AT_LEAST = ("real_time_factor",)
+AT_LEAST = WALL_CLOCK = ("real_time_factor",)
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,10 @@ class CellStudy:
 
     @property
     def met(self) -> bool:
-        """Whether all were completed and every target was met."""
-        return all(r.completed for r in self.runs) and all(ok for *_, ok in self.reached)
+        """Whether all were completed and every target met; the real-time factor depends on the machine and does not count."""
+        return all(r.completed for r in self.runs) and all(
+            ok for name, *_, ok in self.reached if name not in WALL_CLOCK
+        )
 
     def summary(self) -> dict[str, object]:
         """The result for JSON."""
@@ -94,7 +94,7 @@ class CellStudy:
             "met": self.met,
             "law": self.options.law,
             "targets": {name: {"value": value, "limit": limit, "met": ok} for name, value, limit, ok in self.reached},
-            "runs": [asdict(r) for r in self.runs],
+            "runs": self.runs,
             "wall_seconds": self.wall_seconds,
             "written_to": self.options.folder,
         }
@@ -136,15 +136,13 @@ def run_cell_study(options: CellStudyOptions, progress: Progress = no_progress) 
             weld_once(name, seed, options, lambda stage, share, at=done: progress(stage, at + share / len(jobs)))  # type: ignore[misc]
         )
         study = CellStudy(options, tuple(runs), time.monotonic() - start, hold_against(runs))
-        write_atomic(
-            options.folder / "table.json", json.dumps(plain(study.summary()), allow_nan=False, indent=1) + "\n"
-        )
-        write_atomic(options.folder / "runs.csv", _table(runs))
+        write_json(options.folder / "table.json", study.summary())
+        write_atomic(options.folder / "runs.csv", records_csv(runs))
     return study
 
 
 def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progress = no_progress) -> CellRun:
-    """One weld of a scenario whose scanner stands where the cell is told it does."""
+    """One weld of a scenario whose camera pose is known exactly."""
     scenario: Scenario = known_camera(name)
     scenario.welding.seam_length_mm = options.seam_mm
     scenario.welding.law = options.law
@@ -211,9 +209,41 @@ def hold_against(runs: list[CellRun]) -> tuple[tuple[str, float, float, bool], .
     return tuple(reached)
 
 
-def _table(runs: list[CellRun]) -> str:
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(asdict(runs[0])), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(r) for r in runs)
-    return table.getvalue()
+FIGURES = (
+    ("seam points, sd mm", "point_sd_mm", 4), ("seam points, offset mm", "point_offset_mm", 4),
+    ("their height, sd mm", "height_sd_mm", 3), ("their height, offset mm", "height_offset_mm", 3),
+    ("torch, mean mm", "torch_mean_mm", 3), ("torch, largest mm", "torch_max_mm", 3),
+    ("in space, largest mm", "space_max_mm", 3), ("torch speed CV %", "cv_percent", 2),
+    ("real-time factor of the weld", "real_time_factor", 2), ("CPU s per simulated s", "cpu_per_second", 2),
+)  # fmt: skip
+NAMES = {
+    "point_sd_mm": "seam points, sd", "torch_mean_mm": "torch, mean", "torch_max_mm": "torch, largest",
+    "real_time_factor": "real-time factor of the weld",
+}  # fmt: skip
+
+
+def print_cell_study(study: CellStudy) -> None:
+    """Write the tables on stdout."""
+    header = ("", *(f"{run.scenario.removesuffix('_groove')}\nseed {run.seed}" for run in study.runs))
+    print_table(
+        "", header, [(title, *(fixed(getattr(run, name), k) for run in study.runs)) for title, name, k in FIGURES]
+    )
+    for run in study.runs:
+        if not run.completed:
+            print_note(f"{run.scenario}, seed {run.seed}, was not completed: {run.reason}")
+    reached = {name: value for name, value, _, _ in study.reached}
+    targets = [
+        Target(
+            NAMES[name],
+            unit,
+            reached[name],
+            limit,
+            "≥" if name in AT_LEAST else "≤",
+            over=over,
+            decides=name not in WALL_CLOCK,
+        )
+        for name, over, limit, unit in TARGETS
+        if name in reached
+    ]
+    print_targets(f"Law: {study.options.law}", targets)
+    print_note(f"written to {study.options.folder}")

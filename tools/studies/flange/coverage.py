@@ -1,7 +1,8 @@
-"""Do the regions that a calibration states hold the truth as often as they say? Simulated calibrations by the hundred."""
+"""Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.stats import binom, chi2
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import CoplanarPoses
-from weldcal.calibration.eye_on_base.estimate import with_scanner
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, with_scanner
 from weldcal.calibration.eye_on_base.scanner_fit import from_motion
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.holes import HolePattern
@@ -25,13 +26,17 @@ from weldcal.tools.studies.flange.frames import facing
 
 Array = NDArray[np.float64]
 LEVEL = 0.95
+WORK_C = np.array([0.02, -0.05, 0.72])
+"""The work point (3,) m in the camera."""
+Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
+"""An estimate, the true X_BC, and where the estimate puts the work point (3,) m in B."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Of ``runs`` calibrations from ``poses`` sightings each: how often the truth lies within the stated 95 % region of
+    """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region of
     X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both means
-    over the runs, with the noise of the scan that is left out in both (NaN where that was not looked at). ``corrected``: with a
+    over the runs, with the noise of the held-out scan in both (NaN where that was not looked at). ``corrected``: with a
     scanner that is off in scale and gradient, and its correction."""
 
     poses: int
@@ -47,17 +52,17 @@ class Coverage:
         return float(low), float(high)
 
 
-def simulated_sightings(
+def simulated_observations(
     n: int, rng: np.random.Generator, *, sigma_m: float = 1e-4, sigma_rad: float = 1e-3
 ) -> tuple[list[Observation], RigidTransform]:
-    """Sightings (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``sigma_m`` and ``sigma_rad`` an
+    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``sigma_m`` and ``sigma_rad`` an
     axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
     are drawn again."""
     X_BC = RigidTransform(
         RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
     )
     while True:
-        out = [_simulated_sighting(f"p{k}", X_BC, rng, sigma_m, sigma_rad) for k in range(n)]
+        out = [_simulated_observation(f"p{k}", X_BC, rng, sigma_m, sigma_rad) for k in range(n)]
         try:
             check_diversity(np.array([o.p_BR for o in out]), np.ones(n, dtype=bool))
         except CoplanarPoses:
@@ -65,7 +70,7 @@ def simulated_sightings(
         return out, X_BC
 
 
-def _simulated_sighting(
+def _simulated_observation(
     id: str, X_BC: RigidTransform, rng: np.random.Generator, sigma_m: float, sigma_rad: float
 ) -> Observation:
     p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
@@ -85,11 +90,11 @@ WRONG = ScannerCorrection(1.002, (0.006, -0.004))
 
 
 def seen_by_a_wrong_scanner(
-    sightings: list[Observation], rng: np.random.Generator, *, sigma_ratio: float = 1e-3
+    observations: list[Observation], rng: np.random.Generator, *, sigma_ratio: float = 1e-3
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """The same sightings as a scanner makes them that needs WRONG, and the hole circle that it sees in each."""
+    """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
     out, patterns = [], {}
-    for o in sightings:
+    for o in observations:
         seen = as_measured(np.asarray(o.p_CR))
         J = WRONG.jacobian(seen)
         assert o.n_C is not None
@@ -110,28 +115,55 @@ def as_measured(p_C: Array) -> Array:
     return seen
 
 
+def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
+    """Calibrate ``runs`` times from ``poses`` simulated observations. Deterministic for ``seed``."""
+    stated, true = [], []
+
+    def calibrate(k: int) -> Calibrated:
+        observations, X_BC = simulated_observations(poses, np.random.default_rng([seed, poses, k]))
+        estimate = estimate_eye_on_base(observations, SolveConfig(seed=seed, hypotheses=60))
+        # the same noise as an observation of this run has, at a place that it did not use
+        other = np.random.default_rng([seed, poses, k, 2])
+        place = other.uniform(np.array([-0.18, -0.13, 0.5]), np.array([0.18, 0.13, 0.9]))
+        seen = place + 1e-4 * other.standard_normal(3) + 4e-5 * other.standard_normal(3)
+        true.append(float(np.linalg.norm(estimate.X_BC @ seen - X_BC @ place)))
+        stated.extend(estimate.held_out.position_m.tolist())
+        return estimate, X_BC, estimate.X_BC @ WORK_C
+
+    pose, point = _inside(calibrate, f"calibrations from {poses} scans", runs, progress)
+    return Coverage(poses, runs, pose, point, float(np.mean(stated) / np.mean(true)) if runs else np.nan)
+
+
 def study_corrected(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
-    """As study_coverage, with a scanner that is off and a correction from the same sightings. Deterministic for ``seed``."""
-    inside_pose, inside_point, done = 0, 0, 0
-    limits = chi2.ppf(LEVEL, 6), chi2.ppf(LEVEL, 3)
-    p_C = np.array([0.02, -0.05, 0.72])
-    for k in range(runs):
-        if k % 20 == 0:
-            progress(f"corrected calibrations from {poses} scans", k / runs)
+    """As study_coverage, with a scanner that is off and a correction from the same observations. Deterministic for ``seed``."""
+
+    def calibrate(k: int) -> Calibrated:
         rng = np.random.default_rng([seed, poses, k, 3])
-        sightings, X_BC = simulated_sightings(poses, rng)
-        sightings, patterns = seen_by_a_wrong_scanner(sightings, rng)
-        rigid = estimate_eye_on_base(sightings, SolveConfig(seed=seed, hypotheses=60, leave_one_out=False))
-        found = from_motion(sightings, patterns, usual=True, start=rigid.X_BC)
+        exact, X_BC = simulated_observations(poses, rng)
+        observations, patterns = seen_by_a_wrong_scanner(exact, rng)
+        rigid = estimate_eye_on_base(observations, SolveConfig(seed=seed, hypotheses=60, leave_one_out=False))
+        found = from_motion(observations, patterns, usual=True, start=rigid.X_BC)
         assert found.X_BC is not None
         estimate = with_scanner(rigid, found.correction, found.X_BC, found.joint, found.redundancy)
-        e = _error(estimate.X_BC, X_BC)
-        inside_pose += float(e @ np.linalg.solve(estimate.covariance, e)) < limits[0]
-        p_BQ = X_BC @ p_C
-        d = p_BQ - estimate.X_BC @ found.correction.points(as_measured(p_C))
-        inside_point += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < limits[1]
-        done += 1
-    return Coverage(poses, runs, inside_pose / done, inside_point / done, float("nan"), corrected=True)
+        return estimate, X_BC, estimate.X_BC @ found.correction.points(as_measured(WORK_C))
+
+    pose, point = _inside(calibrate, f"corrected calibrations from {poses} scans", runs, progress)
+    return Coverage(poses, runs, pose, point, float("nan"), corrected=True)
+
+
+def _inside(calibrate: Callable[[int], Calibrated], name: str, runs: int, progress: Progress) -> tuple[float, float]:
+    """Shares of calibrations whose 95 % regions of X_BC and of the work point hold the truth."""
+    inside = np.zeros(2)
+    for k in range(runs):
+        if k % 20 == 0:
+            progress(name, k / runs)
+        estimate, X_BC, found_BQ = calibrate(k)
+        e, p_BQ = _error(estimate.X_BC, X_BC), X_BC @ WORK_C
+        d = p_BQ - found_BQ
+        inside[0] += float(e @ np.linalg.solve(estimate.covariance, e)) < chi2.ppf(LEVEL, 6)
+        inside[1] += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < chi2.ppf(LEVEL, 3)
+    pose, point = inside / max(runs, 1)
+    return float(pose), float(point)
 
 
 def _error(X: RigidTransform, X_true: RigidTransform) -> Array:
@@ -146,7 +178,7 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     axes = figure.subplots(1, 2, sharey=True)
     low, high = studies[0].chance()
     for ax, corrected, title in zip(
-        axes, (False, True), ("a right scanner", "a scanner off by 0.2 %, corrected"), strict=True
+        axes, (False, True), ("an exact scanner", "a scanner off by 0.2 %, corrected"), strict=True
     ):
         chosen = [s for s in studies if s.corrected == corrected]
         n = [s.poses for s in chosen]
@@ -161,31 +193,3 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     axes[0].set_ylabel("inside the stated 95 % region, %")
     axes[0].legend(frameon=False, fontsize=9, loc="lower right")
     return svg(figure, *axes)
-
-
-def study_coverage(poses: int, runs: int, seed: int = 0, progress: Progress = no_progress) -> Coverage:
-    """Calibrate ``runs`` times from ``poses`` simulated sightings. Deterministic for ``seed``."""
-    inside_pose, inside_point = 0, 0
-    stated, true = [], []
-    limits = chi2.ppf(LEVEL, 6), chi2.ppf(LEVEL, 3)
-    for k in range(runs):
-        if k % 20 == 0:
-            progress(f"calibrations from {poses} scans", k / runs)
-        rng = np.random.default_rng([seed, poses, k])
-        sightings, X_BC = simulated_sightings(poses, rng)
-        estimate = estimate_eye_on_base(sightings, SolveConfig(seed=seed, hypotheses=60))
-        e = _error(estimate.X_BC, X_BC)
-        inside_pose += float(e @ np.linalg.solve(estimate.covariance, e)) < limits[0]
-        p_C = np.array([0.02, -0.05, 0.72])
-        p_BQ = X_BC @ p_C
-        d = p_BQ - estimate.X_BC @ p_C
-        inside_point += float(d @ np.linalg.solve(point_error_covariance(estimate, p_BQ), d)) < limits[1]
-        # the same noise as a sighting of this run has, at a place that it did not use
-        other = np.random.default_rng([seed, poses, k, 2])
-        place = other.uniform(np.array([-0.18, -0.13, 0.5]), np.array([0.18, 0.13, 0.9]))
-        seen = place + 1e-4 * other.standard_normal(3) + 4e-5 * other.standard_normal(3)
-        true.append(float(np.linalg.norm(estimate.X_BC @ seen - X_BC @ place)))
-        stated += estimate.held_out.position_m.tolist()
-    return Coverage(
-        poses, runs, inside_pose / runs, inside_point / runs, float(np.mean(stated) / np.mean(true)) if runs else np.nan
-    )

@@ -1,5 +1,4 @@
-"""Whole scanner frames with a flange whose place is known, or with none but much that resembles one: ray-cast, noisy,
-seeded."""
+"""Ray-cast scanner frames with a flange at a known pose, or with objects that resemble one."""
 
 from __future__ import annotations
 
@@ -120,13 +119,8 @@ def _surroundings(
     while len(out) < count + 1:
         size = rng.uniform(0.02, 0.12, 3)
         kind = int(rng.integers(3))
-        thing = (
-            box(*size)
-            if kind == 0
-            else _solid([(0.5 * size[0], 0.0), (0.5 * size[0], -size[1])])
-            if kind == 1
-            else _ball(0.5 * size[0])
-        )
+        radius = 0.5 * size[0]
+        thing = (box(*size), _solid([(radius, 0.0), (radius, -size[1])]), _ball(radius))[kind]
         z = rng.uniform(scanner.near_m + 0.05, far)
         half = 0.5 * z * np.array([scanner.width / scanner.fx, scanner.height / scanner.fy])
         p = np.array([rng.uniform(-half[0], half[0]), rng.uniform(-half[1], half[1]), z])

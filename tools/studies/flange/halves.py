@@ -1,4 +1,4 @@
-"""How far two parts of one cloud disagree about the flange's centre, and how far they must: the Cramer-Rao bound of its edges."""
+"""Difference between the flange's centres from two parts of one cloud, and its Cramer-Rao bound."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How fast the flange is found: ours, the paper's loop, an Open3D chain and a PCL-style random search, in one run."""
+"""Times the detection of the flange: weldcal, the paper's loop, an Open3D chain and a PCL-style random search."""
 
 from __future__ import annotations
 
@@ -113,37 +113,38 @@ def _circle(a: Array, b: Array, c: Array) -> tuple[Array, float]:
     return a + out, float(np.linalg.norm(out))
 
 
-def _paper_loop(points: Array, seed: int) -> Array | None:
-    """Section 2.1.4 as its Python program goes: draw, check the radius, count the points one by one."""
+def _search(points: Array, seed: int, count: Callable[[Array, float], int]) -> Array | None:
+    """Section 2.1.4: draw three points, check the circle's radius, count the points near it; the best centre."""
     rng = np.random.default_rng(seed)
-    best, count = None, 0
-    everything = points.tolist()
+    best, most = None, 0
     for _ in range(_K_MAX):
         center, radius = _circle(*points[rng.integers(0, len(points), 3)])
         if abs(radius - PAPER_RADIUS_M) > _E_R:
             continue
+        agree = count(center, radius)
+        if agree > most:
+            best, most = center, agree
+    return best
+
+
+def _paper_loop(points: Array, seed: int) -> Array | None:
+    """The search as the paper's Python program does it: points are counted one by one."""
+    everything = points.tolist()
+
+    def count(center: Array, radius: float) -> int:
         x, y, z = center.tolist()
         agree = 0
         for px, py, pz in everything:
             if abs(((px - x) ** 2 + (py - y) ** 2 + (pz - z) ** 2) ** 0.5 - radius) < _E_D:
                 agree += 1
-        if agree > count:
-            best, count = center, agree
-    return best
+        return agree
+
+    return _search(points, seed, count)
 
 
 def _ransac(points: Array, seed: int) -> Array | None:
-    """The same search with each candidate's count as one array operation, as PCL's SACMODEL_CIRCLE3D does in C++."""
-    rng = np.random.default_rng(seed)
-    best, count = None, 0
-    for _ in range(_K_MAX):
-        center, radius = _circle(*points[rng.integers(0, len(points), 3)])
-        if abs(radius - PAPER_RADIUS_M) > _E_R:
-            continue
-        agree = int((np.abs(np.linalg.norm(points - center, axis=1) - radius) < _E_D).sum())
-        if agree > count:
-            best, count = center, agree
-    return best
+    """The search with each count as one array operation, as PCL's SACMODEL_CIRCLE3D does in C++."""
+    return _search(points, seed, lambda c, r: int((np.abs(np.linalg.norm(points - c, axis=1) - r) < _E_D).sum()))
 
 
 def _open3d_chain(frame: Array, depth_m: float) -> Array | None:

@@ -1,4 +1,4 @@
-"""How good the hand-eye solvers are: others' data against OpenCV, outliers, invariance, uncertainty, AXB = YCZ, speed."""
+"""Benchmark of the hand-eye solvers: public data against OpenCV, outliers, invariance, uncertainty, AXB = YCZ, speed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.results import write_atomically
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.corners import refine_with_corners
 from weldcal.calibration.hand_eye.linearisation import Loss, Noise, Scaled
@@ -28,7 +27,9 @@ from weldcal.calibration.hand_eye.solve import (
 )
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.hand_eye.fuzz import fuzz
+from weldcal.tools.studies.output import markdown_table
 
 Array = NDArray[np.float64]
 
@@ -101,10 +102,9 @@ def dataset_row(name: str, F: Array, G: Array, truth: Array | None, *, opencv: b
     """Ours and OpenCV's on poses F X G = Y, held out on the same folds; without ``opencv`` its columns are NaN."""
     ours = solve_problem(full_problem(F, G))
     theirs = {m: opencv_held_out(m, F, G) for m in METHODS} if opencv else {}
-    deg = {m: h.rms_deg for m, h in theirs.items() if np.isfinite(h.rotation_rad).all()} or {"-": float("nan")}
-    mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()} or {
-        "-": float("nan")
-    }
+    none = {"-": float("nan")}
+    deg = {m: h.rms_deg for m, h in theirs.items() if np.isfinite(h.rotation_rad).all()} or none
+    mm = {m: 1e3 * h.rms_translation for m, h in theirs.items() if np.isfinite(h.translation).all()} or none
     by_deg, by_mm = min(deg, key=lambda m: deg[m]), min(mm, key=lambda m: mm[m])
     row = DatasetRow(
         name,
@@ -205,7 +205,7 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]
     all three unknowns, the worst error, and the rms error over all starts, both in units of the bound.
 
     The error of an unknown is the root of its squared error in units of the bound's covariance, per number. (An error
-    norm beside the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
+    norm compared with the root of a trace would fail a perfect estimator in 2 of 100 by chance.)
     """
     turn, shift = float(np.radians(0.02)), 1e-4
     ratios = []
@@ -223,16 +223,12 @@ def three_unknowns(starts: int = 100, seed: int = 0) -> tuple[int, float, float]
             row.append(float(np.sqrt(e @ np.linalg.solve(bound[s, s], e) / 6.0)))
         ratios.append(row)
     table = np.array(ratios)
-    return (
-        int((table.max(axis=1) < 2.0).sum()),
-        float(table.max()),
-        float(np.sqrt((table**2).mean(axis=0)).max()),
-    )
+    return int((table.max(axis=1) < 2.0).sum()), float(table.max()), float(np.sqrt((table**2).mean(axis=0)).max())
 
 
 def degenerate(seed: int = 0) -> dict[str, str]:
     """What is said of motions that cannot determine the answer: an error by its name, or the direction left open; "answer"
-    where a number came without a word."""
+    where a number came without a warning."""
     rng = np.random.default_rng(seed)
     problem, truth = simulated("eye_in_hand", 20, rng, float(np.radians(0.05)), 2e-4)
     X, Y = truth["X"], truth["Y"]
@@ -316,11 +312,9 @@ def run_hand_eye_benchmark(
     flagged = [r.flagged for r in report.rows if r.name == "handeye_calib_camodocal"]
     if flagged:
         report.checks["outlier of camodocal"] = (flagged == [(36,)], f"flagged {flagged[0]}")
-    told = degenerate(seed)
-    report.checks["degenerate motion"] = (
-        "answer" not in told.values(),
-        "; ".join(f"{k}: {v}" for k, v in told.items()),
-    )
+    verdict = degenerate(seed)
+    seen = "; ".join(f"{k}: {v}" for k, v in verdict.items())
+    report.checks["degenerate motion"] = ("answer" not in verdict.values(), seen)
     worlds = 3 if quick else 300
     verdicts = fuzz(worlds, seed)
     bad = sum(c["NAN"] + c["WRONG"] for c in verdicts.values())
@@ -342,10 +336,8 @@ def run_hand_eye_benchmark(
         report.checks[f"95 % region, {name}"] = (low <= share <= high, f"{100 * share:.1f} % of {trials}")
         progress(name, 0.5 + 0.1 * (k + 1))
     times = speed(200, 3 if quick else 15)
-    report.checks["speed, 200 poses"] = (
-        times["weldcal"] < 20.0,
-        ", ".join(f"{k} {v:.1f} ms" for k, v in times.items()),
-    )
+    seen = ", ".join(f"{k} {v:.1f} ms" for k, v in times.items())
+    report.checks["speed, 200 poses"] = (times["weldcal"] < 20.0, seen)
     return report
 
 
@@ -355,28 +347,31 @@ def _short(value: float | None) -> str:
 
 def write_table(report: HandEyeBenchmark, folder: Path) -> str:
     """Write hand_eye.md in ``folder`` and return its text."""
-    lines = [
-        "| set | n | held-out deg | best OpenCV | held-out mm | best OpenCV | flagged | open | holds |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for r in report.rows:
-        lines.append(
-            f"| {r.name} | {r.n} | {r.deg:.4f} | {r.best_deg:.4f} {r.best_deg_by} | {r.mm:.3f} | {r.best_mm:.3f} {r.best_mm_by} | "
-            f"{', '.join(map(str, r.flagged)) or '-'} | {'; '.join(r.unobservable) or '-'} | {'yes' if r.holds else 'NO' if np.isfinite(r.best_deg) else '-'} |"
+    header = ("set", "n", "held-out deg", "best OpenCV", "held-out mm", "best OpenCV", "flagged", "open", "holds")
+    rows = [
+        (r.name, f"{r.n}", f"{r.deg:.4f}", f"{r.best_deg:.4f} {r.best_deg_by}", f"{r.mm:.3f}",
+         f"{r.best_mm:.3f} {r.best_mm_by}", ", ".join(map(str, r.flagged)) or "-", "; ".join(r.unobservable) or "-",
+         "yes" if r.holds else "NO" if np.isfinite(r.best_deg) else "-")
+        for r in report.rows
+    ]  # fmt: skip
+    tables = [markdown_table(header, rows)]
+    truths = [
+        (
+            r.name,
+            f"{r.truth_deg:.4f}",
+            f"{r.truth_mm:.3f}",
+            f"{r.truth_nees:.1f}",
+            _short(r.truth_nees_corners),
+            r.corners,
         )
-    truths = [r for r in report.rows if r.truth_nees is not None]
+        for r in report.rows
+        if r.truth_nees is not None
+    ]
     if truths:
-        lines += [
-            "",
-            "| set | truth deg | truth mm | normalised error squared | with corners | |",
-            "|---|---|---|---|---|---|",
-        ]
-        lines += [
-            f"| {r.name} | {r.truth_deg:.4f} | {r.truth_mm:.3f} | {r.truth_nees:.1f} | {_short(r.truth_nees_corners)} | {r.corners} |"
-            for r in truths
-        ]
-    lines += ["", "| check | holds | seen |", "|---|---|---|"]
-    lines += [f"| {k} | {'yes' if ok else 'NO'} | {seen} |" for k, (ok, seen) in report.checks.items()]
-    text = "\n".join(lines) + "\n"
-    write_atomically(folder / "hand_eye.md", text)
+        tables.append(
+            markdown_table(("set", "truth deg", "truth mm", "normalised error squared", "with corners", ""), truths)
+        )
+    checks = [(name, "yes" if ok else "NO", seen) for name, (ok, seen) in report.checks.items()]
+    text = "\n".join([*tables, markdown_table(("check", "holds", "seen"), checks)])
+    write_atomic(folder / "hand_eye.md", text)
     return text

@@ -1,4 +1,4 @@
-"""Random worlds for the hand-eye solver: whatever comes, no NaN, no confident wrong number, and a mistake is named."""
+"""Random worlds for the hand-eye solver: no NaN, no confident wrong answer, mistakes are named."""
 
 from __future__ import annotations
 

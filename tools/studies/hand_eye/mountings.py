@@ -1,8 +1,7 @@
-"""weldcal benchmark mountings: every mounting live over several seeds, as the table of docs/hand_eye.md."""
+"""Benchmark of the mountings: every mounting scenario live over several seeds, as the table of docs/hand_eye.md."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,12 +15,13 @@ from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import markdown_table, write_json
 
 HEADER = (
-    "| scenario | runs | scans | point at best distance, mm: expected / true median / worst "
-    "| kept aside, mm: median / worst | unknown off the truth: worst mm, deg "
-    "| squared error per covariance: mean / worst (99.7 % bound) |\n|---|---|---|---|---|---|---|\n"
-)
+    "scenario", "runs", "scans", "point at best distance, mm: expected / true median / worst",
+    "held out, mm: median / worst", "unknown off the truth: worst mm, deg",
+    "squared error per covariance: mean / worst (99.7 % bound)",
+)  # fmt: skip
 
 
 def run_mountings(
@@ -33,12 +33,12 @@ def run_mountings(
         InputError: a scenario that is not a mounting job.
     """
     chosen = names or tuple(n for n in scenario_names() if job_of(load_scenario(n)).key == "mounting")
-    rows, table = [], HEADER
+    rows, failed_by = [], dict[str, list[str]]()
     for k, name in enumerate(chosen):
         if job_of(load_scenario(name)).key != "mounting":
             raise InputError(f"Scenario '{name}' has no mounting part; choose one that has.")
         reports: list[MountingReport] = []
-        failed: list[str] = []
+        failed = failed_by[name] = []
         for i, seed in enumerate(seeds):
             progress(f"{name}, seed {seed}", (k + i / len(seeds)) / len(chosen))
             options = RunOptions(scenario=name, out=folder / name / f"seed{seed}", seed=seed, recording=False)
@@ -51,31 +51,26 @@ def run_mountings(
                 reports.append(report)
             else:
                 failed.append(f"seed {seed}: {report.reason}")
-        row = _row(name, reports, failed)
-        rows.append(row)
-        table += _line(row)
+        rows.append(_row(name, reports, failed))
     summary: dict[str, object] = {
         "state": "done" if all(not row["failed"] for row in rows) else "failed",
         "seeds": list(seeds),
         "mountings": rows,
     }
-    failures = [f"{row['scenario']} {text}" for row in rows for text in _texts(row["failed"])]
+    failures = [f"{name} {text}" for name, texts in failed_by.items() for text in texts]
     if failures:
         summary["reason"] = failures[0]
-    write_atomic(folder / "mountings.json", json.dumps(summary, indent=2) + "\n")
+    table = markdown_table(HEADER, map(_line, rows))
+    write_json(folder / "mountings.json", summary)
     write_atomic(folder / "mountings.md", table)
     return summary, table
-
-
-def _texts(value: object) -> list[str]:
-    return [str(v) for v in value] if isinstance(value, list) else []
 
 
 def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[str, object]:
     if not reports:
         return {"scenario": name, "runs": 0, "failed": failed}
     work = np.array([r.work_error_mm() or np.nan for r in reports])
-    aside = np.array([1e3 * k.error_m for r in reports for k in r.status.kept_aside])
+    held_out = np.array([1e3 * k.error_m for r in reports for k in r.status.kept_aside])
     errors = [e for r in reports for e in r.truth_errors().values()]
     return {
         "scenario": name,
@@ -86,8 +81,8 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
         "expected_mm": float(np.median([1e3 * r.status.sigma_work_m for r in reports])),
         "work_median_mm": float(np.median(work)),
         "work_worst_mm": float(work.max()),
-        "aside_median_mm": float(np.median(aside)),
-        "aside_worst_mm": float(aside.max()),
+        "aside_median_mm": float(np.median(held_out)),
+        "aside_worst_mm": float(held_out.max()),
         "worst_mm": max(e.mm for e in errors),
         "worst_deg": max(e.deg for e in errors),
         "nees_mean": float(np.mean([e.nees for e in errors])),
@@ -97,13 +92,16 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
     }
 
 
-def _line(row: dict[str, object]) -> str:
+def _line(row: dict[str, object]) -> tuple[str, ...]:
     if row["runs"] == 0:
-        return f"| {row['scenario']} | 0 | - | - | - | - | - |\n"
+        return (str(row["scenario"]), "0", *("-",) * 5)
     r = {k: v for k, v in row.items() if isinstance(v, int | float)}
     return (
-        f"| {row['scenario']} | {r['runs']:.0f} | {r['scans']:.1f} "
-        f"| {r['expected_mm']:.3f} / {r['work_median_mm']:.3f} / {r['work_worst_mm']:.3f} "
-        f"| {r['aside_median_mm']:.3f} / {r['aside_worst_mm']:.3f} | {r['worst_mm']:.3f}, {r['worst_deg']:.4f} "
-        f"| {r['nees_mean']:.1f} / {r['nees_worst']:.1f} ({r['bound']:.1f}) |\n"
+        str(row["scenario"]),
+        f"{r['runs']:.0f}",
+        f"{r['scans']:.1f}",
+        f"{r['expected_mm']:.3f} / {r['work_median_mm']:.3f} / {r['work_worst_mm']:.3f}",
+        f"{r['aside_median_mm']:.3f} / {r['aside_worst_mm']:.3f}",
+        f"{r['worst_mm']:.3f}, {r['worst_deg']:.4f}",
+        f"{r['nees_mean']:.1f} / {r['nees_worst']:.1f} ({r['bound']:.1f})",
     )

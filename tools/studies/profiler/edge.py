@@ -1,4 +1,4 @@
-"""The edge paper's Tables 1 to 3 and what they do not show: the calibration's own error, for its method and for the joint one."""
+"""Tables 1 to 3 of the edge paper, and the calibration's own error, by its method and by the joint method."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge.joint import edge_crb, edge_joint
-from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial
 
@@ -22,10 +19,15 @@ TARGETS = {
     "tilt_paper": (0.32, 0.40),
     "xy_nominal": (0.116, 0.14),
     "tilt_nominal": (0.107, 0.132),
+    "free_paper": (0.36, 0.42),
+    "free_nominal": (0.107, 0.123),
+    "outlier_nominal": (0.071, 0.095),
 }
 TITLES = {
     "xy_paper": "level arcs, noise as in the paper", "tilt_paper": "tilted arcs, noise as in the paper",
     "xy_nominal": "level arcs, nominal noise", "tilt_nominal": "tilted arcs, nominal noise",
+    "free_paper": "40 free poses, noise as in the paper", "free_nominal": "40 free poses, nominal noise",
+    "outlier_nominal": "a tenth of outliers",
 }  # fmt: skip
 # Tables 1, 2 and 3 as printed: bar, scale, blade for 10, 15, 20, 25 rotations
 PRINTED_ALPHA = {10: (2.19, 3.10, 1.85), 15: (1.16, 0.74, 0.81), 20: (-1.03, 0.86, 0.84), 25: (-1.12, 0.73, 0.94)}
@@ -67,6 +69,20 @@ class EdgeRow:
         return bool(self.rotation_deg <= TARGETS[self.name][0] and self.translation_mm <= TARGETS[self.name][1])
 
 
+def edge_targets(names: Iterable[str]) -> list[tuple[str, str, float]]:
+    """(what, unit, limit) of rotation and translation, for each of these sets."""
+    return [
+        (f"edge, {TITLES[name]}, {part}", unit, limit)
+        for name in names
+        for part, unit, limit in zip(("rotation", "translation"), ("deg", "mm"), TARGETS[name], strict=True)
+    ]
+
+
+def edge_figures(name: str, values: Iterable[float]) -> dict[str, float]:
+    """Rotation and translation of a set, by the names of their targets."""
+    return {what: float(value) for (what, _, _), value in zip(edge_targets([name]), values, strict=True)}
+
+
 def edge_rows(
     name: str, trials: Iterable[EdgeTrial], progress: Callable[[float], None], counts: tuple[int, ...] = COUNTS
 ) -> list[EdgeRow]:
@@ -76,34 +92,20 @@ def edge_rows(
     for k, trial in enumerate(every):
         progress(k / len(every))
         for n in counts:
-            few = slice(0, n * TRANSLATIONS)
-            poses, points = trial.poses[few], trial.points[few]
-            sigma, xz = trial.noise.robot_m, trial.noise.xz_m
-            crb = edge_crb(trial.truth, poses.rotation, poses.translation, sigma_robot_m=sigma, sigma_xz_m=xz)
-            bound = [np.degrees(np.sqrt(np.trace(crb[:3, :3]))), 1e3 * np.sqrt(np.trace(crb[3:, 3:]))]
+            few = trial.first(n * TRANSLATIONS)
+            bound = few.bound()
             for method in METHODS:
-                if method == "paper":
-                    linear = edge_linear(
-                        poses.rotation, poses.translation, points, np.repeat(np.arange(n), TRANSLATIONS)
-                    )
-                    R, t = linear.rotation, linear.translation
-                else:
-                    e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=sigma, sigma_xz_m=xz)
-                    R, t = e.rotation, e.translation
-                off_deg = np.degrees(Rotation.from_matrix(trial.truth.rotation @ R.T).magnitude())
-                off_mm = 1e3 * np.linalg.norm(t - trial.truth.translation)
-                radius = _ball_radius_mm(trial, R, t)
-                found[n, method].append(np.array([off_deg, off_mm, *bound, *_criteria(poses, points, R, t), radius]))
+                found_pose = few.paper() if method == "paper" else few.joint()
+                R, t = found_pose.rotation, found_pose.translation
+                error, radius = few.error(R, t), _ball_radius_mm(trial, R, t)
+                one = (error.deg, error.mm, bound.deg, bound.mm, *_criteria(few.poses, few.points, R, t), radius)
+                found[n, method].append(np.array(one))
     rows = []
     for (n, method), values in found.items():
         v = np.array(values)
-        rms = np.sqrt((v[:, :4] ** 2).mean(axis=0))
-        alpha, alpha_std, d, d_std, radius = (float(x) for x in v[:, 4:9].mean(axis=0))
-        turn, shift, crb_deg, crb_mm = (float(x) for x in rms)
         off = float(np.abs(v[:, 8] - 20.0).mean())
-        rows.append(
-            EdgeRow(name, n, method, len(v), turn, shift, crb_deg, crb_mm, alpha, alpha_std, d, d_std, radius, off)
-        )
+        figures = [*np.sqrt((v[:, :4] ** 2).mean(axis=0)).tolist(), *v[:, 4:].mean(axis=0).tolist(), off]
+        rows.append(EdgeRow(name, n, method, len(v), *figures))
     return rows
 
 
@@ -122,7 +124,7 @@ def _criteria(poses: FlangePoses, points: Floats, R: Floats, t: Floats) -> tuple
 
 
 def _ball_radius_mm(trial: EdgeTrial, R: Floats, t: Floats) -> float:
-    """Radius of the sphere through all profiles of the ball, brought together by a calibration."""
+    """Radius of the sphere through all profiles of the ball, brought into one frame by a calibration."""
     if trial.ball is None or trial.ball_poses is None:
         return float("nan")
     at = ball_points(trial, R, t).reshape(-1, 3)
@@ -152,9 +154,5 @@ def all_sets(
     """Rows of the sets named."""
     rows: list[EdgeRow] = []
     for k, name in enumerate(names):
-
-        def part(share: float, k: int = k, name: str = name) -> None:
-            progress(name, (k + share) / len(names))
-
-        rows += edge_rows(name, trials_of(name), part)
+        rows += edge_rows(name, trials_of(name), lambda share, k=k: progress(names[k], (k + share) / len(names)))  # type: ignore[misc]
     return rows

@@ -1,4 +1,4 @@
-"""Workpieces under a profiler in a made world: the S-shaped V-groove and the boss, as meshes that its rays are cast onto."""
+"""Workpieces under a simulated profiler: meshes of the S-shaped V-groove and the frustum."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ class GrooveScan:
     q_touch: Floats
 
 
-def _seam(u: Floats, beside_m: float) -> Floats:
-    """Points (n, 2) at a distance beside the seam y = A sin(2 pi x / L)."""
+def _seam(u: Floats, offset_m: float) -> Floats:
+    """Points (n, 2) at a distance from the seam y = A sin(2 pi x / L)."""
     w = 2.0 * np.pi / LENGTH_M
     slope = SWING_M * w * np.cos(w * u)
     n = np.column_stack([-slope, np.ones_like(u)]) / np.hypot(1.0, slope)[:, None]
-    return np.asarray(np.column_stack([u, SWING_M * np.sin(w * u)]) + beside_m * n)
+    return np.asarray(np.column_stack([u, SWING_M * np.sin(w * u)]) + offset_m * n)
 
 
 def groove_mesh() -> TriMesh:
-    """Plate with the groove: strips ruled between lines beside the seam; its top at z = 0."""
+    """Plate with the groove: strips ruled between lines along the seam; its top at z = 0."""
     u = np.linspace(-0.05, LENGTH_M + 0.05, 1601)
     lines = [(-0.07, 0.0), (-HALF_M, 0.0), (0.0, -DEPTH_M), (HALF_M, 0.0), (0.07, 0.0)]
-    vertices = np.vstack([np.column_stack([_seam(u, beside), np.full(len(u), z)]) for beside, z in lines])
+    vertices = np.vstack([np.column_stack([_seam(u, offset), np.full(len(u), z)]) for offset, z in lines])
     n = len(u)
     k = np.arange(n - 1)
     quads = [(j * n + k, j * n + k + 1, (j + 1) * n + k + 1, (j + 1) * n + k) for j in range(len(lines) - 1)]
@@ -100,8 +100,8 @@ def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
     p[rng.random(p.shape[:2]) < 0.03] = np.nan
     fine = np.linspace(-0.05, LENGTH_M + 0.05, 40001)
     features, touched = np.empty((STATIONS, 3, 2)), np.empty((STATIONS, 3, 3))
-    for j, (beside, z) in enumerate(((-HALF_M, 0.0), (0.0, -DEPTH_M), (HALF_M, 0.0))):
-        line = np.column_stack([_seam(fine, beside), np.full(len(fine), z)]) @ turn.T + place
+    for j, (offset, z) in enumerate(((-HALF_M, 0.0), (0.0, -DEPTH_M), (HALF_M, 0.0))):
+        line = np.column_stack([_seam(fine, offset), np.full(len(fine), z)]) @ turn.T + place
         for k in range(STATIONS):
             one = FlangePoses(X.rotation[[k] * len(fine)], X.translation[[k] * len(fine)])
             y = (((line - one.translation[0]) @ one.rotation[0]) - world.translation) @ world.rotation
@@ -120,7 +120,7 @@ def scan_groove(world: SphereWorld, seed: int) -> GrooveScan:
 
 
 def scan_boss(world: SphereWorld, seed: int, profiles: int = 90) -> tuple[Floats, Floats]:
-    """Joints (n, 6) and raw profiles (n, m, 2) m of the boss, the line at 45 deg to its sides."""
+    """Joints (n, 6) and raw profiles (n, m, 2) m of the frustum, the line at 45 deg to its sides."""
     rng = np.random.default_rng([seed, 74])
     turn = Rotation.from_euler("z", 12.0, degrees=True).as_matrix()
     place = world.cell.boss

@@ -1,9 +1,8 @@
-"""The pictures of the profiler's study: the edge paper's Fig. 6 to 8, the seam's deviations and the boss."""
+"""Pictures of the profiler study: Fig. 6 to 8 of the edge paper, the seam's deviations and the frustum."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,10 +10,8 @@ from matplotlib.figure import Figure
 
 from weldcal.tools.report.plots_weld import OURS, PLANNED, svg
 from weldcal.tools.studies.profiler.edge import COUNTS, EdgeRow
+from weldcal.tools.studies.profiler.results import TargetLine
 from weldcal.tools.studies.profiler.sphere import METHODS, WorldResult
-
-if TYPE_CHECKING:
-    from weldcal.tools.studies.profiler.seeds import Line
 
 PAPER = PLANNED
 _COLOURS = {METHODS[0]: "black", METHODS[1]: PAPER, METHODS[2]: "#6aa5c9", METHODS[3]: OURS}
@@ -29,61 +26,58 @@ def _tidy(axes: Axes, x: str, y: str) -> None:
 def against_rotations(
     rows: list[EdgeRow], names: tuple[str, ...], what: str, label: str, titles: dict[str, str]
 ) -> bytes:
-    """Mean and standard deviation (bars) of a criterion over the number of rotations, a panel a set (Fig. 6 and 7)."""
-    picture = Figure(figsize=(7.2, 2.6), layout="constrained")
-    panels = np.atleast_1d(picture.subplots(1, len(names), sharey=True))
-    for axes, name in zip(panels, names, strict=True):
-        for method, colour, shift in (("paper", PAPER, -0.35), ("joint", OURS, 0.35)):
-            r = {x.rotations: x for x in rows if x.name == name and x.method == method}
-            mean = [getattr(r[n], f"{what}_mean_{label}") for n in COUNTS]
-            std = [getattr(r[n], f"{what}_std_{label}") for n in COUNTS]
+    """Mean and standard deviation (bars) of a criterion over the number of rotations, a panel per set (Fig. 6 and 7)."""
+
+    def draw(axes: Axes, found: dict[str, list[EdgeRow]]) -> None:
+        for (method, r), colour, shift in zip(found.items(), (PAPER, OURS), (-0.35, 0.35), strict=True):
+            mean, std = ([getattr(row, f"{what}_{part}_{label}") for row in r] for part in ("mean", "std"))
             low = np.minimum(std, mean)  # neither angle nor distance can be negative
-            axes.errorbar(
-                np.array(COUNTS) + shift,
-                mean,
-                yerr=[low, std],
-                color=colour,
-                marker="o",
-                ms=4,
-                lw=1.2,
-                capsize=3,
-                label=f"{method} method",
-            )
-        axes.set_xticks(COUNTS)
-        axes.set_title(titles[name], fontsize=9)
-        _tidy(axes, "rotations", "")
-    panels[0].set_ylabel({"deg": "angle to the edge, deg", "mm": "distance to the edge, mm"}[label])
-    picture.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2, frameon=False, fontsize=8
+            x, label_ = np.array(COUNTS) + shift, f"{method} method"
+            axes.errorbar(x, mean, yerr=[low, std], color=colour, marker="o", ms=4, lw=1.2, capsize=3, label=label_)
+
+    return _panels(
+        rows, names, titles, draw, {"deg": "angle to the edge, deg", "mm": "distance to the edge, mm"}[label]
     )
-    return svg(picture)
 
 
 def true_error(rows: list[EdgeRow], names: tuple[str, ...], titles: dict[str, str]) -> bytes:
-    """What the criteria hardly show: the pose's own rms error, with the Cramer-Rao bound."""
+    """The pose's own rms error, which the criteria hardly show, with the Cramer-Rao bound."""
+
+    def draw(axes: Axes, found: dict[str, list[EdgeRow]]) -> None:
+        for (method, r), colour in zip(found.items(), (PAPER, OURS), strict=True):
+            values = [x.translation_mm for x in r]
+            axes.semilogy(COUNTS, values, color=colour, marker="o", ms=4, lw=1.2, label=f"{method} method")
+        bound = [x.crb_mm for x in found["joint"]]
+        axes.semilogy(COUNTS, bound, color="black", lw=1.0, ls=":", label="Cramér-Rao bound")
+
+    return _panels(rows, names, titles, draw, "translation error, mm")
+
+
+def _panels(
+    rows: list[EdgeRow],
+    names: tuple[str, ...],
+    titles: dict[str, str],
+    draw: Callable[[Axes, dict[str, list[EdgeRow]]], None],
+    y: str,
+) -> bytes:
+    """A panel per set over the number of rotations; `draw` gets the rows of each method in the order of COUNTS."""
     picture = Figure(figsize=(7.2, 2.6), layout="constrained")
     panels = np.atleast_1d(picture.subplots(1, len(names), sharey=True))
     for axes, name in zip(panels, names, strict=True):
-        for method, colour in (("paper", PAPER), ("joint", OURS)):
-            r = {x.rotations: x for x in rows if x.name == name and x.method == method}
-            axes.semilogy(
-                COUNTS,
-                [r[n].translation_mm for n in COUNTS],
-                color=colour,
-                marker="o",
-                ms=4,
-                lw=1.2,
-                label=f"{method} method",
-            )
-        axes.semilogy(COUNTS, [r[n].crb_mm for n in COUNTS], color="black", lw=1.0, ls=":", label="Cramér-Rao bound")
+        by = {(x.method, x.rotations): x for x in rows if x.name == name}
+        draw(axes, {method: [by[method, n] for n in COUNTS] for method in ("paper", "joint")})
         axes.set_xticks(COUNTS)
         axes.set_title(titles[name], fontsize=9)
         _tidy(axes, "rotations", "")
-    panels[0].set_ylabel("translation error, mm")
-    picture.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False, fontsize=8
-    )
+    panels[0].set_ylabel(y)
+    _legend(picture, panels[0])
     return svg(picture)
+
+
+def _legend(picture: Figure, axes: Axes) -> None:
+    """One legend for all panels, over them."""
+    handles, labels = axes.get_legend_handles_labels()
+    picture.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 4), frameon=False, fontsize=8)
 
 
 def ball(points: np.ndarray) -> bytes:
@@ -111,14 +105,12 @@ def seam(results: list[WorldResult]) -> bytes:
         axes.set_title(title, fontsize=9, loc="left")
         _tidy(axes, "", "off, mm")
     panels[-1].set_xlabel("station along the seam")
-    picture.legend(
-        *panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=8
-    )
+    _legend(picture, panels[0])
     return svg(picture)
 
 
-def boss(result: WorldResult) -> bytes:
-    """The boss's cloud by the planes it was divided into, with the slanted edges that were measured (Fig. 7 and 8)."""
+def frustum(result: WorldResult) -> bytes:
+    """The frustum's cloud by plane, with the slanted edges that were measured (Fig. 7 and 8)."""
     assert result.cloud is not None
     assert result.boss is not None
     b, p = result.boss, result.cloud
@@ -137,7 +129,7 @@ def boss(result: WorldResult) -> bytes:
     return svg(picture)
 
 
-def over_seeds(lines: Sequence[Line]) -> bytes:
+def over_seeds(lines: Sequence[TargetLine]) -> bytes:
     """Every target over the seeds, each figure as a share of its target: seeds, bounds, and the fixed files."""
     picture = Figure(figsize=(7.6, 0.34 * len(lines) + 1.3), layout="constrained")
     axes = picture.add_subplot()
@@ -155,5 +147,5 @@ def over_seeds(lines: Sequence[Line]) -> bytes:
     axes.invert_yaxis()
     _tidy(axes, "reached over target", "")
     axes.set_xlim(left=0.0)
-    picture.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False, fontsize=8)
+    _legend(picture, axes)
     return svg(picture)

@@ -1,48 +1,46 @@
-"""The profiler study's report page: targets, then the tables of both papers with ours beside them, and the pictures."""
+"""Report page of the profiler study: targets, both papers' tables compared with ours, and pictures."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.profiler import edge, plots, sphere
-from weldcal.tools.studies.profiler.fixed import told
-
-if TYPE_CHECKING:
-    from weldcal.tools.studies.profiler.command import ProfilerStudy
+from weldcal.tools.studies.profiler.fixed import figure_text
+from weldcal.tools.studies.profiler.results import ProfilerStudy
 
 Lines = list[tuple[str, ...]]
 
 
 def target_lines(study: ProfilerStudy) -> Lines:
     """What, reached, target, verdict."""
-    return [(what, told(v, unit), f"≤ {limit:g} {unit}", verdict) for what, unit, v, limit, verdict in study.targets()]
+    return [(t.what, figure_text(t.value, t.unit), t.wanted, t.verdict) for t in study.targets()]
 
 
 def criteria_lines(study: ProfilerStudy) -> tuple[Lines, Lines, Lines]:
     """Tables 1 to 3 of the edge paper, over 10 to 25 rotations: as printed for its three objects, then every set and method."""
     n = edge.COUNTS
-    alpha: Lines = []
-    d: Lines = []
-    radius: Lines = []
+
+    def pair(mean: float, std: float, digits: int) -> str:
+        return f"{fixed(mean, digits)} ± {fixed(std, digits)}"
+
+    tables: tuple[Lines, Lines, Lines] = ([], [], [])
     for j, thing in enumerate(("bar", "scale", "blade")):
-        head = ("printed" if j == 0 else "", thing)
-        alpha.append(
-            (*head, *(f"{fixed(edge.PRINTED_ALPHA[k][j], 2)} ± {fixed(edge.PRINTED_ALPHA_STD[k][j], 2)}" for k in n))
-        )
-        d.append((*head, *(f"{fixed(edge.PRINTED_D[k][j], 2)} ± {fixed(edge.PRINTED_D_STD[k][j], 2)}" for k in n)))
-        radius.append((*head, *(fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)))
+        alpha = (pair(edge.PRINTED_ALPHA[k][j], edge.PRINTED_ALPHA_STD[k][j], 2) for k in n)
+        d = (pair(edge.PRINTED_D[k][j], edge.PRINTED_D_STD[k][j], 2) for k in n)
+        radius = (fixed(edge.PRINTED_RADIUS[k][j], 2) for k in n)
+        for table, cells in zip(tables, (alpha, d, radius), strict=True):
+            table.append(("printed" if j == 0 else "", thing, *cells))
     for name in study.names:
         for method in edge.METHODS:
-            r = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
-            head = (edge.TITLES[name] if method == edge.METHODS[0] else "", method)
-            alpha.append((*head, *(f"{fixed(r[k].alpha_mean_deg, 2)} ± {fixed(r[k].alpha_std_deg, 2)}" for k in n)))
-            d.append((*head, *(f"{fixed(r[k].d_mean_mm, 3)} ± {fixed(r[k].d_std_mm, 3)}" for k in n)))
-            radius.append((*head, *(fixed(r[k].radius_mm, 3) for k in n)))
-    return alpha, d, radius
+            by = {x.rotations: x for x in study.edge if (x.name, x.method) == (name, method)}
+            rows = [by[k] for k in n]
+            alpha = (pair(r.alpha_mean_deg, r.alpha_std_deg, 2) for r in rows)
+            d = (pair(r.d_mean_mm, r.d_std_mm, 3) for r in rows)
+            for table, cells in zip(tables, (alpha, d, (fixed(r.radius_mm, 3) for r in rows)), strict=True):
+                table.append((edge.TITLES[name] if method == edge.METHODS[0] else "", method, *cells))
+    return tables
 
 
 def error_lines(study: ProfilerStudy) -> Lines:
@@ -107,7 +105,7 @@ def profiler_report(study: ProfilerStudy) -> str:
         fig_error=plots.true_error(rows, study.names, _short()),
         fig_ball=plots.ball(study.ball),
         fig_seam=plots.seam(list(study.sphere)),
-        fig_boss=plots.boss(with_boss),
+        fig_boss=plots.frustum(with_boss),
         command="weldcal reproduce profiler" + (" --data FOLDER" if fixed_files else f" --seed {study.options.seed}") + (" --quick" if study.options.quick else ""),
         software=software_version(),
     )  # fmt: skip

@@ -1,87 +1,47 @@
-"""Every target of the profiler over many seeds: what was reached, what the bound allows, and where the fixed files stand."""
+"""Every target of the profiler study over many seeds: figures, their Cramer-Rao bounds, and the fixed files."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.profiler.edge.joint import edge_crb, edge_joint
-from weldcal.calibration.profiler.features.groove import groove_features
+from weldcal.calibration.profiler.arm_errors import ArmErrors, DhArm
+from weldcal.calibration.profiler.features.frustum import fit_frustum
+from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.calibration.profiler.record import ProfilerRecord
+from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joint
+from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
-from weldcal.tools.console import Progress, plain
+from weldcal.tools.console import Progress
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.profiler import edge
-from weldcal.tools.studies.profiler.bounds import world_bounds
-from weldcal.tools.studies.profiler.sets import EdgeTrial, fixed_edge_trials, made_edge_trials
+from weldcal.tools.studies.output import write_json
+from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
+from weldcal.tools.studies.profiler.plots import over_seeds
+from weldcal.tools.studies.profiler.results import Reached, TargetLine
+from weldcal.tools.studies.profiler.sets import EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 from weldcal.tools.studies.profiler.sphere import (
     METHODS,
     MM,
-    TARGET_BOSS,
-    TARGET_POINTS,
-    TARGET_SEAM,
     WorldData,
+    WorldResult,
+    cloud_of,
     fixed_worlds,
     joint_records,
     made_worlds,
     measured,
+    named_figures,
+    seam_features,
+    sphere_figures,
+    sphere_targets,
 )
 
 TRIALS = {"free": 20}
 WORLDS, GROOVES, BOSSES = 8, 3, 2
-EDGE_TARGETS = edge.TARGETS | {
-    "free_paper": (0.36, 0.42),
-    "free_nominal": (0.107, 0.123),
-    "outlier_nominal": (0.071, 0.095),
-}
-EDGE_TITLES = edge.TITLES | {
-    "free_paper": "40 free poses, noise as in the paper", "free_nominal": "40 free poses, nominal noise",
-    "outlier_nominal": "a tenth of outliers",
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Reached:
-    """One figure of one seed or of the fixed files: what was reached, and the bound where there is one (mm or deg)."""
-
-    value: float
-    bound: float | None
-
-
-@dataclass(frozen=True)
-class Line:
-    """One target over the seeds."""
-
-    what: str
-    unit: str
-    target: float
-    seeds: tuple[Reached, ...]
-    fixed: Reached | None
-
-    @property
-    def values(self) -> np.ndarray:
-        """Reached (n,), seed by seed."""
-        return np.array([r.value for r in self.seeds])
-
-    @property
-    def bounds(self) -> np.ndarray:
-        """Bounds (n,); not a number where there is none."""
-        return np.array([np.nan if r.bound is None else r.bound for r in self.seeds])
-
-    @property
-    def over_bound(self) -> float:
-        """All seeds together, root of the mean squares over the bound's."""
-        return float(np.sqrt(np.mean(self.values**2) / np.mean(self.bounds**2)))
-
-    @property
-    def met(self) -> int:
-        """In how many seeds the target is met."""
-        return int((self.values <= self.target).sum())
 
 
 @dataclass(frozen=True)
@@ -91,7 +51,7 @@ class SeedStudy:
     folder: Path
     first: int
     count: int
-    lines: tuple[Line, ...]
+    lines: tuple[TargetLine, ...]
     nees: float
     trials: int
     wall_seconds: float
@@ -132,89 +92,134 @@ def run_profiler_seeds(folder: Path, first: int, count: int, data: Path | None, 
     fixed: dict[str, Reached] = {}
     if data is not None:
         progress("fixed files", 0.0)
-        fixed = _all({n: fixed_edge_trials(data, n) for n in EDGE_TARGETS}, fixed_worlds(data, WORLDS), 0, [])
+        fixed = _all({n: fixed_edge_trials(data, n) for n in TARGETS}, fixed_worlds(data, WORLDS), 0, [])
     found: list[dict[str, Reached]] = []
     for k in range(count):
         progress(f"seed {first + k}", (k + 0.5) / (count + 0.5))
         seed = first + k
-        trials = {n: made_edge_trials(n, TRIALS.get(n.split("_")[0], 10), seed) for n in EDGE_TARGETS}
+        trials = {n: made_edge_trials(n, TRIALS.get(n.split("_")[0], 10), seed) for n in TARGETS}
         found.append(_all(trials, made_worlds(WORLDS, seed, GROOVES, BOSSES), seed, nees))
     lines = tuple(
-        Line(what, unit, target, tuple(f[what] for f in found), fixed.get(what)) for what, unit, target in targets()
+        TargetLine(what, unit, target, tuple(f[what] for f in found), fixed.get(what))
+        for what, unit, target in [*edge_targets(TARGETS), *sphere_targets()]
     )
     study = SeedStudy(folder, first, count, lines, float(np.mean(nees)), len(nees), time.monotonic() - start)
-    from weldcal.tools.studies.profiler.plots import over_seeds
-
-    write_atomic(folder / "seeds.json", json.dumps(plain(study.summary()), indent=1) + "\n")
+    write_json(folder / "seeds.json", study.summary())
     write_atomic(folder / "seeds.svg", over_seeds(study.lines).decode())
     return study
-
-
-def targets() -> list[tuple[str, str, float]]:
-    """(what, unit, target) of every line, in the order of the note's table."""
-    lines: list[tuple[str, str, float]] = []
-    for name, (turn, shift) in EDGE_TARGETS.items():
-        lines += [
-            (f"edge, {EDGE_TITLES[name]}, rotation", "deg", turn),
-            (f"edge, {EDGE_TITLES[name]}, translation", "mm", shift),
-        ]
-    lines += [(f"sphere, {method}", "mm", limit) for method, limit in TARGET_POINTS.items()]
-    names = ("first edge", "root", "second edge")
-    lines += [(f"seam, {name}", "mm", limit) for name, limit in zip(names, TARGET_SEAM, strict=True)]
-    return [*lines, ("boss, length (worst)", "mm", TARGET_BOSS[0]), ("boss, angle (worst)", "deg", TARGET_BOSS[1])]
 
 
 def _all(
     trials: dict[str, Iterator[EdgeTrial]], worlds: Iterable[WorldData], seed: int, nees: list[float]
 ) -> dict[str, Reached]:
-    found: dict[str, Reached] = {}
+    """Every figure and its bound; the squared errors in units of the bound are appended to `nees`."""
+    values: dict[str, float] = {}
+    bounds: dict[str, float] = {}
     for name, every in trials.items():
-        value, bound = _edge(every, nees)
-        for part, v, b in zip(("rotation", "translation"), value, bound, strict=True):
-            found[f"edge, {EDGE_TITLES[name]}, {part}"] = Reached(float(v), float(b))
-    return found | _sphere(worlds, seed)
+        errors, least = [], []
+        for trial in every:
+            e = trial.joint()
+            errors.append(trial.error(e.rotation, e.translation, trial.crb()))
+            least.append(trial.bound())
+        nees += [e.nees for e in errors]
+        values |= edge_figures(name, rms(errors))
+        bounds |= edge_figures(name, rms(least))
+    results, predicted = _sphere(worlds, seed)
+    values |= sphere_figures(results)
+    bounds |= predicted
+    return {what: Reached(values[what], bounds[what]) for what in values}
 
 
-def _edge(trials: Iterable[EdgeTrial], nees: list[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Rms error and bound (2,) deg and mm over the trials; the squared errors in units of the bound are appended."""
-    values, bounds = [], []
-    for trial in trials:
-        X, noise = trial.poses, trial.noise
-        e = edge_joint(X.rotation, X.translation, trial.points, sigma_robot_m=noise.robot_m, sigma_xz_m=noise.xz_m)
-        good = X if trial.wrong is None else X[~trial.wrong]
-        C = edge_crb(trial.truth, good.rotation, good.translation, sigma_robot_m=noise.robot_m, sigma_xz_m=noise.xz_m)
-        turn = Rotation.from_matrix(trial.truth.rotation @ e.rotation.T).as_rotvec()
-        off = np.concatenate([turn, trial.truth.translation - e.translation])
-        nees.append(float(off @ np.linalg.solve(C, off)))
-        values.append([off[:3] @ off[:3], off[3:] @ off[3:]])
-        bounds.append([np.trace(C[:3, :3]), np.trace(C[3:, 3:])])
-    unit = np.array([np.degrees(1.0), 1.0 / MM])
-    return unit * np.sqrt(np.mean(values, axis=0)), unit * np.sqrt(np.mean(bounds, axis=0))
-
-
-def _sphere(worlds: Iterable[WorldData], seed: int) -> dict[str, Reached]:
-    points: dict[str, list[float]] = {m: [] for m in METHODS[2:]}
-    seams, bosses = [], []
+def _sphere(worlds: Iterable[WorldData], seed: int) -> tuple[list[WorldResult], dict[str, float]]:
+    """Results of the joint methods, and the figures that their bounds predict."""
+    results: list[WorldResult] = []
     bound: dict[str, list[np.ndarray]] = {"points": [], "seam": [], "boss": []}
     for k, world in enumerate(worlds):
-        features = None
-        if world.groove is not None:
-            features = np.array([groove_features(p).points for p in world.groove.profiles])
+        features = seam_features(world)
         for method, record in joint_records(world).items():
-            result = measured(k, method, record, world, features, boss=method == METHODS[3])
-            points[method].append(float(result.points_mm.mean()))
-            if method == METHODS[3] and result.seam_mm is not None:
-                seams.append(result.seam_mm)
-            if result.boss_error is not None:
-                bosses.append(result.boss_error)
+            results.append(measured(k, method, record, world, features, boss=method == METHODS[3]))
         for name, value in world_bounds(world, features, 1000 * seed + k).items():
             bound[name].append(value)
-    foretold = float(np.mean(bound["points"]))
-    found = {f"sphere, {m}": Reached(float(np.mean(v)), foretold) for m, v in points.items()}
-    for name, value, b in zip(
-        ("first edge", "root", "second edge"), np.mean(seams, axis=0), np.mean(bound["seam"], axis=0), strict=True
-    ):
-        found[f"seam, {name}"] = Reached(float(value), float(b))
-    for name, value, b in zip(("length", "angle"), np.max(bosses, axis=0), np.max(bound["boss"], axis=0), strict=True):
-        found[f"boss, {name} (worst)"] = Reached(float(value), float(b))
+    points = float(np.mean(bound["points"]))
+    return results, named_figures(dict.fromkeys(METHODS[2:], points), bound["seam"], bound["boss"])
+
+
+# of the fixed files' worlds: what each error's sigma really is
+REAL = SphereSigmas(
+    sensor_m=0.05e-3, robot_m=0.04e-3, touch_m=0.04e-3, affine=0.01, joint_rad=np.radians(0.015), length_m=0.125e-3,
+    twist_rad=np.radians(0.01), tip_m=3.54e-3,
+)  # fmt: skip
+DRAWS, BOSS_DRAWS = 300, 6
+
+
+def changed(e: SphereEstimate, x: Floats) -> SphereEstimate:
+    """The estimate with all its unknowns (39,) moved."""
+    assert e.tip is not None
+    errors = ArmErrors.of(x[15:])
+    return replace(
+        e,
+        rotation=Rotation.from_rotvec(x[:3]).as_matrix() @ e.rotation,
+        translation=e.translation + x[3:6],
+        tip=e.tip + x[9:12],
+        affine=e.affine + x[12:15],
+        arm_errors=ArmErrors(
+            e.arm_errors.offsets + errors.offsets, e.arm_errors.sag + errors.sag, e.arm_errors.table + errors.table
+        ),
+    )
+
+
+def _apart(e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats) -> tuple[Floats, FlangePoses]:
+    """Vectors (n, 3) m from where the tip touches to where the sensor sees; and the flange at the views."""
+    assert e.tip is not None
+    X, touch = e.flange(arm, q), e.flange(arm, q_touch)
+    sensed = np.einsum("nij,nj->ni", X.rotation, e.points_F(seen)) + X.translation
+    return sensed - touch.rotation @ e.tip - touch.translation, X
+
+
+def predicted_mm(
+    e: SphereEstimate, arm: DhArm, q: Floats, seen: Floats, q_touch: Floats, rng: np.random.Generator
+) -> float:
+    """Mean distance that points seen and touched will have, by the bound and by the noise of seeing them."""
+    at, X = _apart(e, arm, q, seen, q_touch)
+    steps = 1e-3 * np.sqrt(np.diag(e.whole))
+    J = np.stack(
+        [(_apart(changed(e, h * u), arm, q, seen, q_touch)[0] - at) / h for h, u in zip(steps, np.eye(len(steps)), strict=True)],
+        axis=2,
+    )  # fmt: skip
+    R_BS = X.rotation @ e.rotation
+    plane = R_BS[:, :, [0, 2]]
+    C = J @ e.whole @ np.swapaxes(J, 1, 2)
+    C = C + REAL.sensor_m**2 * plane @ np.swapaxes(plane, 1, 2) + REAL.robot_m**2 * np.eye(3)
+    draws = np.linalg.cholesky(C)[:, None] @ rng.standard_normal((len(C), DRAWS, 3, 1))
+    return float(np.linalg.norm(draws[..., 0], axis=2).mean() / MM)
+
+
+def world_bounds(world: WorldData, features: Floats | None, seed: int) -> dict[str, Floats]:
+    """`points` (), `seam` (3,) mm and `boss` (2,) mm and deg that the bound predicts; the last two where the world has them."""
+    data, tests = world.trial.data, world.trial.tests
+    assert data.arm is not None
+    assert tests is not None
+    rng = np.random.default_rng([seed, 76])
+    e = sphere_joint(data, "affine+joints", REAL)
+    found = {"points": np.array(predicted_mm(e, data.arm, tests.q_view, tests.seen, tests.q_touch, rng))}
+    if world.groove is not None and features is not None:
+        g = world.groove
+        found["seam"] = np.array(
+            [predicted_mm(e, data.arm, g.q, features[:, j], g.q_touch[:, j], rng) for j in range(3)]
+        )
+    if world.boss is not None:
+        arm = data.arm
+        L = np.linalg.cholesky(e.whole)
+
+        def measured(estimate: SphereEstimate) -> Floats:
+            record = ProfilerRecord.of("", estimate, {}, "", arm)
+            assert world.boss is not None
+            b = fit_frustum(cloud_of(record, arm, *world.boss))
+            return np.array([b.hips_m / MM, np.degrees(b.dihedrals_rad)])
+
+        here = measured(e)
+        off = [
+            np.abs(measured(changed(e, L @ rng.standard_normal(len(L)))) - here).mean(axis=1) for _ in range(BOSS_DRAWS)
+        ]
+        found["boss"] = np.mean(off, axis=0)
     return found

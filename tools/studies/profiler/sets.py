@@ -1,15 +1,18 @@
-"""What the profiler's study calibrates from: grids of edge poses and a sphere per trial, from the fixed files or from seeds."""
+"""Edge trials of the profiler study: poses, points and truth, from the fixed files or made from seeds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
+from weldcal.calibration.profiler.edge.linear import EdgeLinear, edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
@@ -38,10 +41,24 @@ NOISE = {"nominal": EdgeNoise(0.03 * MM, 0.046 * MM, 0.05 * MM), "paper": EdgeNo
 SETS = ("xy_paper", "tilt_paper", "xy_nominal", "tilt_nominal")
 
 
+class EdgeError(NamedTuple):
+    """Error of a calibration: rotation deg, translation mm, normalised error squared of six numbers (NaN without covariance)."""
+
+    deg: float
+    mm: float
+    nees: float = float("nan")
+
+
 @dataclass(frozen=True, eq=False)
 class EdgeTrial:
-    """25 rotations of 10 translations each, the truth, and the profiles of a ball (60, m, 2) that the result is tried on; `wrong`: which
-    points (n,) are, where some are."""
+    """One calibration by an edge.
+
+    Attributes:
+        poses, points: flange poses (n) as reported and profile points (n, 2) m, usually 25 rotations of 10 translations.
+        truth, noise: of these.
+        ball_poses, ball: profiles of a ball (60, m, 2) m on which the result is tried, and the flange poses.
+        wrong: (n,) which points are outliers, where some are.
+    """
 
     poses: FlangePoses
     points: Floats
@@ -50,6 +67,54 @@ class EdgeTrial:
     ball_poses: FlangePoses | None = None
     ball: Floats | None = None
     wrong: NDArray[np.bool_] | None = None
+
+    def first(self, count: int) -> EdgeTrial:
+        """The trial with its first poses only."""
+        return replace(self, poses=self.poses[slice(0, count)], points=self.points[:count])
+
+    def joint(self, init: EdgeState | None = None) -> EdgeEstimate:
+        """The joint method's calibration."""
+        X, noise = self.poses, self.noise
+        return edge_joint(
+            X.rotation, X.translation, self.points, sigma_robot_m=noise.robot_m, sigma_xz_m=noise.xz_m, init=init
+        )
+
+    def paper(self) -> EdgeLinear:
+        """The calibration by the paper's method."""
+        group = np.repeat(np.arange(len(self.poses) // TRANSLATIONS), TRANSLATIONS)
+        return edge_linear(self.poses.rotation, self.poses.translation, self.points, group)
+
+    def crb(self) -> Floats:
+        """The Cramer-Rao bound (6, 6) of a calibration from the poses that are no outliers."""
+        X = self.poses if self.wrong is None else self.poses[~self.wrong]
+        return edge_crb(
+            self.truth, X.rotation, X.translation, sigma_robot_m=self.noise.robot_m, sigma_xz_m=self.noise.xz_m
+        )
+
+    def bound(self) -> EdgeError:
+        """The Cramer-Rao bound, as standard deviations of rotation and translation."""
+        return sigma_of(self.crb())
+
+    def error(self, rotation: Floats, translation: Floats, covariance: Floats | None = None) -> EdgeError:
+        """The error of a calibration."""
+        turn = Rotation.from_matrix(self.truth.rotation @ rotation.T).as_rotvec()
+        off = np.concatenate([turn, self.truth.translation - translation])
+        nees = np.nan if covariance is None else float(off @ np.linalg.solve(covariance, off))
+        return EdgeError(float(np.degrees(np.linalg.norm(turn))), float(np.linalg.norm(off[3:])) / MM, nees)
+
+
+def sigma_of(covariance: Floats) -> EdgeError:
+    """Standard deviations of rotation and translation from a covariance (6, 6)."""
+    turn, shift = np.sqrt(np.trace(covariance[:3, :3])), np.sqrt(np.trace(covariance[3:, 3:]))
+    return EdgeError(float(np.degrees(turn)), float(shift) / MM)
+
+
+def rms(errors: Sequence[EdgeError]) -> tuple[float, float]:
+    """Root mean squares of rotations (deg) and translations (mm); NaN for none."""
+    if not errors:
+        return float("nan"), float("nan")
+    deg, mm = (float(np.sqrt(np.mean([e[k] ** 2 for e in errors]))) for k in (0, 1))
+    return deg, mm
 
 
 def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
@@ -61,7 +126,7 @@ def fixed_edge_trials(folder: Path, name: str) -> Iterator[EdgeTrial]:
     files = folder / "edge_features.npz", folder / "edge_sphere.npz"
     for path in files:
         if not path.is_file():
-            raise InputError(f"There is no {path.name} in '{folder}': leave --data away to make trials from seeds.")
+            raise InputError(f"There is no {path.name} in '{folder}': omit --data to make trials from seeds.")
     kind, level = name.split("_")
     of = {"free": f"free40_{level}", "outlier": f"outlier10_{level}"}.get(kind, f"grid_{name}")
     with np.load(files[0]) as d, np.load(files[1]) as b:
@@ -135,8 +200,10 @@ def _outlier(_kind: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTria
 
 def _observed(poses: FlangePoses, truth: EdgeState, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:
     points = _noisy(predicted(truth, poses)[0], noise, rng)
-    told = FlangePoses(poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape))
-    return EdgeTrial(told, points, truth, noise)
+    reported = FlangePoses(
+        poses.rotation, poses.translation + noise.robot_m * rng.standard_normal(poses.translation.shape)
+    )
+    return EdgeTrial(reported, points, truth, noise)
 
 
 def _arcs(arc: str, noise: EdgeNoise, rng: np.random.Generator) -> EdgeTrial:

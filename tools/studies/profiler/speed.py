@@ -1,8 +1,7 @@
-"""How fast a profiler is calibrated by an edge without a guess, and who else finds the answer: the paper's method, a search."""
+"""Times the calibration of a profiler by an edge without a guess, the paper's method and a grid search."""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -13,15 +12,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.profiler.edge.joint import edge_joint
-from weldcal.calibration.profiler.edge.linear import edge_linear
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
-from weldcal.tools.console import Progress, plain
-from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials
+from weldcal.tools.console import Progress
+from weldcal.tools.studies.output import write_json
+from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
 SETS = 20
 SEARCHED = 5  # sets on which the search is tried
@@ -34,8 +31,7 @@ Answer = tuple[Floats, Floats]
 
 @dataclass(frozen=True)
 class SpeedRow:
-    """A method on sets of one kind: seconds (median and most; of the processor too, which other work does not lengthen), in how
-    many sets the optimum was found, rms error over the sets."""
+    """A method on sets of one kind: wall and processor seconds (median and largest), how often the optimum was found, rms error."""
 
     method: str
     poses: str
@@ -88,7 +84,7 @@ def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress:
         "slowest_processor_s": max(r.most_processor_s for r in free_rows),
         "target_s": TARGET_S,
     }
-    write_atomic(folder / "benchmark.json", json.dumps(plain(summary), indent=1) + "\n")
+    write_json(folder / "benchmark.json", summary)
     return summary
 
 
@@ -125,11 +121,11 @@ def _row(
         worked.append(time.process_time() - begun)
         if answer is None:
             continue
-        errors.append(_apart(answer, (trial.truth.rotation, trial.truth.translation)))
+        errors.append(trial.error(*answer))
         if best is not None:
             deg, mm = _apart(answer, best[k])
             found += bool(deg < SAME_DEG and mm < SAME_MM)
-    rms = np.sqrt(np.mean(np.square(errors), axis=0)) if errors else np.full(2, np.nan)
+    rotation_deg, translation_mm = rms(errors)
     return SpeedRow(
         method=method,
         poses=poses,
@@ -139,8 +135,8 @@ def _row(
         processor_s=float(np.median(worked)),
         most_processor_s=max(worked),
         found=None if best is None else found,
-        rotation_deg=float(rms[0]),
-        translation_mm=float(rms[1]),
+        rotation_deg=rotation_deg,
+        translation_mm=translation_mm,
     )
 
 
@@ -149,20 +145,13 @@ def _apart(a: Answer, b: Answer) -> tuple[float, float]:
     return float(turn), 1e3 * float(np.linalg.norm(a[1] - b[1]))
 
 
-def _joint(t: EdgeTrial) -> Answer:
-    X = t.poses
-    e = edge_joint(X.rotation, X.translation, t.points, sigma_robot_m=t.noise.robot_m, sigma_xz_m=t.noise.xz_m)
+def _joint(t: EdgeTrial, start: EdgeState | None = None) -> Answer:
+    e = t.joint(start)
     return e.rotation, e.translation
 
 
 def _from_truth(t: EdgeTrial) -> Answer:
-    return _from(t, t.truth)
-
-
-def _from(t: EdgeTrial, start: EdgeState) -> Answer:
-    X, noise = t.poses, t.noise
-    e = edge_joint(X.rotation, X.translation, t.points, sigma_robot_m=noise.robot_m, sigma_xz_m=noise.xz_m, init=start)
-    return e.rotation, e.translation
+    return _joint(t, t.truth)
 
 
 def _starts(t: EdgeTrial) -> None:
@@ -170,15 +159,14 @@ def _starts(t: EdgeTrial) -> None:
 
 
 def _paper(t: EdgeTrial) -> Answer:
-    group = np.repeat(np.arange(len(t.poses) // TRANSLATIONS), TRANSLATIONS)
-    e = edge_linear(t.poses.rotation, t.poses.translation, t.points, group)
+    e = t.paper()
     return e.rotation, e.translation
 
 
 def _paper_pairs(t: EdgeTrial) -> Answer:
     """Its translation from every pair of poses of different groups (Eq. 28 to 35), after its rotation."""
     group = np.repeat(np.arange(len(t.poses) // TRANSLATIONS), TRANSLATIONS)
-    e = edge_linear(t.poses.rotation, t.poses.translation, t.points, group)
+    e = t.paper()
     i, j = np.triu_indices(len(t.poses), 1)
     other = group[i] != group[j]
     i, j = i[other], j[other]
@@ -216,7 +204,7 @@ def _searched(t: EdgeTrial) -> Answer:
     turn, shift = np.asarray(Rotation.from_rotvec(best.x[:3]).as_matrix()), np.asarray(best.x[3:])
     at = np.einsum("nij,nj->ni", t.poses.rotation, p_S @ turn.T + shift) + t.poses.translation
     e = np.linalg.svd(at - at.mean(axis=0), full_matrices=False)[2][0]
-    return _from(t, EdgeState(turn, shift, at.mean(axis=0), e))
+    return _joint(t, EdgeState(turn, shift, at.mean(axis=0), e))
 
 
 def _off_line(x: Floats, poses: FlangePoses, p_S: Floats) -> Floats:

@@ -1,8 +1,8 @@
-"""The sphere paper's Tables 1 to 3: points, seam and boss, by its method before and after compensation and by the joint one."""
+"""Tables 1 to 3 of the sphere paper: points, seam and frustum, by the paper's method and by the joint method."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,13 +23,14 @@ from weldcal.tools.studies.profiler.worlds import SphereTests, SphereTrial, Sphe
 
 MM = 1e-3
 METHODS = ("linear", "compensated", "joint, affine", "joint, affine+joints")
-# as printed: mean deviations before and after (Table 1), after (Table 2), boss length and angle (Table 3)
+# as printed: mean deviations before and after (Table 1), after (Table 2), frustum length and angle (Table 3)
 PRINTED_POINTS = {"linear": (4.3132, 4.5731, 4.0331), "compensated": (0.8183, 0.7069, 0.6371)}
 PRINTED_SEAM = (0.4567, 0.6374, 0.4856)
 PRINTED_BOSS = (0.5071, 0.2145)
 TARGET_POINTS = {"joint, affine": 0.141, "joint, affine+joints": 0.110}
 TARGET_SEAM = (0.122, 0.219, 0.146)
 TARGET_BOSS = (0.042, 0.10)
+SEAM_FEATURES = ("first edge", "root", "second edge")
 HIP_MM, SLOPE_DEG = 50.0, float(np.degrees(np.arctan2(4.0, 3.0)))
 
 
@@ -45,7 +46,7 @@ class WorldData:
 
 @dataclass(frozen=True, eq=False)
 class WorldResult:
-    """Of one world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and the boss."""
+    """One world and method: mean |sensed - touched| (3,) mm of the points and of the seam's features, and the frustum."""
 
     world: int
     method: str
@@ -56,12 +57,39 @@ class WorldResult:
     cloud: Floats | None
 
     @property
-    def boss_error(self) -> tuple[float, float] | None:
-        """Mean error of the slanted edges mm and of the slopes deg."""
+    def boss_error(self) -> Floats | None:
+        """Mean error (2,) of the slanted edges mm and of the slopes deg."""
         if self.boss is None:
             return None
         length = np.abs(self.boss.hips_m / MM - HIP_MM).mean()
-        return float(length), float(np.abs(np.degrees(self.boss.dihedrals_rad) - SLOPE_DEG).mean())
+        return np.array([length, np.abs(np.degrees(self.boss.dihedrals_rad) - SLOPE_DEG).mean()])
+
+
+def sphere_targets() -> list[tuple[str, str, float]]:
+    """(what, unit, limit) of points, seam and frustum."""
+    return [
+        *((f"sphere, {method}", "mm", limit) for method, limit in TARGET_POINTS.items()),
+        *((f"seam, {name}", "mm", limit) for name, limit in zip(SEAM_FEATURES, TARGET_SEAM, strict=True)),
+        ("frustum, length (worst)", "mm", TARGET_BOSS[0]),
+        ("frustum, angle (worst)", "deg", TARGET_BOSS[1]),
+    ]
+
+
+def sphere_figures(results: Sequence[WorldResult]) -> dict[str, float]:
+    """The joint methods' figures over the worlds, by the names of their targets."""
+    points = {m: float(np.mean([r.points_mm.mean() for r in results if r.method == m])) for m in TARGET_POINTS}
+    best = [r for r in results if r.method == METHODS[3]]
+    return named_figures(
+        points,
+        [r.seam_mm for r in best if r.seam_mm is not None],
+        [r.boss_error for r in best if r.boss_error is not None],
+    )
+
+
+def named_figures(points: Mapping[str, float], seams: Sequence[Floats], bosses: Sequence[Floats]) -> dict[str, float]:
+    """Figures by the names of their targets: points by method, the mean of the seams, the worst of the frustums."""
+    values = [*points.values(), *np.mean(seams, axis=0), *np.max(bosses, axis=0)]
+    return {what: float(value) for (what, _, _), value in zip(sphere_targets(), values, strict=True)}
 
 
 def made_worlds(count: int, seed: int, grooves: int, bosses: int) -> Iterator[WorldData]:
@@ -81,7 +109,7 @@ def fixed_worlds(folder: Path, count: int) -> Iterator[WorldData]:
     """
     for name in ("sphere", "groove", "boss"):
         if not (folder / f"{name}.npz").is_file():
-            raise InputError(f"There is no {name}.npz in '{folder}': leave --data away to make worlds from seeds.")
+            raise InputError(f"There is no {name}.npz in '{folder}': omit --data to make worlds from seeds.")
     d, g, b = (dict(np.load(folder / f"{name}.npz")) for name in ("sphere", "groove", "boss"))
     arm = DhArm.checked(d["dh_nominal"] * [MM, np.radians(1.0), MM, np.radians(1.0)])
     for w in range(min(count, len(d["scan_T"]))):
@@ -137,16 +165,19 @@ def joint_records(world: WorldData) -> dict[str, ProfilerRecord]:
 
 def measure(k: int, world: WorldData) -> list[WorldResult]:
     """All methods on one world."""
-    features = None
-    if world.groove is not None:
-        features = np.array([groove_features(p).points for p in world.groove.profiles])
+    features = seam_features(world)
     return [measured(k, method, record, world, features) for method, record in calibrations(world).items()]
+
+
+def seam_features(world: WorldData) -> Floats | None:
+    """Features (n, 3, 2) m in the groove's profiles; None without a groove."""
+    return None if world.groove is None else np.array([groove_features(p).points for p in world.groove.profiles])
 
 
 def measured(
     k: int, method: str, record: ProfilerRecord, world: WorldData, features: Floats | None, *, boss: bool = True
 ) -> WorldResult:
-    """Points, seam and boss of one world by one calibration; features (n, 3, 2) m as found in the groove's profiles."""
+    """Points, seam and frustum of one world by one calibration; features (n, 3, 2) m from `seam_features`."""
     arm, tests = world.trial.data.arm, world.trial.tests
     assert arm is not None
     assert tests is not None
@@ -178,7 +209,7 @@ def _off(record: ProfilerRecord, arm: DhArm, q: Floats, seen: Floats, q_touch: F
 
 
 def cloud_of(record: ProfilerRecord, arm: DhArm, q: Floats, profiles: Floats) -> Floats:
-    """A boss's profiles (n, m, 2) m brought together in B by a calibration, (k, 3) m."""
+    """A frustum's profiles (n, m, 2) m as points in B by a calibration, (k, 3) m."""
     X = _flange(record, arm, q)
     parts = [record.points_F(without_spikes(p)) @ X.rotation[k].T + X.translation[k] for k, p in enumerate(profiles)]
     return np.vstack(parts)

@@ -1,4 +1,4 @@
-"""Worlds in which a profiler is calibrated by a sphere: an arm that is not its drawing, a sensor that is not flat, a bent torch.
+"""Simulated worlds for the calibration by a sphere: arm with kinematic errors, distorted sensor, bent torch.
 
 Everything random follows from the seed. Two cells: the one that the fixed files were made in, from which files of other seeds
 come, and a UR10e with another scanner pose in every world. The sag has the form that the calibration's model also has.
@@ -43,7 +43,7 @@ CLEAN = WorldErrors(length_m=0.0, angle_rad=0.0, twist_rad=0.0, sag_rad_m=0.0, a
 @dataclass(frozen=True, eq=False)
 class Cell:
     """Where a world's arm stands: its table, joints at which the tool points downwards, the sphere's centre (3,) m, and where
-    the groove's and the boss's frames lie, the groove turned about z."""
+    the groove's and the frustum's frames lie, the groove turned about z."""
 
     arm: DhArm
     home: Floats

@@ -1,1 +1,1 @@
-"""The robot link measured: timing and faults."""
+"""Benchmarks of the robot link: timing and faults."""

@@ -1,4 +1,4 @@
-"""The bench on which the hardware link is made to fail: an emulated controller, the link, and an arm kept moving at 0.05 m/s."""
+"""Test bench of the hardware link: an emulated controller, the link, and an arm that moves at 0.05 m/s."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Stroke:
 
 
 class Stream(threading.Thread):
-    """Commands at 125 Hz, whatever the link says: nothing that comes after a fault may move the arm.
+    """Commands at 125 Hz regardless of the link's state: no command after a fault may move the arm.
 
     `twist` changes what is sent: it takes the velocity that is due and gives another, or None to be silent.
     """
@@ -134,13 +134,8 @@ class Bench:
             require_ready(preflight(self.host))
         self.emulator.do("reset_checker")
         config = UrRtde(host=self.host)
-        self.link = UrLink.start(
-            self.host,
-            self.arm,
-            config.limits(self.arm),
-            payload_kg=config.payload_kg,
-            process_output=self.output,
-        )
+        limits = config.limits(self.arm)
+        self.link = UrLink.start(self.host, self.arm, limits, payload_kg=config.payload_kg, process_output=self.output)
         self._stream = Stream(self.link, self.arm, self.home)
         self._stream.start()
 

@@ -1,10 +1,11 @@
-"""Every fault that is thrown at the hardware link: how, what must follow, and how the world is put right again."""
+"""The faults that are injected into the hardware link: how, what must follow, and the repair."""
 
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3
 
 LINK = frozenset({Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF})
+DEAF = LINK | {Fault.GUARD_LATCHED}
 ALL = frozenset(Fault) - {Fault.NONE}
 
 
@@ -49,27 +51,45 @@ def _fault(name: str, **values: object) -> Callable[[Bench], float]:
     return lambda bench: bench.emulator.fault(name, latch=False, **values)
 
 
-def _nan(qd: Array) -> Array:
-    return np.full(6, np.nan)
+def _sends(twist: Callable[[Array], Array], seconds: float = 0.05) -> Callable[[Bench], float]:
+    return lambda bench: bench.send(twist, seconds)
 
 
-def _fast(qd: Array) -> Array:
-    return np.array([5.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-
-
-def _jump(qd: Array) -> Array:
-    jump: Array = np.array([0.9, 0.0, 0.0, 0.0, 0.0, 0.0])
-    return qd + jump
-
-
-def _turn_wrist_3(qd: Array) -> Array:
-    turn: Array = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2])
-    return qd + turn
+def _joint(number: int, speed: float) -> Array:
+    qd: Array = speed * np.eye(6)[number]
+    return qd
 
 
 CLEAR = (Deed("clear_links"),)
 UNLOCK = (Deed("clear_pstop_timer"), Deed("unlock"))
 POWER = (Deed("normal"), Deed("power_on", 1.15))
+
+
+def _stops(
+    name: str,
+    throw: Callable[[Bench], float],
+    faults: Fault | frozenset[Fault],
+    repair: tuple[Deed, ...] = (),
+    *,
+    short: bool = True,
+    **settings: Any,
+) -> Case:
+    """A fault that must stop the arm and be reported as one of these."""
+    named = frozenset({faults}) if isinstance(faults, Fault) else faults
+    return Case(name, throw, STOP, named, repair, short=short, **settings)
+
+
+def _either(
+    name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: Deed, short: bool = True
+) -> Case:
+    """A fault in which the arm may go on, or stop and report one of these."""
+    return Case(name, throw, GO_OR_STOP, frozenset(faults), repair, short=short)
+
+
+def _refused(name: str, throw: Callable[[Bench], float], says: str, *, short: bool = True) -> Case:
+    """A state of the controller in which a start must be refused with a sentence that contains `says`."""
+    return Case(f"start {name}", throw, REFUSE, says=says, short=short)
+
 
 RUNNING: tuple[Case, ...] = (
     # the link
@@ -77,179 +97,98 @@ RUNNING: tuple[Case, ...] = (
     Case("state 30 ms late for 0.3 s", _fault("delay", seconds=0.03, **{"for": 0.3}), GO, repair=CLEAR),
     Case("10 % of the states lost", _fault("drop_p", p=0.1), GO, repair=CLEAR),
     # ur_rtde drops a whole package when the beginning of the next one has come with it: it goes deaf, and is stopped
-    Case("states in torn pieces", _fault("partial_writes", bytes=7), GO_OR_STOP, LINK, CLEAR),
+    _either("states in torn pieces", _fault("partial_writes", bytes=7), LINK, *CLEAR),
     Case("controller's frames jitter by 5 ms", _fault("jitter", seconds=0.005), GO, repair=CLEAR),
     Case("controller's clock 100 ppm fast", _fault("clock_skew", ppm=100), GO),
     Case("dashboard connection reset", _fault("reset_tcp", kind="dashboard"), GO, short=False),
-    Case("script connection reset", _fault("reset_tcp", kind="script"), GO_OR_STOP, LINK),
-    Case("no state for 100 ms", _fault("drop", seconds=0.1), STOP, LINK),
-    Case("no state any more", _fault("drop", seconds=1e9), STOP, LINK, CLEAR, short=False),
-    Case("state 100 ms late", _fault("delay", seconds=0.1), STOP, LINK, CLEAR),
-    Case("state late by up to 200 ms", _fault("delay", seconds=0.05, jitter=0.15), STOP, LINK, CLEAR, short=False),
-    Case("half-open connections", _fault("half_open"), STOP, LINK, CLEAR),
-    Case("RTDE stands still for 200 ms", _fault("freeze", seconds=0.2, kind="rtde"), STOP, LINK),
-    Case("controller stands still for 200 ms", _fault("freeze", seconds=0.2), STOP, LINK),
+    _either("script connection reset", _fault("reset_tcp", kind="script"), LINK),
+    _stops("no state for 100 ms", _fault("drop", seconds=0.1), LINK),
+    _stops("no state any more", _fault("drop", seconds=1e9), LINK, CLEAR, short=False),
+    _stops("state 100 ms late", _fault("delay", seconds=0.1), LINK, CLEAR),
+    _stops("state late by up to 200 ms", _fault("delay", seconds=0.05, jitter=0.15), LINK, CLEAR, short=False),
+    _stops("half-open connections", _fault("half_open"), LINK, CLEAR),
+    _stops("RTDE stands still for 200 ms", _fault("freeze", seconds=0.2, kind="rtde"), LINK),
+    _stops("controller stands still for 200 ms", _fault("freeze", seconds=0.2), LINK),
     # chance decides when a frame is 40 ms late, and a controller that lives so slowly hears a stop late too
-    Case(
+    _stops(
         "controller's frames jitter by 60 ms",
         _fault("jitter", seconds=0.06),
-        STOP,
         LINK,
         CLEAR,
         watch_s=1.5,
         rest_s=1.0,
         short=False,
     ),
-    Case("RTDE connections reset", _fault("reset_tcp"), STOP, LINK),
-    Case("RTDE connections closed", _fault("close_tcp"), STOP, LINK, short=False),
-    Case("receiving connection reset", _fault("reset_tcp", index=0), STOP, LINK),
-    Case("commanding connection reset", _fault("reset_tcp", index=1), STOP, LINK),
-    Case("receiving connection closed", _fault("close_tcp", index=0), STOP, LINK, short=False),
-    Case("commanding connection closed", _fault("close_tcp", index=1), STOP, LINK, short=False),
-    Case("every connection reset", _fault("reset_tcp", kind="all"), STOP, LINK),
-    Case("controller ignores commands", _fault("mute_input"), STOP, LINK | {Fault.GUARD_LATCHED}, CLEAR),
-    Case(
-        "controller ignores commands for 60 ms",
-        _fault("mute_input", seconds=0.06),
-        STOP,
-        LINK | {Fault.GUARD_LATCHED},
-        short=False,
+    _stops("RTDE connections reset", _fault("reset_tcp"), LINK),
+    _stops("RTDE connections closed", _fault("close_tcp"), LINK, short=False),
+    _stops("receiving connection reset", _fault("reset_tcp", index=0), LINK),
+    _stops("commanding connection reset", _fault("reset_tcp", index=1), LINK),
+    _stops("receiving connection closed", _fault("close_tcp", index=0), LINK, short=False),
+    _stops("commanding connection closed", _fault("close_tcp", index=1), LINK, short=False),
+    _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
+    _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
+    _stops("controller ignores commands for 60 ms", _fault("mute_input", seconds=0.06), DEAF, short=False),
+    _either("one byte wrong in a package", _fault("corrupt", n=1), ALL, *CLEAR),
+    _either("bytes wrong in 20 packages", _fault("corrupt", n=20), ALL, *CLEAR, short=False),
+    _either("one package of a wrong size", _fault("wrong_size", n=1), ALL, *CLEAR),
+    _stops("controller restarts", _fault("reboot", seconds=0.5), ALL, (Deed("power_on", 1.15),)),
+    _stops(
+        "controller's clock jumps 10 s ahead", _fault("timestamp_jump", seconds=10.0), Fault.CLOCK_JUMPED, short=False
     ),
-    Case("one byte wrong in a package", _fault("corrupt", n=1), GO_OR_STOP, ALL, CLEAR),
-    Case("bytes wrong in 20 packages", _fault("corrupt", n=20), GO_OR_STOP, ALL, CLEAR, short=False),
-    Case("one package of a wrong size", _fault("wrong_size", n=1), GO_OR_STOP, ALL, CLEAR),
-    Case("controller restarts", _fault("reboot", seconds=0.5), STOP, ALL, (Deed("power_on", 1.15),)),
-    Case(
-        "controller's clock jumps 10 s ahead",
-        _fault("timestamp_jump", seconds=10.0),
-        STOP,
-        frozenset({Fault.CLOCK_JUMPED}),
-        short=False,
-    ),
-    Case(
-        "controller's clock jumps 10 s back",
-        _fault("timestamp_jump", seconds=-10.0),
-        STOP,
-        frozenset({Fault.CLOCK_JUMPED}),
-    ),
+    _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
     # the robot
     Case("reduced mode", _fault("reduced"), GO, repair=(Deed("normal"),)),
     Case("tool contact", _fault("tool_contact", n=1), GO, short=False),
-    Case("pendant switched to local", _fault("local_mode"), GO_OR_STOP, ALL, (Deed("remote"),)),
-    Case("protective stop", _fault("protective_stop"), STOP, frozenset({Fault.PROTECTIVE_STOP}), UNLOCK),
-    Case("emergency stop on the robot", _fault("estop"), STOP, frozenset({Fault.EMERGENCY_STOP}), POWER),
-    Case(
-        "emergency stop of the cell",
-        _fault("estop", system=True),
-        STOP,
-        frozenset({Fault.EMERGENCY_STOP}),
-        POWER,
-        short=False,
-    ),
-    Case("safeguard stop", _fault("safeguard"), STOP, frozenset({Fault.SAFEGUARD_STOP}), (Deed("safeguard_release"),)),
-    Case("recovery mode", _fault("safety_mode", value=4), STOP, frozenset({Fault.RECOVERY_MODE}), (Deed("normal"),)),
-    Case("safety violation", _fault("safety_mode", value=8), STOP, frozenset({Fault.SAFETY_VIOLATION}), POWER),
-    Case("safety fault", _fault("safety_mode", value=9), STOP, frozenset({Fault.SAFETY_VIOLATION}), POWER, short=False),
-    Case(
-        "arm without power",
-        _fault("robot_mode", value=3),
-        STOP,
-        frozenset({Fault.ROBOT_NOT_RUNNING}),
-        (Deed("power_on", 1.15),),
-    ),
-    Case(
-        "brakes on",
-        _fault("robot_mode", value=5),
-        STOP,
-        frozenset({Fault.ROBOT_NOT_RUNNING}),
-        (Deed("power_on", 0.6),),
-        short=False,
-    ),
-    Case("program stopped", _fault("stop_program"), STOP, frozenset({Fault.PROGRAM_STOPPED})),
-    Case(
-        "program paused",
-        _fault("pause_program"),
-        STOP,
-        frozenset({Fault.PROGRAM_PAUSED}),
-    ),
-    Case("program replaced", _fault("replace_program"), STOP, ALL),
-    Case(
-        "speed slider to 50 % in 0.2 s",
-        _fault("speed_scaling", value=0.5, ramp=0.2),
-        STOP,
-        frozenset({Fault.SPEED_SLIDER}),
-    ),
-    Case("speed slider to 0", _fault("speed_scaling", value=0.0), STOP, frozenset({Fault.SPEED_SLIDER}), short=False),
-    Case(
-        "arm follows 0.1 s late",
-        _fault("tracking_lag", seconds=0.1),
-        GO_OR_STOP,
-        frozenset({Fault.TRACKING}),
-        short=False,
-    ),
-    Case("arm is held fast", _fault("tracking_lag", seconds=1e6), STOP, frozenset({Fault.TRACKING}), watch_s=1.0),
-    Case("another TCP is set", _fault("wrong_tcp"), STOP, frozenset({Fault.POSE_MISMATCH})),
-    Case(
-        "joints jump",
-        _fault("set_q", q=[0.5, -1.6, 1.6, -1.6, -1.6, 0.0]),
-        STOP,
-        frozenset({Fault.STATE_IMPLAUSIBLE}),
-    ),
+    _either("pendant switched to local", _fault("local_mode"), ALL, Deed("remote")),
+    _stops("protective stop", _fault("protective_stop"), Fault.PROTECTIVE_STOP, UNLOCK),
+    _stops("emergency stop on the robot", _fault("estop"), Fault.EMERGENCY_STOP, POWER),
+    _stops("emergency stop of the cell", _fault("estop", system=True), Fault.EMERGENCY_STOP, POWER, short=False),
+    _stops("safeguard stop", _fault("safeguard"), Fault.SAFEGUARD_STOP, (Deed("safeguard_release"),)),
+    _stops("recovery mode", _fault("safety_mode", value=4), Fault.RECOVERY_MODE, (Deed("normal"),)),
+    _stops("safety violation", _fault("safety_mode", value=8), Fault.SAFETY_VIOLATION, POWER),
+    _stops("safety fault", _fault("safety_mode", value=9), Fault.SAFETY_VIOLATION, POWER, short=False),
+    _stops("arm without power", _fault("robot_mode", value=3), Fault.ROBOT_NOT_RUNNING, (Deed("power_on", 1.15),)),
+    _stops("brakes on", _fault("robot_mode", value=5), Fault.ROBOT_NOT_RUNNING, (Deed("power_on", 0.6),), short=False),
+    _stops("program stopped", _fault("stop_program"), Fault.PROGRAM_STOPPED),
+    _stops("program paused", _fault("pause_program"), Fault.PROGRAM_PAUSED),
+    _stops("program replaced", _fault("replace_program"), ALL),
+    _stops("speed slider to 50 % in 0.2 s", _fault("speed_scaling", value=0.5, ramp=0.2), Fault.SPEED_SLIDER),
+    _stops("speed slider to 0", _fault("speed_scaling", value=0.0), Fault.SPEED_SLIDER, short=False),
+    _either("arm follows 0.1 s late", _fault("tracking_lag", seconds=0.1), {Fault.TRACKING}, short=False),
+    _stops("arm is held fast", _fault("tracking_lag", seconds=1e6), Fault.TRACKING, watch_s=1.0),
+    _stops("another TCP is set", _fault("wrong_tcp"), Fault.POSE_MISMATCH),
+    _stops("joints jump", _fault("set_q", q=[0.5, -1.6, 1.6, -1.6, -1.6, 0.0]), Fault.STATE_IMPLAUSIBLE),
     # this computer
-    Case("cell silent for 0.3 s", lambda b: b.send(lambda qd: None, 0.3), STOP, frozenset({Fault.COMMAND_LATE})),
-    Case(
-        "cell silent for ever",
-        lambda b: b.send(lambda qd: None, 1e9),
-        STOP,
-        frozenset({Fault.COMMAND_LATE}),
-        short=False,
-    ),
-    Case("a velocity that is no number", lambda b: b.send(_nan, 0.05), STOP, frozenset({Fault.COMMAND_NOT_FINITE})),
-    Case("a velocity of 5 rad/s", lambda b: b.send(_fast, 0.05), STOP, frozenset({Fault.COMMAND_TOO_FAST})),
-    Case("a velocity that jumps by 0.9 rad/s", lambda b: b.send(_jump, 0.05), STOP, frozenset({Fault.COMMAND_JUMPED})),
-    Case(
+    _stops("cell silent for 0.3 s", lambda b: b.send(lambda qd: None, 0.3), Fault.COMMAND_LATE),
+    _stops("cell silent for ever", lambda b: b.send(lambda qd: None, 1e9), Fault.COMMAND_LATE, short=False),
+    _stops("a velocity that is no number", _sends(lambda qd: np.full(6, np.nan)), Fault.COMMAND_NOT_FINITE),
+    _stops("a velocity of 5 rad/s", _sends(lambda qd: _joint(0, 5.0)), Fault.COMMAND_TOO_FAST),
+    _stops("a velocity that jumps by 0.9 rad/s", _sends(lambda qd: qd + _joint(0, 0.9)), Fault.COMMAND_JUMPED),
+    _stops(
         "a velocity into a joint's limit",
-        lambda b: b.send(_turn_wrist_3, 0.5),
-        STOP,
-        frozenset({Fault.JOINT_LIMIT}),
+        _sends(lambda qd: qd + _joint(5, 0.2), 0.5),
+        Fault.JOINT_LIMIT,
         wrist_3=2.0 * np.pi - 0.05,
         random=False,
     ),
-    Case("worker killed", lambda b: b.signal_worker(signal.SIGKILL), STOP, frozenset({Fault.WORKER_DIED})),
-    Case(
-        "worker crashes", lambda b: b.signal_worker(signal.SIGSEGV), STOP, frozenset({Fault.WORKER_DIED}), short=False
-    ),
-    Case("worker stopped (SIGSTOP)", lambda b: b.signal_worker(signal.SIGSTOP), STOP, frozenset({Fault.WORKER_DIED})),
-    Case("cell's process killed", lambda b: b.kill_child(), STOP, elsewhere=True, random=False, watch_s=1.0),
+    _stops("worker killed", lambda b: b.signal_worker(signal.SIGKILL), Fault.WORKER_DIED),
+    _stops("worker crashes", lambda b: b.signal_worker(signal.SIGSEGV), Fault.WORKER_DIED, short=False),
+    _stops("worker stopped (SIGSTOP)", lambda b: b.signal_worker(signal.SIGSTOP), Fault.WORKER_DIED),
+    _stops("cell's process killed", lambda b: b.kill_child(), frozenset(), elsewhere=True, random=False, watch_s=1.0),
 )
 
 AT_START: tuple[Case, ...] = (
-    Case("start in local mode", _fault("local_mode"), REFUSE, says="Remote Control"),
-    Case("start beside a foreign program", _fault("foreign_program"), REFUSE, says="busy"),
-    Case(
-        "start with registers in use",
-        _fault("registers_in_use", names=["input_int_register_24"]),
-        REFUSE,
-        says="in use",
+    _refused("in local mode", _fault("local_mode"), "Remote Control"),
+    _refused("beside a foreign program", _fault("foreign_program"), "busy"),
+    _refused("with registers in use", _fault("registers_in_use", names=["input_int_register_24"]), "in use"),
+    _refused("where uploads are refused", _fault("refuse_upload"), "did not start our program", short=False),
+    _refused(
+        "where scripts begin 10 s late", _fault("slow_start", seconds=10.0), "did not start our program", short=False
     ),
-    Case(
-        "start where uploads are refused",
-        _fault("refuse_upload"),
-        REFUSE,
-        says="did not start our program",
-        short=False,
-    ),
-    Case(
-        "start where scripts begin 10 s late",
-        _fault("slow_start", seconds=10.0),
-        REFUSE,
-        says="did not start our program",
-        short=False,
-    ),
-    Case("start in a protective stop", _fault("protective_stop"), REFUSE, says="protective stop"),
-    Case("start in an emergency stop", _fault("estop"), REFUSE, says="emergency stop"),
-    Case("start in recovery mode", _fault("safety_mode", value=4), REFUSE, says="recovery", short=False),
-    Case("start without power", _fault("robot_mode", value=3), REFUSE, says="no power", short=False),
-    Case("start with another TCP", _fault("wrong_tcp"), REFUSE, says="TCP"),
-    Case("start with the speed slider at 50 %", _fault("speed_scaling", value=0.5), REFUSE, says="slider"),
+    _refused("in a protective stop", _fault("protective_stop"), "protective stop"),
+    _refused("in an emergency stop", _fault("estop"), "emergency stop"),
+    _refused("in recovery mode", _fault("safety_mode", value=4), "recovery", short=False),
+    _refused("without power", _fault("robot_mode", value=3), "no power", short=False),
+    _refused("with another TCP", _fault("wrong_tcp"), "TCP"),
+    _refused("with the speed slider at 50 %", _fault("speed_scaling", value=0.5), "slider"),
 )

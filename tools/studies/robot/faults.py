@@ -1,10 +1,7 @@
-"""What the hardware link does in each fault: a matrix, and random sequences in which nothing may move without a command."""
+"""Benchmark of the hardware link under faults: a matrix of faults, and random sequences of them."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -20,9 +17,9 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.console import plain
 from weldcal.tools.emulators.ur.process import HOST, emulator_process
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import csv_text, write_json
 from weldcal.tools.studies.robot.bench import SPEED_M_S, Bench, StoppedUnasked
 from weldcal.tools.studies.robot.cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
 from weldcal.tools.studies.robot.sequences import Sequence, run_sequence
@@ -53,11 +50,11 @@ class Outcome:
     did: str  # stopped, went on, refused
     fault: str
     sentence: str
-    rest_after_ms: float | None
-    travel_mm: float | None
-    seen_after_ms: float | None
-    played: str  # what the dashboard said to Play after the repair
-    problems: tuple[str, ...]
+    rest_after_ms: float | None = None
+    travel_mm: float | None = None
+    seen_after_ms: float | None = None
+    played: str = ""  # what the dashboard said to Play after the repair
+    problems: tuple[str, ...] = ()
     retries: int = 0  # attempts that the load of this computer ended; also among `unasked_stops`
 
     @property
@@ -96,7 +93,7 @@ def run_case(bench: Bench, case: Case, *, hasty: bool = False) -> Outcome:
         finally:
             bench.end(kill=hasty)
             recover(bench)
-    return Outcome(case.name, case.must, "failed", "", reason, None, None, None, "", (reason,), retries)
+    return Outcome(case.name, case.must, "failed", "", reason, problems=(reason,), retries=retries)
 
 
 def recover(bench: Bench) -> None:
@@ -122,7 +119,7 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
         if not paused and bench.stream.state.fault is Fault.NONE:
             speed = bench.tool_speed()
             problems = () if abs(speed - SPEED_M_S) < 0.1 * SPEED_M_S else (f"its speed is {speed:.4f} m/s",)
-            return Outcome(case.name, case.must, "went on", "", "", None, None, None, "", problems)
+            return Outcome(case.name, case.must, "went on", "", "", problems=problems)
     time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
     return _stopped(bench, case, at, children, PLAYED_S - (HASTE_S if hasty else 0.0))
 
@@ -153,18 +150,9 @@ def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played
     summary = bench.emulator.ask(check="summary")
     if summary["moves_without_a_command"]:
         problems.append("it moved without a command")
-    return Outcome(
-        case.name,
-        case.must,
-        "stopped",
-        fault.name if fault else "",
-        sentence,
-        None if rest is None else 1e3 * float(rest),
-        None if travel is None else 1e3 * float(travel),
-        seen,
-        played,
-        tuple(problems),
-    )
+    rest_ms, travel_mm = (None if value is None else 1e3 * float(value) for value in (rest, travel))
+    name = fault.name if fault else ""
+    return Outcome(case.name, case.must, "stopped", name, sentence, rest_ms, travel_mm, seen, played, tuple(problems))
 
 
 def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:
@@ -194,7 +182,7 @@ def _at_start(bench: Bench, case: Case) -> Outcome:
     found = bench.at_rest_after(at, REST_S)
     if not found["ok"]:
         problems.append("it moved")
-    return Outcome(case.name, case.must, "refused", "", sentence, None, None, None, "", tuple(problems))
+    return Outcome(case.name, case.must, "refused", "", sentence, problems=tuple(problems))
 
 
 def _alive(process: int) -> bool:
@@ -281,7 +269,7 @@ def run_fault_benchmark(
         with emulator_process(host=address, seed=seed + k) as emulator, no_long_garbage_collections():
             report.sequences.append(run_sequence(Bench(emulator), seed + k, seconds))
         write_atomic(out / "sequences.csv", _table(SEQUENCE_COLUMNS, report.sequences))
-    write_atomic(out / "robot_faults.json", json.dumps(plain(report.summary()), indent=1))
+    write_json(out / "robot_faults.json", report.summary())
     return report
 
 
@@ -291,12 +279,7 @@ def _spread(values: Several[float | None]) -> dict[str, float]:
 
 
 def _table(columns: tuple[str, ...], rows: Several[object]) -> str:
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(columns)
-    for row in rows:
-        writer.writerow([_cell(getattr(row, name)) for name in columns])
-    return table.getvalue()
+    return csv_text(columns, ([_cell(getattr(row, name)) for name in columns] for row in rows))
 
 
 def _cell(value: object) -> str:

@@ -1,4 +1,4 @@
-"""Random faults at random moments, with random repairs, Plays and restarts: nothing may ever move without a command."""
+"""Random faults at random times, with random repairs and restarts: the arm must never move without a command."""
 
 from __future__ import annotations
 

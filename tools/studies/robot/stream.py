@@ -1,10 +1,7 @@
-"""How punctual the robot link is: a 125 Hz command stream through the Diagram, timed from the cell's clock to the arm's motion."""
+"""Benchmark of the robot link's timing: a 125 Hz command stream through the Diagram, up to the arm's motion."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import time
 from array import array
 from dataclasses import dataclass, field, replace
@@ -24,9 +21,9 @@ from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
 from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.console import plain
 from weldcal.tools.emulators.ur.process import HOST, emulator_process
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import csv_text, write_json
 from weldcal.tools.studies.robot.faults import LOADED
 
 RATE_HZ = 125.0
@@ -224,12 +221,9 @@ def run_robot_benchmark(
                 break
             stops.append(Stopped(60.0 * minutes - left, report.fault))
     report = replace(report, seconds=60.0 * minutes - left, stops=tuple(stops))
-    write_atomic(out / "robot.json", json.dumps(plain(report.summary()), indent=1))
-    table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(("at_s", "late_ms"))
-    writer.writerows((f"{missed.at_s:.3f}", f"{1e3 * missed.late_s:.2f}") for missed in report.missed)
-    write_atomic(out / "missed.csv", table.getvalue())
+    write_json(out / "robot.json", report.summary())
+    missed = ((f"{m.at_s:.3f}", f"{1e3 * m.late_s:.2f}") for m in report.missed)
+    write_atomic(out / "missed.csv", csv_text(("at_s", "late_ms"), missed))
     return report
 
 

@@ -1,4 +1,4 @@
-"""How well the seam is planned from one scan, by drawing and from the cloud alone, for each scanner and in each trouble."""
+"""Benchmark of seam planning from one scan, by drawing and from the cloud alone, for each scanner and hard case."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ from pathlib import Path
 from weldcal.models.scanners import SCANNERS
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.output import records_csv
 from weldcal.tools.studies.seam_planning.trials import (
+    COLUMNS,
     FIRST_HELD_OUT,
     METHODS,
     SHAPES,
+    TROUBLE_COLUMNS,
     WIDEST_PX,
     Trial,
     run_trial,
+    run_troubles,
     scan,
     summary_rows,
-    table_text,
+    trouble_rows,
 )
-from weldcal.tools.studies.seam_planning.troubles import run_troubles, trouble_rows
 
 
 def run_seam_planning_benchmark(
@@ -46,11 +49,11 @@ def run_seam_planning_benchmark(
                 scene = scan(preset, shape, number, None if full else WIDEST_PX)
                 trials += [run_trial(scene, preset, shape, number, method) for method in METHODS]
                 progress("planning", len(trials) / (len(METHODS) * total))
-                write_atomic(out / "trials.csv", table_text(trials))
+                write_atomic(out / "trials.csv", records_csv(trials, COLUMNS))
     rows = summary_rows(trials)
     if troubles:
         cases = run_troubles(runs, FIRST_HELD_OUT + seed)
-        write_atomic(out / "troubles.csv", table_text(cases))
+        write_atomic(out / "troubles.csv", records_csv(cases, TROUBLE_COLUMNS))
         rows |= trouble_rows(cases)
     done = [t for t in trials if not t.refused]
     summary: dict[str, object] = {

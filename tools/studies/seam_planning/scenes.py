@@ -1,4 +1,4 @@
-"""Scans of workpieces by ray casting: a part on a table among other things, seen by any scanner preset, seeded."""
+"""Simulated scans of workpieces: a part on a table with other objects, ray-cast for any scanner preset."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TABLE_M = 1.4
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What a scanner saw: cloud p_BS (H,W,3) m with NaN where nothing was measured, and the truth beside it."""
+    """A scan p_BS (H,W,3) m, NaN where nothing was measured, and the true pose."""
 
     cloud_B: NDArray[np.float64]
     eye_B: NDArray[np.float64]

@@ -1,55 +1,59 @@
-"""Trials of seam planning: a part under a scanner preset in a random pose, planned by a method, compared with the truth."""
+"""Trials of seam planning in random poses: every scanner preset, and hard cases."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial import cKDTree
 
 from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import WeldcalError
+from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import Workpiece, make_workpiece
-from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
+from weldcal.tools.studies.seam_planning.scenes import Scene, box, scan_part
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats, into
 
 WIDEST_PX = 824
-SHAPES = (
-    "straight",
-    "s",
-    "l",
-    "corner",
-    "bent",
-)  # l: its corner rounded with 20 mm; corner: with 4 mm; bent: s over 200 mm
+SHAPES = ("straight", "s", "l", "corner", "bent")  # l: corner radius 20 mm; corner: 4 mm; bent: s over 200 mm
 CORNER_M, BEND_M = 0.004, 0.200
 FIRST_HELD_OUT = 1000  # seeds from here on were not used while the figures of the algorithms were set
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One scan planned by one method; lengths in mm, empty (nan) where it was refused."""
+COLUMNS = (
+    "preset", "method", "shape", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "chi", "within_2_sigma", "seconds",
+)  # fmt: skip
 
-    preset: str
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The plan of one scan by one method; lengths in mm, NaN where it was refused; processor seconds."""
+
     method: str
-    shape: str
     seed: int
     refused: str
-    rms_mm: float
-    worst_mm: float
-    sigma_mm: float
-    chi: float
-    within_2_sigma: float
-    seconds: float
+    rms_mm: float = math.nan
+    worst_mm: float = math.nan
+    sigma_mm: float = math.nan
+    chi: float = math.nan
+    within_2_sigma: float = math.nan
+    seconds: float = math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial(Plan):
+    """One scan of a part under a scanner preset."""
+
+    preset: str
+    shape: str
 
 
 def sideways(points_B: Floats, part: Workpiece, X_BP: RigidTransform) -> tuple[Floats, Floats]:
@@ -111,26 +115,30 @@ METHODS = {"cad": try_cad, "cloud": try_cloud}
 
 
 def run_trial(scene: Scene, preset: str, shape: str, seed: int, method: str) -> Trial:
-    """One scan planned by one method; a named refusal is a result."""
+    """Plan one scan by one method; a named refusal is a result."""
+    return Trial(preset=preset, shape=shape, method=method, seed=seed, **figures(lambda: METHODS[method](scene)))
+
+
+def figures(plan: Callable[[], tuple[Floats, Floats]]) -> dict[str, Any]:
+    """Run `plan`, which returns errors and sigmas (N,) m; the fields of a Plan that follow from it."""
     began = time.process_time()
     try:
-        error, sigma = METHODS[method](scene)
+        error, sigma = plan()
     except WeldcalError as refusal:
-        nothing = (*[math.nan] * 5, time.process_time() - began)
-        return Trial(preset, method, shape, seed, f"{type(refusal).__name__}: {refusal}", *nothing)
-    return Trial(
-        preset,
-        method,
-        shape,
-        seed,
-        "",
-        1e3 * float(np.sqrt(np.mean(np.square(error)))),
-        1e3 * float(np.abs(error).max()),
-        1e3 * float(np.sqrt(np.mean(np.square(sigma)))),
-        float(np.sqrt(np.mean(np.square(error / sigma)))),
-        float(np.mean(np.abs(error) < 2.0 * sigma)),
-        time.process_time() - began,
-    )
+        return {"refused": f"{type(refusal).__name__}: {refusal}", "seconds": time.process_time() - began}
+    return {
+        "refused": "",
+        "rms_mm": 1e3 * _rms(error),
+        "worst_mm": 1e3 * float(np.abs(error).max()),
+        "sigma_mm": 1e3 * _rms(sigma),
+        "chi": _rms(error / sigma),
+        "within_2_sigma": float(np.mean(np.abs(error) < 2.0 * sigma)),
+        "seconds": time.process_time() - began,
+    }
+
+
+def _rms(values: Any) -> float:
+    return math.sqrt(float(np.mean(np.square(values))))
 
 
 def summary_rows(trials: list[Trial]) -> dict[str, str]:
@@ -140,24 +148,146 @@ def summary_rows(trials: list[Trial]) -> dict[str, str]:
         for method in METHODS:
             mine = [t for t in trials if t.preset == preset and t.method == method]
             done = [t for t in mine if not t.refused]
-            key = f"{preset} {method}"
-            if not done:
-                rows[key] = f"0 of {len(mine)} planned; {mine[0].refused}"
-                continue
-            rms = math.sqrt(float(np.mean([t.rms_mm**2 for t in done])))
-            sigma = math.sqrt(float(np.mean([t.sigma_mm**2 for t in done])))
-            within = 100.0 * float(np.mean([t.within_2_sigma for t in done]))
-            rows[key] = (
-                f"{len(done)} of {len(mine)} planned; error rms {rms:.3f}, worst {max(t.worst_mm for t in done):.2f} mm; "
-                f"sigma stated {sigma:.3f} mm ({within:.0f} % of the line within 2 sigma); {np.mean([t.seconds for t in done]):.2f} s CPU"
-            )
+            seconds = f"; {np.mean([t.seconds for t in done]):.2f} s CPU" if done else f"; {mine[0].refused}"
+            rows[f"{preset} {method}"] = f"{len(done)} of {len(mine)} planned{error_text(done)}{seconds}"
     return rows
 
 
-def table_text(trials: Sequence[Any]) -> str:
-    """Dataclasses of one kind as CSV."""
-    table = io.StringIO()
-    writer = csv.DictWriter(table, [f.name for f in fields(trials[0])], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows([vars(t) for t in trials])
-    return table.getvalue()
+def error_text(planned: Sequence[Plan]) -> str:
+    """Errors and stated sigmas of the plans, as a part of a sentence; empty for none."""
+    if not planned:
+        return ""
+    within = 100.0 * float(np.mean([t.within_2_sigma for t in planned]))
+    return (
+        f"; error rms {_rms([t.rms_mm for t in planned]):.3f}, worst {max(t.worst_mm for t in planned):.2f} mm; sigma stated "
+        f"{_rms([t.sigma_mm for t in planned]):.3f} mm ({within:.0f} % of the line within 2 sigma)"
+    )
+
+
+PRESET = "phoxi_m"
+PLANNED, REFUSED = "planned", "refused"
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """A kind of scene. others: what else stands there; drawing: what is looked for, None: the part itself; must: what the
+    answer has to be, empty where a plan with an honest sigma and a refusal are both right.
+    """
+
+    name: str
+    part: Callable[[], Workpiece]
+    must: str
+    method: str
+    others: Callable[[np.random.Generator], list[TriMesh]] = lambda rng: []
+    drawing: Callable[[], Workpiece] | None = None
+
+
+TROUBLE_COLUMNS = (
+    "name", "method", "seed", "refused", "rms_mm", "worst_mm", "sigma_mm", "within_2_sigma", "ok", "seconds",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class TroubleTrial(Plan):
+    """One scan in one kind of trouble; must: as in Trouble."""
+
+    name: str
+    must: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether the answer is what it has to be."""
+        return self.must in ("", REFUSED if self.refused else PLANNED)
+
+
+def _bar(width_m: float) -> Callable[[np.random.Generator], list[TriMesh]]:
+    """A bar 60 mm over the part, across its middle."""
+
+    def made(rng: np.random.Generator) -> list[TriMesh]:
+        turn = RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi))
+        p = [0.6 + rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), 0.11]
+        return [box(0.6, width_m, 0.01).transformed(RigidTransform(turn, p))]
+
+    return made
+
+
+def _clutter(rng: np.random.Generator) -> list[TriMesh]:
+    """Boxes around the part, some as high as it, and one that stands on its edge."""
+    meshes = []
+    for _ in range(8):
+        angle, far = rng.uniform(-math.pi, math.pi), rng.uniform(0.16, 0.32)
+        X = RigidTransform(
+            RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi)),
+            [0.6 + far * math.cos(angle), far * math.sin(angle), 0.0],
+        )
+        size = rng.uniform([0.03, 0.03, 0.01], [0.12, 0.08, 0.08])
+        meshes.append(box(*(float(v) for v in size)).transformed(X))
+    return meshes
+
+
+def _s() -> Workpiece:
+    return make_workpiece("s", length_m=0.250)
+
+
+def _flat() -> Workpiece:
+    return make_workpiece("s", length_m=0.200)
+
+
+def _bent(radius_m: float) -> Callable[[], Workpiece]:
+    return lambda: bend(_flat(), radius_m)
+
+
+TROUBLES = (
+    *(
+        Trouble(name, part, must, method, others)
+        for name, part, must, others in (
+            ("bar of 12 mm across", _s, PLANNED, _bar(0.012)),
+            ("bar of 30 mm across", _s, "", _bar(0.030)),
+            ("clutter around", _s, PLANNED, _clutter),
+            ("bent, bar of 12 mm across", _bent(BEND_M), PLANNED, _bar(0.012)),
+        )
+        for method in ("cad", "cloud")
+    ),
+    *(
+        Trouble(f"wrong: {name}", part, REFUSED, "cad", drawing=drawing)
+        for name, part, drawing in (
+            ("6 mm wider", lambda: make_workpiece("s", length_m=0.250, width_m=0.206), _s),
+            ("5 mm longer", lambda: make_workpiece("s", length_m=0.255), _s),
+            ("another groove", lambda: make_workpiece("straight", length_m=_s().size_m[0]), _s),
+            ("bent, drawn flat", _bent(BEND_M), _flat),
+            ("flat, drawn bent", _flat, _bent(BEND_M)),
+            ("bent over 230 mm, drawn 200", _bent(0.230), _bent(BEND_M)),
+        )
+    ),
+)
+
+
+def trouble_trial(trouble: Trouble, seed: int) -> TroubleTrial:
+    """One scan, planned; held against what it has to be."""
+    scanner = get_scanner(PRESET).resized(WIDEST_PX)
+    others = trouble.others(np.random.default_rng([seed, 97]))
+    scene = scan_part(trouble.part(), scanner, seed, tilt_rad=math.radians(5.0), spread_m=0.02, others=others)
+    plan = figures(lambda: _plan(scene, trouble))
+    return TroubleTrial(name=trouble.name, must=trouble.must, method=trouble.method, seed=seed, **plan)
+
+
+def _plan(scene: Scene, trouble: Trouble) -> tuple[np.ndarray, np.ndarray]:
+    if trouble.method == "cloud":
+        return try_cloud(scene)
+    return try_cad(scene, None if trouble.drawing is None else trouble.drawing())
+
+
+def run_troubles(runs: int, first_seed: int) -> list[TroubleTrial]:
+    """Every kind of trouble, `runs` times."""
+    return [trouble_trial(trouble, first_seed + k) for trouble in TROUBLES for k in range(runs)]
+
+
+def trouble_rows(trials: list[TroubleTrial]) -> dict[str, str]:
+    """A line per kind and method."""
+    rows: dict[str, str] = {}
+    for name, method in dict.fromkeys((t.name, t.method) for t in trials):
+        mine = [t for t in trials if (t.name, t.method) == (name, method)]
+        done = [t for t in mine if not t.refused]
+        right = f"{sum(t.ok for t in mine)} as they have to be"
+        rows[f"{name}, {method}"] = f"{len(done)} of {len(mine)} planned, {right}{error_text(done)}"
+    return rows

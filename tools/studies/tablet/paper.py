@@ -1,4 +1,4 @@
-"""What the tablet paper prints: its data (Tables 2 and 3) and its results (Tables 7 to 12).
+"""Data of the tablet paper (Tables 2 and 3) and its results (Tables 7 to 12).
 
 J. Sato, "Hand-Eye Calibration Using a Tablet Computer", Math. Comput. Appl. 2023, 28(1), 22, doi 10.3390/mca28010022, CC BY 4.0.
 The tablet's grid and the turn at the first landmark are not printed; both are inferred from the printed results.
@@ -70,6 +70,11 @@ STAGE_2: dict[Model, PrintedStage] = {
 TABLE_NUMBER = {("htm", 1): 7, ("dh", 1): 8, ("htm", 2): 10, ("dh", 2): 11}
 # Tables 9 and 12: mean touching error of the robot, mm, five trials (an experiment: nothing here can repeat it)
 TOUCHING_MM = {9: (1.23, 1.29, 1.26, 1.21, 1.26), 12: (0.98, 1.02, 0.99, 1.03, 1.03)}
+
+
+def printed_stage(model: Model, stage: int) -> PrintedStage:
+    """The results table of one stage of one chain."""
+    return (STAGE_1 if stage == 1 else STAGE_2)[model]
 
 
 def published_touches() -> TabletTouches:

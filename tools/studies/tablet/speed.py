@@ -1,4 +1,4 @@
-"""What a tablet calibration costs: the closed form, PnP, the paper's stages, and the published search beside them."""
+"""Times each tablet calibration: closed form, PnP, the paper's stages, and the published search."""
 
 from __future__ import annotations
 

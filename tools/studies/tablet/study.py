@@ -1,4 +1,4 @@
-"""The tablet paper's tables done again: every stage, sign and model, their cost, and how well each predicts what it did not see."""
+"""Reproduces the tablet paper's tables: every stage, sign and model, their cost, and their prediction errors."""
 
 from __future__ import annotations
 
@@ -187,8 +187,7 @@ def two_stage_errors(touches: TabletTouches, keep: NDArray[np.bool_], sign: Sign
     """Hand errors (n, 2) m of the paper's stage 1 and of both its stages, fitted to some landmarks, at all of them, against
     their own r' (Eq. 20)."""
     fitted = touches.pick(keep)
-    first = tablet_stage1(fitted, "htm", sign).parameters
-    second = tablet_stage2(fitted, first, "htm", sign).parameters
+    first, second = _two_stages(fitted, sign)
     target = touches.hand_m + 1e-3 * sign * place_landmarks(touches, first, "htm").correction[0]
     asked = (
         hand_to_touch(fitted, first, affine, touches.uv_px, touches.depth_m, touches.theta_rad)
@@ -196,6 +195,11 @@ def two_stage_errors(touches: TabletTouches, keep: NDArray[np.bool_], sign: Sign
     )
     of_one, of_both = (np.asarray(a - target) for a in asked)
     return of_one, of_both
+
+
+def _two_stages(touches: TabletTouches, sign: Sign) -> tuple[Array, Array]:
+    first = tablet_stage1(touches, "htm", sign).parameters
+    return first, tablet_stage2(touches, first, "htm", sign).parameters
 
 
 def _model_row(name: str, unknowns: int, own: Array, left_out: Array) -> ModelRow:
@@ -211,8 +215,7 @@ def held_out(seed: int, trials: int, published_trials: int) -> tuple[HeldOutRow,
 
     def two_stage(sign: Sign) -> Callable[[TabletTrial], Array]:
         def asked(t: TabletTrial) -> Array:
-            first = tablet_stage1(t.touches, "htm", sign).parameters
-            second = tablet_stage2(t.touches, first, "htm", sign).parameters
+            first, second = _two_stages(t.touches, sign)
             return hand_to_touch(t.touches, first, second, t.query_uv_px, t.query_depth_m, t.query_theta_rad)
 
         return asked

@@ -1,4 +1,4 @@
-"""A tablet, a camera and a pen that are known exactly: touches with the paper's noise, and queries that no fit sees."""
+"""Simulated tablet, camera and pen: touches with the paper's noise, and queries for validation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class TabletNoise:
     """Noise of the simulated devices, as the paper's data suggest it: a depth camera that reads 1.5 % short and 0.8 mm
-    noisy, blobs of 0.15 px read to whole pixels, hands read to whole millimetres, touches 2.5 px beside the dot, a table level within 0.7 deg."""
+    noisy, blobs of 0.15 px read to whole pixels, hands read to whole millimetres, touches 2.5 px off the dot, a table level within 0.7 deg."""
 
     depth_scale: float = 0.985
     depth_m: float = 0.8e-3

@@ -1,4 +1,4 @@
-"""What is wrong with the study's world: tag, robot, wall and plan, in the two error budgets of the targets."""
+"""Error budgets of the weld study: tag, robot, wall and plan."""
 
 from __future__ import annotations
 

@@ -1,77 +1,23 @@
-"""The whole study as one call: rows, turns and laws run, tables, CSV files and the report written."""
+"""Runs the weld study: rows, turns and laws; writes table.json, CSV files and report.html."""
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable
+from dataclasses import astuple, fields
 
-from weldcal.tools.console import Progress, plain
+from weldcal.tools.console import Progress
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.weld.files import row_summary, run_csv, runs_csv, turn_summary
+from weldcal.tools.studies.output import csv_text, write_json
 from weldcal.tools.studies.weld.metrics import RunMetrics
-from weldcal.tools.studies.weld.plant import StudyRun
+from weldcal.tools.studies.weld.plant import COLUMNS, PHASES, StudyRun
+from weldcal.tools.studies.weld.report import study_report
+from weldcal.tools.studies.weld.results import Study, StudyOptions
 from weldcal.tools.studies.weld.rows import COMPARED, Case, get_rows
-from weldcal.tools.studies.weld.study import CaseResult, RowResult, measure_row, run_cases
+from weldcal.tools.studies.weld.study import CaseResult, measure_row, run_cases
 from weldcal.tools.studies.weld.turns import CHORDS, TURNS, TurnResult, run_turn
 
 COMPARED_SEEDS = 3
-
-
-@dataclass(frozen=True)
-class StudyOptions:
-    """Where to write, which rows (all when none), how many seeds from which on, and whether in short."""
-
-    folder: Path
-    rows: tuple[str, ...] = ()
-    seeds: int = 10
-    first_seed: int = 0
-    quick: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Study:
-    """Everything that a study found."""
-
-    options: StudyOptions
-    rows: tuple[RowResult, ...]
-    turns: tuple[TurnResult, ...]
-    compared: tuple[CaseResult, ...]
-    pictured: tuple[tuple[Case, StudyRun, RunMetrics], ...]
-    wall_seconds: float
-
-    @property
-    def folder(self) -> Path:
-        """Where it was written."""
-        return self.options.folder
-
-    @property
-    def met(self) -> bool:
-        """Whether every weld was completed, every target met, and every impossible turn named."""
-        return all(r.met for r in self.rows) and all(t.named and not t.stalled for t in self.turns)
-
-    def summary(self) -> dict[str, object]:
-        """The result for JSON."""
-        return {
-            "state": "done",
-            "met": self.met,
-            "seeds": self.options.seeds,
-            "first_seed": self.options.first_seed,
-            "rows": {r.row.key: row_summary(r) for r in self.rows},
-            "turns": [turn_summary(t) for t in self.turns],
-            "laws": [
-                {
-                    "case": c.case.name,
-                    "law": c.case.law,
-                    "completed": c.completed,
-                    "runs": [m.as_row() for m in c.metrics],
-                }
-                for c in self.compared
-            ],
-            "wall_seconds": self.wall_seconds,
-            "written_to": self.folder,
-        }
 
 
 def run_study(options: StudyOptions, progress: Progress) -> Study:
@@ -108,17 +54,30 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
         tuple(pictured.values()),
         time.monotonic() - start,
     )
-    _write(study, [*results.values(), *compared.values()])
-    return study
-
-
-def _write(study: Study, results: list[CaseResult]) -> None:
-    from weldcal.tools.studies.weld.report import study_report
-
-    folder = study.folder
-    text = json.dumps(plain(study.summary()), allow_nan=False, indent=1)
-    write_atomic(folder / "table.json", text + "\n")
-    write_atomic(folder / "runs.csv", runs_csv(results))
+    folder = options.folder
+    write_json(folder / "table.json", study.summary())
+    write_atomic(folder / "runs.csv", runs_csv([*results.values(), *compared.values()]))
     for case, run, _ in study.pictured:
         write_atomic(folder / "runs" / f"{case.name}.csv", run_csv(run))
     write_atomic(folder / "report.html", study_report(study))
+    return study
+
+
+def runs_csv(results: Iterable[CaseResult]) -> str:
+    """One line per run: case, seed and every figure."""
+    header = ["case", "seam", "budget", "chord_mm", "speed_mm_s", "law", "seed", *(f.name for f in fields(RunMetrics))]
+    lines: list[tuple[object, ...]] = []
+    for result in results:
+        c = result.case
+        head = (c.name, c.seam, c.budget, 1e3 * c.chord_m, 1e3 * c.speed_m_s, c.law)
+        lines += [(*head, seed, *astuple(m)) for seed, m in zip(result.seeds, result.metrics, strict=True)]
+    return csv_text(header, lines)
+
+
+def run_csv(run: StudyRun) -> str:
+    """One run, a line per servo tick; units in the header's names, positions in m."""
+    k = COLUMNS.index("phase")
+    lines = [[f"{v:.7g}" for v in row] for row in run.table.tolist()]
+    for line, phase in zip(lines, run.column("phase"), strict=True):
+        line[k] = PHASES[int(phase)].value
+    return csv_text(COLUMNS, lines)

@@ -1,4 +1,4 @@
-"""The tip in its groove: a massless sphere on springs between two walls, with Coulomb friction and free ends."""
+"""Contact of the tip in the groove: a massless sphere on springs between two walls with Coulomb friction."""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What one simulated weld came to, against the true line that only the study knows."""
+"""Figures of one simulated weld against the true seam."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ class RunMetrics:
         time_ratio: time of the weld over its length at the wanted speed.
         omega_rad_s, tip_speed_mm_s: largest commanded; end_step_mm_s: largest step between ticks from the seam's end on.
         work_deg: largest lean across the chord against the normal at the torch; travel_deg: largest pitch of the chord
-            against the surface at the torch; travel_error_deg: against what the chord map of the plan foretold.
+            against the surface at the torch; travel_error_deg: against what the chord map of the plan predicts.
         space_mm: largest distance in space; start_mm, stop_mm: where the arc went on and off, along the true seam
             (from its start, and past its end).
         gain: the tag's gain as calibrated.
@@ -62,10 +62,6 @@ class RunMetrics:
     start_mm: float = math.nan
     stop_mm: float = math.nan
     gain: float = math.nan
-
-    def as_row(self) -> dict[str, object]:
-        """The figures by name."""
-        return asdict(self)
 
 
 def judge(
@@ -146,17 +142,16 @@ def _speed(run: StudyRun, weld_speed_m_s: float, s: Array, moving: NDArray[np.bo
 def _angles(
     run: StudyRun, chord_m: float, deflection_m: float, s: Array, moving: NDArray[np.bool_]
 ) -> dict[str, float]:
-    """Work and travel angle against the true surface at the torch, and the travel angle the true seam foretells."""
+    """Work and travel angle against the true surface at the torch, and the travel angle that the true seam predicts."""
     on_seam = (s >= 0.0) & (s <= run.torch_line.length - chord_m)
     if not on_seam.any():
         return {}
     up = run.torch_line.up(s[on_seam])
-    lean = np.degrees(np.arcsin(np.clip(np.sum(run.points("left")[moving][on_seam] * up, axis=1), -1.0, 1.0)))
-    pitch = np.degrees(np.arcsin(np.clip(np.sum(run.points("ahead")[moving][on_seam] * up, axis=1), -1.0, 1.0)))
+    lean, pitch = (np.degrees(a) for a in run.angles(np.flatnonzero(moving)[on_seam], up))
     chart = chord_map(run.torch_line, chord_m, 0.008, spacing=1e-3, tip_left=deflection_m)
-    foretold = np.degrees(chart.travel_at(s[on_seam]))
+    predicted = np.degrees(chart.travel_at(s[on_seam]))
     return {
         "work_deg": float(np.abs(lean).max()),
         "travel_deg": float(np.abs(pitch).max()),
-        "travel_error_deg": float(np.abs(pitch - foretold).max()),
+        "travel_error_deg": float(np.abs(pitch - predicted).max()),
     }

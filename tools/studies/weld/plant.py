@@ -1,4 +1,4 @@
-"""The study's world around the servo: a robot that lags, a tag that is late, noisy and wrong, a tip in its groove."""
+"""Plant of the weld study: a lagging robot, a late and noisy tag, a tip in its groove."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.tools.studies.weld.budgets import Budget, planned_seam, roughness
@@ -54,6 +55,13 @@ class StudyRun:
         """Points (N,3) m of "torch", "robot" or "tip", the velocity "v", or the tool's axes "ahead" (x_T) and "left" (y_T)."""
         first = COLUMNS.index(f"{name}_x")
         return np.asarray(self.table[:, first : first + 3])
+
+    def angles(self, rows: NDArray[np.bool_] | NDArray[np.int64], up: Array) -> tuple[Array, Array]:
+        """Work and travel angle (n,) rad of the tool at these ticks, against surface normals (n,3)."""
+        left, ahead = (
+            np.arcsin(np.clip(np.sum(self.points(name)[rows] * up, axis=1), -1.0, 1.0)) for name in ("left", "ahead")
+        )
+        return left, ahead
 
     @property
     def phase(self) -> Phase:

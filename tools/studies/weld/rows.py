@@ -1,4 +1,4 @@
-"""The rows of the target table: which welds, which figure of them, and what it is to be held against."""
+"""Rows of the target table: welds, figures and limits."""
 
 from __future__ import annotations
 

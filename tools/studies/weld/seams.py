@@ -1,4 +1,4 @@
-"""The seams of the study: straight, S, L of every radius, turns no torch can follow, and the same on a cylinder."""
+"""Seams of the weld study: straight, S, L corners, infeasible turns, and seams on a cylinder."""
 
 from __future__ import annotations
 

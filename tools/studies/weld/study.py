@@ -1,4 +1,4 @@
-"""The study of the weld law: every case over its seeds, figures against targets, one result that can be written down."""
+"""Runs every case of the weld study over its seeds and compares the figures with the targets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns, U-turns and cusps: what the chord map foretells of each before the arc is lit, and what the law then does."""
+"""Turns, U-turns and cusps: the prediction of the chord map, and the result of the weld."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class TurnResult:
 
 
 def run_turn(seam: str, chord_m: float, seed: int) -> TurnResult:
-    """Foretell and then try one seam with one chord, with the nominal budget's plan; what is refused is welded in pieces."""
+    """Predict and then weld one seam with one chord, with the nominal budget's plan; what is refused is welded in pieces."""
     case = Case(seam, chord_m=chord_m)
     config = study_config(case)
     true = get_seam(seam)

@@ -1,4 +1,4 @@
-"""The arm of the emulated controller: the simulation's kinematic model, moved 2 ms at a time."""
+"""Arm of the emulated controller: integrates the kinematic model in steps of 2 ms."""
 
 from __future__ import annotations
 

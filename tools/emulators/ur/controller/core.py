@@ -1,90 +1,42 @@
-"""The controller core: power, safety, program and watchdogs around the arm, one call of `step` every 2 ms."""
+"""The controller: runs programs and watchdogs, and moves the arm, one call of `step` every 2 ms."""
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
-from weldcal.tools.emulators.ur.controller.modes import POWERLESS, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, MotionRefused
-from weldcal.tools.emulators.ur.controller.registers import Payload, Registers, Terminals, Watchdog
+from weldcal.tools.emulators.ur.controller.registers import Registers
+from weldcal.tools.emulators.ur.controller.state import POWER_STEP_S, ControllerState
 from weldcal.tools.emulators.ur.script.builtins import script_functions
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 from weldcal.tools.emulators.ur.versions import Version
 
-START_TIMESTAMP_S = 100.0  # a controller has been on for a while; some clients wait for more than 40 s
-UNLOCK_AFTER_S = 5.0
-POWER_STEP_S = 0.5  # [M] how long power on and brake release take
+WORDS = ("stop program", "power on", "power off", "set robotmode run", "set unlock protective stop")
 
 
-class Controller:
-    """Everything but the wire. Times count in frames of 2 ms; the wire's faults live in the servers."""
+class Controller(ControllerState):
+    """Everything but the wire; the wire's faults live in the servers."""
 
     def __init__(self, model: ArmModel, q: NDArray[np.float64], version: Version) -> None:
-        self.version = version
-        self.arm = EmulatedArm(model, q)
-        self.inputs, self.outputs, self.terminals = Registers(), Registers(), Terminals()
-        self.external_wrench = [0.0] * 6
-        self.tcp_offset = [0.0] * 6
-        self.payload = Payload(0.0, [0.0] * 3, [0.0] * 6)
-        self.tool_contact_steps = 0
-        self.frame = 0
-        self.timestamp = START_TIMESTAMP_S
-        self.clock_rate = 1.0
-        self.robot_mode = RobotMode.RUNNING
-        self.safety_mode = SafetyMode.NORMAL
-        self.runtime_state = RuntimeState.STOPPED
-        self.remote = True
-        self.refuse_upload = False
-        self.start_delay_s = 0.0
+        super().__init__(model, q, version)
         self.program: Program | None = None
         self.program_name = ""
         self.sidekicks: list[Program] = []
-        self.watchdogs: dict[str, Watchdog] = {}
-        self.log: deque[str] = deque(maxlen=200)
-        self.events: deque[tuple[str, str, int]] = deque(maxlen=200)
-        self.protective_since = -(10**9)
         self.script_count = 0
-        self._later: list[tuple[int, Callable[[], object]]] = []
-
-    @property
-    def time_s(self) -> float:
-        """Seconds since start, by the count of frames."""
-        return self.frame * STEP_S
-
-    @property
-    def speed_scaling(self) -> float:
-        """Share of the commanded speed that the slider lets through."""
-        return self.terminals.speed_slider
-
-    def note(self, text: str) -> None:
-        """Writes to the log."""
-        self.log.append(f"{self.time_s:.3f} {text}")
-
-    def later(self, seconds: float, action: Callable[[], object]) -> None:
-        """Does something after some time."""
-        self._later.append((self.frame + round(seconds / STEP_S), action))
 
     # programs
 
     def submit(self, source: str) -> None:
-        """Text of one program from a script port: runs it where the state allows, or drops it without a word."""
+        """Text of one program from a script port: runs it where the state allows, or drops it."""
         line = source.strip()
         words = line.rstrip("()").strip()
-        if self.version.takes_scripts and words in (
-            "stop program",
-            "power on",
-            "power off",
-            "set robotmode run",
-            "set unlock protective stop",
-        ):
+        if self.version.takes_scripts and words in WORDS:
             self._word(words)
             return
         if not line or line.startswith("#"):
@@ -115,8 +67,8 @@ class Controller:
                 self.later(POWER_STEP_S + STEP_S, self.release_brakes)
 
     def start(self, source: str) -> bool:
-        """Starts a program in place of the running one; a `sec` runs beside it."""
-        if self.robot_mode != RobotMode.RUNNING or self.safety_mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
+        """Starts a program in place of the running one; a `sec` runs in parallel."""
+        if not self.ready:
             self.note("program ignored: the robot is not running or a safety stop is active")
             return False
         try:
@@ -153,66 +105,14 @@ class Controller:
         self.arm.motion = None
         self.watchdogs.clear()
 
-    def pause_program(self) -> None:
-        """The program stands still and the arm brakes on its path; `resume_program` goes on from there."""
-        if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
-            self.runtime_state = RuntimeState.PAUSING
-
     def resume_program(self) -> bool:
         """Dashboard `play`, also after a protective stop: the program goes on with whatever its registers hold."""
-        ready = self.robot_mode == RobotMode.RUNNING and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
-        if self.program is None or not ready or not self.remote:
+        if self.program is None or not self.ready or not self.remote:
             return False
         self.runtime_state = RuntimeState.PLAYING
         for watchdog in self.watchdogs.values():
             watchdog.fed_at = self.frame
         return True
-
-    # safety and power
-
-    def protective_stop(self, reason: str) -> None:
-        """The arm brakes and the program pauses until somebody unlocks."""
-        if self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED):
-            self.set_safety_mode(SafetyMode.PROTECTIVE_STOP)
-            self.note(f"protective stop: {reason}")
-
-    def set_safety_mode(self, mode: SafetyMode) -> None:
-        """What the safety system would do; modes that stop also pause the program."""
-        self.safety_mode = mode
-        if mode == SafetyMode.PROTECTIVE_STOP:
-            self.protective_since = self.frame
-        if mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED):
-            self.pause_program()
-        if mode in POWERLESS:
-            self.robot_mode = RobotMode.POWER_OFF
-        self.note(f"safety mode {mode.name}")
-
-    def unlock_protective_stop(self) -> bool:
-        """Only a protective stop that is at least 5 s old unlocks."""
-        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
-            return True
-        if (self.frame - self.protective_since) * STEP_S < UNLOCK_AFTER_S:
-            return False
-        self.set_safety_mode(SafetyMode.NORMAL)
-        return True
-
-    def power_on(self) -> None:
-        """POWER_OFF -> POWER_ON -> IDLE."""
-        if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode not in POWERLESS:
-            self.robot_mode = RobotMode.POWER_ON
-            self.later(POWER_STEP_S, lambda: self._advance(RobotMode.POWER_ON, RobotMode.IDLE))
-
-    def release_brakes(self) -> None:
-        """IDLE -> RUNNING."""
-        if self.robot_mode == RobotMode.IDLE:
-            self.later(POWER_STEP_S, lambda: self._advance(RobotMode.IDLE, RobotMode.RUNNING))
-        elif self.robot_mode == RobotMode.POWER_OFF:
-            self.power_on()
-            self.later(POWER_STEP_S + STEP_S, self.release_brakes)
-
-    def _advance(self, before: RobotMode, after: RobotMode) -> None:
-        if self.robot_mode == before:
-            self.robot_mode = after
 
     def power_off(self) -> None:
         """The brakes fall; the program ends."""
@@ -230,19 +130,6 @@ class Controller:
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0
         self.note("rebooted")
-
-    # inputs
-
-    def written(self, names: tuple[str, ...]) -> None:
-        """Inputs arrived: those with a watchdog have been fed."""
-        for name in names:
-            if name in self.watchdogs:
-                self.watchdogs[name].fed_at = self.frame
-
-    def set_tcp(self, pose: list[float]) -> None:
-        """The tool centre point in the flange frame."""
-        self.tcp_offset = [float(value) for value in pose]
-        self.arm.set_tcp(self.tcp_offset)
 
     # time
 
@@ -289,13 +176,8 @@ class Controller:
                     return
 
     def _move(self) -> None:
-        driven = (
-            self.runtime_state == RuntimeState.PLAYING
-            and self.program is not None
-            and self.program.owner is not None
-            and self.robot_mode == RobotMode.RUNNING
-            and self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
-        )
+        playing = self.runtime_state == RuntimeState.PLAYING and self.ready
+        driven = playing and self.program is not None and self.program.owner is not None
         try:
             self.arm.step(driven, self.speed_scaling)
         except MotionRefused as refused:

@@ -1,4 +1,4 @@
-"""The Denavit-Hartenberg numbers of a chain of link transforms, as a controller's KinematicsInfo holds them."""
+"""Denavit-Hartenberg parameters of a chain of link transforms, as in a controller's KinematicsInfo."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The controller's enumerations, as RTDE numbers them."""
+"""Enumerations of the controller, numbered as in RTDE."""
 
 from __future__ import annotations
 
@@ -45,32 +45,13 @@ class SafetyMode(enum.IntEnum):
     FAULT = 9
 
 
-POWERLESS = frozenset(
-    {
-        SafetyMode.SYSTEM_EMERGENCY_STOP,
-        SafetyMode.ROBOT_EMERGENCY_STOP,
-        SafetyMode.VIOLATION,
-        SafetyMode.FAULT,
-    }
-)
-_BIT = {
-    SafetyMode.NORMAL: 0,
-    SafetyMode.REDUCED: 1,
-    SafetyMode.PROTECTIVE_STOP: 2,
-    SafetyMode.RECOVERY: 3,
-    SafetyMode.SAFEGUARD_STOP: 4,
-    SafetyMode.SYSTEM_EMERGENCY_STOP: 5,
-    SafetyMode.ROBOT_EMERGENCY_STOP: 6,
-    SafetyMode.VIOLATION: 8,
-    SafetyMode.FAULT: 9,
-}
+MOVING = frozenset({SafetyMode.NORMAL, SafetyMode.REDUCED})
+_EMERGENCY = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
+POWERLESS = _EMERGENCY | {SafetyMode.VIOLATION, SafetyMode.FAULT}
 
 
 def safety_status_bits(mode: SafetyMode) -> int:
     """RTDE's safety_status_bits: one bit a mode, bit 7 for any emergency stop, bit 10 for stopped due to safety."""
-    bits = 1 << _BIT[mode]
-    if mode in (SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP):
-        bits |= 1 << 7
-    if mode not in (SafetyMode.NORMAL, SafetyMode.REDUCED, SafetyMode.RECOVERY):
-        bits |= 1 << 10
-    return bits
+    bits = 1 << (mode if mode >= SafetyMode.VIOLATION else mode - 1)
+    bits |= (mode in _EMERGENCY) << 7
+    return bits | (mode not in MOVING | {SafetyMode.RECOVERY}) << 10

@@ -1,4 +1,4 @@
-"""How URScript's motions move the joints: each turns the state of the arm into the joint velocity of the next 2 ms.
+"""URScript motions: each computes the joint velocity of the next 2 ms from the arm's state.
 
 Marked [M] in docs/ur_emulator.md: profiles are trapezoids without jerk limit, blends are stops, servoj is a first-order
 chase, and the reaction to limits is a protective stop.
@@ -41,16 +41,14 @@ class Motion(Protocol):
     """A motion under way."""
 
     streamed: bool
+    done: bool
+    """The target is reached."""
 
     def velocity(self, arm: ArmState, scaling: float) -> Array:
         """Joint velocity (6) rad/s for the next step; scaling is the speed slider."""
 
     def braked(self, factor: float) -> None:
         """The arm was slowed by `factor` instead, along its path."""
-
-    @property
-    def done(self) -> bool:
-        """The target is reached."""
 
 
 def limited(current: Array, wanted: Array, step: float, model: ArmModel) -> Array:
@@ -70,20 +68,16 @@ class JointVelocity:
 
     def __init__(self, target: Array, acceleration: float) -> None:
         self.target, self.acceleration = target, acceleration
-        self._reached = False
+        self.done = False
 
     def velocity(self, arm: ArmState, scaling: float) -> Array:
         wanted = self.target * scaling
         qd = limited(arm.qd_target, wanted, self.acceleration * STEP_S, arm.model)
-        self._reached = bool(np.abs(qd - wanted).max() < REST_RAD_S)
+        self.done = bool(np.abs(qd - wanted).max() < REST_RAD_S)
         return qd
 
     def braked(self, factor: float) -> None:
-        self._reached = False
-
-    @property
-    def done(self) -> bool:
-        return self._reached
+        self.done = False
 
 
 class ToolVelocity:
@@ -95,23 +89,19 @@ class ToolVelocity:
         self.target, self._linear, self._angular = target, acceleration, angular
         # kept as its own variable: the twist recomputed through the Jacobian never equals the target
         self.twist = start.copy()
-        self._reached = False
+        self.done = False
 
     def velocity(self, arm: ArmState, scaling: float) -> Array:
         wanted = self.target * scaling
         change = wanted - self.twist
         time = max(float(np.linalg.norm(change[:3])) / self._linear, float(np.linalg.norm(change[3:])) / self._angular)
         self.twist = wanted.copy() if time <= STEP_S else self.twist + change * (STEP_S / time)
-        self._reached = time <= STEP_S
+        self.done = time <= STEP_S
         return joint_velocity(arm, self.twist)
 
     def braked(self, factor: float) -> None:
         self.twist = self.twist * factor
-        self._reached = False
-
-    @property
-    def done(self) -> bool:
-        return self._reached
+        self.done = False
 
 
 class Path:
@@ -122,7 +112,7 @@ class Path:
     def __init__(self, joints: Callable[[float, Array], Array], length: float, speed: float, acceleration: float):
         self._joints, self._length = joints, length
         self._speed, self._acceleration = speed, acceleration
-        self._s, self._sdot = 0.0, 0.0
+        self._s, self._sdot, self.done = 0.0, 0.0, False
 
     def velocity(self, arm: ArmState, scaling: float) -> Array:
         left = self._length - self._s
@@ -133,25 +123,21 @@ class Path:
             self._s, self._sdot = self._length, 0.0
         else:
             self._s += self._sdot * STEP_S
-        return self._towards(arm)
+        self.done = self._s >= self._length
+        return np.asarray((self._joints(self._s, arm.q_target) - arm.q_target) / STEP_S, dtype=np.float64)
 
     def braked(self, factor: float) -> None:
         # the arm leaves its place on the path by nothing: the next step starts from the slower speed
         self._sdot *= factor
         self._s = min(self._length, self._s + self._sdot * STEP_S)
-
-    def _towards(self, arm: ArmState) -> Array:
-        return np.asarray((self._joints(self._s, arm.q_target) - arm.q_target) / STEP_S, dtype=np.float64)
-
-    @property
-    def done(self) -> bool:
-        return self._s >= self._length
+        self.done = self._s >= self._length
 
 
 class Servo:
     """servoj: a first-order chase of the newest joint target with the look-ahead as time constant [M]."""
 
     streamed = True
+    done = False
 
     def __init__(self, goal: Array, lookahead: float) -> None:
         self._goal, self._lookahead = goal, lookahead
@@ -164,10 +150,6 @@ class Servo:
     def braked(self, factor: float) -> None:
         return
 
-    @property
-    def done(self) -> bool:
-        return False
-
 
 class Stop:
     """stopj, and stopl where the arm can hold its line: every joint slows by the same share."""
@@ -176,8 +158,7 @@ class Stop:
 
     def __init__(self, deceleration: float, twist: Array | None = None) -> None:
         self._deceleration, self._twist = deceleration, twist
-        self._share = 1.0
-        self._done = False
+        self._share, self.done = 1.0, False
 
     def velocity(self, arm: ArmState, scaling: float) -> Array:
         if self._twist is not None and (speed := float(np.abs(self._twist).max())) > 0.0:
@@ -186,16 +167,12 @@ class Stop:
             qd = joint_velocity(arm, self._twist * self._share)
         else:
             qd = slowed(arm.qd_target, self._deceleration)
-        self._done = bool(np.abs(qd).max() < REST_RAD_S)
+        self.done = bool(np.abs(qd).max() < REST_RAD_S)
         return qd
 
     def braked(self, factor: float) -> None:
         self._share *= factor
-        self._done = factor == 0.0
-
-    @property
-    def done(self) -> bool:
-        return self._done
+        self.done = factor == 0.0
 
 
 def slowed(qd: Array, deceleration: float) -> Array:

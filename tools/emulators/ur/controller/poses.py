@@ -1,4 +1,4 @@
-"""UR poses: [x, y, z, rx, ry, rz] with a rotation vector, and the few operations that URScript does on them."""
+"""UR poses [x, y, z, rx, ry, rz] with a rotation vector, and their conversions."""
 
 from __future__ import annotations
 

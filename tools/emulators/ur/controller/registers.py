@@ -1,4 +1,4 @@
-"""Registers and terminals: what RTDE inputs write and scripts read, and the other way round. Values outlive programs."""
+"""Registers and terminals that RTDE and scripts read and write; values outlive programs."""
 
 from __future__ import annotations
 
@@ -52,9 +52,8 @@ class Terminals:
     def __init__(self) -> None:
         self.digital_inputs = 0
         self.digital_outputs = 0
-        self.runstate: dict[
-            int, int
-        ] = {}  # of standard outputs: what set_runstate_standard_digital_output_to_value chose
+        # of standard outputs: what set_runstate_standard_digital_output_to_value chose
+        self.runstate: dict[int, int] = {}
         self.analog_outputs = [0.0, 0.0]
         self.analog_output_types = 0
         self.speed_slider = 1.0

@@ -1,9 +1,10 @@
-"""URScript's functions that answer at once, by their own names: registers, states, kinematics, poses."""
+"""URScript functions that return at once: registers, states, kinematics, poses."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,10 @@ from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
 from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
+from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.compiler import Pose
+from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
-
-if TYPE_CHECKING:
-    from weldcal.tools.emulators.ur.controller.core import Controller
-    from weldcal.tools.emulators.ur.script.program import Program
 
 Array = NDArray[np.float64]
 
@@ -41,30 +40,59 @@ def positive(value: Any, what: str) -> float:
     return float(value)
 
 
+READS: dict[str, Callable[[ControllerState], Any]] = {
+    "get_steptime": lambda c: STEP_S,
+    "get_actual_joint_positions": lambda c: c.arm.q.tolist(),
+    "get_target_joint_positions": lambda c: c.arm.q_target.tolist(),
+    "get_actual_joint_speeds": lambda c: c.arm.qd.tolist(),
+    "get_target_joint_speeds": lambda c: c.arm.qd_target.tolist(),
+    "get_actual_tcp_pose": lambda c: Pose(c.arm.tool_pose()),
+    "get_target_tcp_pose": lambda c: Pose(c.arm.tool_pose(target=True)),
+    "get_target_waypoint": lambda c: Pose(c.arm.tool_pose(target=True)),
+    "get_actual_tcp_speed": lambda c: list(c.arm.tool_speed()),
+    "get_target_tcp_speed": lambda c: list(c.arm.tool_speed(target=True)),
+    "get_actual_tool_flange_pose": lambda c: Pose(pose_of(c.arm.flange(c.arm.q))),
+    "get_tcp_force": lambda c: [0.0] * 6,
+    "get_joint_torques": lambda c: [0.0] * 6,
+    "get_tcp_offset": lambda c: Pose(c.tcp_offset),
+    "get_target_payload": lambda c: c.payload.mass,
+    "get_target_payload_cog": lambda c: list(c.payload.center),
+    "get_target_payload_inertia": lambda c: list(c.payload.inertia),
+    "is_steady": lambda c: c.arm.at_rest,
+}
+"""Functions without arguments, by their URScript name."""
+CALCULATIONS: dict[str, Callable[..., Any]] = {
+    "pose_trans": lambda p_from, p_from_to: Pose(pose_of(matrix(p_from) @ matrix(p_from_to))),
+    "pose_inv": lambda p_from: Pose(pose_of(inverse(matrix(p_from)))),
+    "pose_dist": lambda pose_from, pose_to: math.dist(pose_from[:3], pose_to[:3]),
+    "point_dist": lambda p_from, p_to: math.dist(p_from[:3], p_to[:3]),
+    "norm": lambda a: math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a)),
+    "length": lambda v: len(v),
+    "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(l)],  # noqa: E741  (URScript's own name)
+    "d2r": lambda d: math.radians(d),
+    "r2d": lambda r: math.degrees(r),
+    "pow": lambda base, exponent: float(base**exponent),
+    "to_str": lambda val: str(val),
+}
+"""Functions of their arguments alone, by their URScript name, with URScript's argument names."""
+REGISTERS = {
+    f"read_{bank}_{kind}_register": (f"{bank}s", numbers, count)
+    for bank in ("input", "output")
+    for kind, numbers, count in (
+        ("integer", "integers", N_NUMBERS),
+        ("float", "doubles", N_NUMBERS),
+        ("boolean", "bits", N_BITS),
+    )
+}
+"""Functions that read a register: direction, type and number of its bank."""
+
+
 class Answers:
     """Functions that answer at once."""
 
-    def __init__(self, controller: Controller, program: Program) -> None:
+    def __init__(self, controller: ControllerState, program: Program) -> None:
         self._controller = controller
         self._program = program
-
-    def read_input_integer_register(self, index: int) -> int:
-        return self._controller.inputs.integers[register_index(index, N_NUMBERS)]
-
-    def read_input_float_register(self, index: int) -> float:
-        return self._controller.inputs.doubles[register_index(index, N_NUMBERS)]
-
-    def read_input_boolean_register(self, index: int) -> bool:
-        return self._controller.inputs.bits[register_index(index, N_BITS)]
-
-    def read_output_integer_register(self, index: int) -> int:
-        return self._controller.outputs.integers[register_index(index, N_NUMBERS)]
-
-    def read_output_float_register(self, index: int) -> float:
-        return self._controller.outputs.doubles[register_index(index, N_NUMBERS)]
-
-    def read_output_boolean_register(self, index: int) -> bool:
-        return self._controller.outputs.bits[register_index(index, N_BITS)]
 
     def write_output_integer_register(self, index: int, value: int) -> None:
         if isinstance(value, bool) or not isinstance(value, int | float) or not -(2**31) <= value < 2**31:
@@ -86,54 +114,12 @@ class Answers:
         period = 1.0 / positive(min_frequency, "The frequency of a watchdog")
         self._controller.watchdogs[variable] = Watchdog(period, action, self._controller.frame)
 
-    def get_steptime(self) -> float:
-        return STEP_S
-
-    def get_actual_joint_positions(self) -> list[float]:
-        return list(self._controller.arm.q.tolist())
-
-    def get_target_joint_positions(self) -> list[float]:
-        return list(self._controller.arm.q_target.tolist())
-
-    def get_actual_joint_speeds(self) -> list[float]:
-        return list(self._controller.arm.qd.tolist())
-
-    def get_target_joint_speeds(self) -> list[float]:
-        return list(self._controller.arm.qd_target.tolist())
-
     def get_actual_joint_positions_history(self, steps: int = 0) -> list[float]:
         history = self._controller.arm.history
         return list((history[-1 - min(int(steps), len(history) - 1)] if history else self._controller.arm.q).tolist())
 
-    def get_actual_tcp_pose(self) -> Pose:
-        return Pose(self._controller.arm.tool_pose())
-
-    def get_target_tcp_pose(self) -> Pose:
-        return Pose(self._controller.arm.tool_pose(target=True))
-
-    def get_actual_tcp_speed(self) -> list[float]:
-        return list(self._controller.arm.tool_speed())
-
-    def get_target_tcp_speed(self) -> list[float]:
-        return list(self._controller.arm.tool_speed(target=True))
-
-    def get_actual_tool_flange_pose(self) -> Pose:
-        return Pose(pose_of(self._controller.arm.flange(self._controller.arm.q)))
-
-    def get_target_waypoint(self) -> Pose:
-        return self.get_target_tcp_pose()
-
-    def get_tcp_force(self) -> list[float]:
-        return [0.0] * 6
-
-    def get_joint_torques(self) -> list[float]:
-        return [0.0] * 6
-
     def set_tcp(self, pose: Any) -> None:
         self._controller.set_tcp(six(pose, "set_tcp").tolist())
-
-    def get_tcp_offset(self) -> Pose:
-        return Pose(self._controller.tcp_offset)
 
     def set_payload(self, m: float, cog: Any = None) -> None:
         self._controller.payload.mass = float(m)
@@ -144,15 +130,6 @@ class Answers:
         self.set_payload(m, cog)
         if inertia is not None:
             self._controller.payload.inertia = [float(value) for value in inertia]
-
-    def get_target_payload(self) -> float:
-        return self._controller.payload.mass
-
-    def get_target_payload_cog(self) -> list[float]:
-        return list(self._controller.payload.center)
-
-    def get_target_payload_inertia(self) -> list[float]:
-        return list(self._controller.payload.inertia)
 
     def get_forward_kin(self, q: Any = None, tcp: Any = None) -> Pose:
         arm = self._controller.arm
@@ -185,12 +162,6 @@ class Answers:
         except InputError as error:
             raise ScriptError(str(error)) from error
 
-    def pose_trans(self, p_from: Any, p_from_to: Any) -> Pose:
-        return Pose(pose_of(matrix(p_from) @ matrix(p_from_to)))
-
-    def pose_inv(self, p_from: Any) -> Pose:
-        return Pose(pose_of(inverse(matrix(p_from))))
-
     def pose_add(self, p_1: Any, p_2: Any) -> Pose:
         X, Y = matrix(p_1), matrix(p_2)
         X[:3, :3] = X[:3, :3] @ Y[:3, :3]
@@ -202,15 +173,6 @@ class Answers:
         X[:3, :3] = X[:3, :3] @ Y[:3, :3].T
         X[:3, 3] -= Y[:3, 3]
         return Pose(pose_of(X))
-
-    def pose_dist(self, pose_from: Any, pose_to: Any) -> float:
-        return math.dist(pose_from[:3], pose_to[:3])
-
-    def point_dist(self, p_from: Any, p_to: Any) -> float:
-        return math.dist(p_from[:3], p_to[:3])
-
-    def is_steady(self) -> bool:
-        return self._controller.arm.at_rest
 
     def is_within_safety_limits(self, pose: Any) -> bool:
         if isinstance(pose, Pose):
@@ -235,27 +197,6 @@ class Answers:
 
     def get_standard_digital_in(self, n: int) -> bool:
         return bool(self._controller.terminals.digital_inputs >> register_index(n, 8) & 1)
-
-    def norm(self, a: Any) -> float:
-        return math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a))
-
-    def length(self, v: Any) -> int:
-        return len(v)
-
-    def integer_to_binary_list(self, x: int, l: int = 32) -> list[bool]:  # noqa: E741  (URScript's own name)
-        return [bool(x >> i & 1) for i in range(l)]
-
-    def d2r(self, d: float) -> float:
-        return math.radians(d)
-
-    def r2d(self, r: float) -> float:
-        return math.degrees(r)
-
-    def pow(self, base: float, exponent: float) -> float:
-        return float(base**exponent)
-
-    def to_str(self, val: Any) -> str:
-        return str(val)
 
     def textmsg(self, s1: Any, s2: Any = "") -> None:
         self._controller.note(f"script: {s1}{s2}")

@@ -1,4 +1,4 @@
-"""URScript's own functions, as far as the client's script and a guard script call them, bound to one program.
+"""URScript functions of the controller, as far as the client's script and a guard script call them.
 
 Motions and the reads of sockets are generators that take frames; all other functions answer at once. What the emulator has no
 physics for (force mode, freedrive ...) is accepted and noted in the log.
@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from weldcal.tools.emulators.ur.script.answers import Answers
+from weldcal.tools.emulators.ur.controller.registers import register_index
+from weldcal.tools.emulators.ur.controller.state import ControllerState
+from weldcal.tools.emulators.ur.script.answers import CALCULATIONS, READS, REGISTERS, Answers
 from weldcal.tools.emulators.ur.script.dynamics import Dynamics
 from weldcal.tools.emulators.ur.script.motions import Motions
+from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
-
-if TYPE_CHECKING:
-    from weldcal.tools.emulators.ur.controller.core import Controller
-    from weldcal.tools.emulators.ur.script.program import Program
 
 BLOCKING = frozenset(
     {
@@ -34,47 +33,40 @@ SINCE = {
     ),
     **dict.fromkeys((name for name in vars(Dynamics) if not name.startswith("_")), ((5, 23), (10, 9))),
 }
-NO_EFFECT = {
-    "force_mode": None,
-    "end_force_mode": None,
-    "force_mode_set_damping": None,
-    "force_mode_set_gain_scaling": None,
-    "freedrive_mode": None,
-    "end_freedrive_mode": None,
-    "teach_mode": None,
-    "end_teach_mode": None,
-    "get_freedrive_status": 0,
-    "zero_ftsensor": None,
-    "set_gravity": None,
-    "enable_external_ft_sensor": None,
-    "ft_rtde_input_enable": None,
-    "direct_torque": None,
-    "set_friction_scales": None,
-    "set_safety_mode_transition_hardness": None,
-    "set_conveyor_tick_count": None,
+MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sqrt", "floor", "ceil", "log")
+NO_EFFECT: dict[str, int | None] = {
+    **dict.fromkeys(("force_mode", "end_force_mode", "force_mode_set_damping", "force_mode_set_gain_scaling")),
+    **dict.fromkeys(("freedrive_mode", "end_freedrive_mode", "teach_mode", "end_teach_mode", "direct_torque", "popup")),
+    **dict.fromkeys(("zero_ftsensor", "enable_external_ft_sensor", "ft_rtde_input_enable", "set_gravity")),
+    **dict.fromkeys(("set_friction_scales", "set_safety_mode_transition_hardness", "set_conveyor_tick_count")),
     "set_tool_voltage": None,
-    "popup": None,
+    "get_freedrive_status": 0,
 }
 
 
 def script_functions(
-    controller: Controller, program: Program
+    controller: ControllerState, program: Program
 ) -> tuple[Mapping[str, Callable[..., Any]], Iterable[str]]:
     """All functions by their URScript name, and the names of those that are generators."""
     functions = Motions(controller, program)
+
+    def known(name: str) -> bool:
+        return controller.version.at_least(*SINCE.get(name, FIRST))
+
     named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name, v) for name, v in NO_EFFECT.items()}
     named |= {
         name: getattr(functions, name)
         for kind in (Motions, Sockets, Dynamics, Answers)
         for name in vars(kind)
-        if not name.startswith("_") and controller.version.at_least(*SINCE.get(name, FIRST))
+        if not name.startswith("_") and known(name)
     }
-    named |= {name: _real(getattr(math, name)) for name in ("sin", "cos", "tan", "asin", "acos", "atan", "atan2")}
-    named |= {name: _real(getattr(math, name)) for name in ("sqrt", "floor", "ceil", "log")}
+    named |= {name: _read(controller, name, read) for name, read in READS.items() if known(name)}
+    named |= {name: _register(controller, *bank) for name, bank in REGISTERS.items()}
+    named |= {name: _real(getattr(math, name)) for name in MATH} | CALCULATIONS
     return named, BLOCKING
 
 
-def _no_effect(controller: Controller, name: str, value: Any) -> Callable[..., Any]:
+def _no_effect(controller: ControllerState, name: str, value: Any) -> Callable[..., Any]:
     noted = False
 
     def function(*arguments: Any, **keywords: Any) -> Any:
@@ -85,6 +77,21 @@ def _no_effect(controller: Controller, name: str, value: Any) -> Callable[..., A
         return value
 
     return function
+
+
+def _read(controller: ControllerState, name: str, read: Callable[[ControllerState], Any]) -> Callable[[], Any]:
+    def function() -> Any:
+        return read(controller)
+
+    function.__qualname__ = name
+    return function
+
+
+def _register(controller: ControllerState, bank: str, kind: str, count: int) -> Callable[[int], Any]:
+    def read_register(index: int) -> Any:
+        return getattr(getattr(controller, bank), kind)[register_index(index, count)]
+
+    return read_register
 
 
 def _real(function: Callable[..., float]) -> Callable[..., float]:

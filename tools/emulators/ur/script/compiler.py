@@ -1,4 +1,4 @@
-"""A URScript tree into Python generator functions: every routine yields where its slice of the 2 ms frame is over.
+"""Compiles a URScript tree into Python generator functions; each yields at the end of its 2 ms slice.
 
 Variables assigned in the main body or declared global are global, all others belong to their routine. URScript names
 are prefixed (v_, f_, b_), since scripts call variables `async` or `time`. Assignment copies lists.
@@ -11,23 +11,8 @@ from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from weldcal.tools.emulators.ur.script.syntax import (
-    Assign,
-    Call,
-    Command,
-    Conditional,
-    Evaluate,
-    Expression,
-    Index,
-    Items,
-    Literal,
-    Loop,
-    Name,
-    Operation,
-    Routine,
-    ScriptError,
-    Statement,
-)
+from weldcal.tools.emulators.ur.script import syntax
+from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
 
 SOURCE_NAME = "<urscript>"
 Slices = Generator[None, None, Any]
@@ -148,11 +133,11 @@ class _Emitter:
     def _statement(self, statement: Statement, depth: int) -> None:
         self._line = statement.line
         match statement:
-            case Assign():
+            case syntax.Assign():
                 self._assign(statement, depth)
-            case Evaluate(value=value):
+            case syntax.Evaluate(value=value):
                 self.emit(depth, self.value(value))
-            case Conditional(branches=branches, otherwise=otherwise):
+            case syntax.Conditional(branches=branches, otherwise=otherwise):
                 for i, (condition, body) in enumerate(branches):
                     # `elif` whose condition calls a routine stays correct: Python evaluates it only when it is reached
                     self.emit(depth, f"{'elif' if i else 'if'} truth({self.value(condition)}):")
@@ -160,16 +145,16 @@ class _Emitter:
                 if otherwise:
                     self.emit(depth, "else:")
                     self._body(otherwise, depth + 1)
-            case Loop(condition=condition, body=body):
+            case syntax.Loop(condition=condition, body=body):
                 self.emit(depth, f"while truth({self.value(condition)}):")
                 self.emit(depth + 1, "loop()")
                 self._body(body, depth + 1)
-            case Command():
+            case syntax.Command():
                 self._command(statement, depth)
 
-    def _assign(self, statement: Assign, depth: int) -> None:
+    def _assign(self, statement: syntax.Assign, depth: int) -> None:
         value = self.value(statement.value)
-        if isinstance(statement.value, Name | Index | Call):
+        if isinstance(statement.value, syntax.Name | syntax.Index | syntax.Call):
             value = f"copied({value})"
         if not statement.indices:
             self.emit(depth, f"v_{statement.name} = {value}")
@@ -179,7 +164,7 @@ class _Emitter:
             target = f"item({target}, {self.value(index)})"
         self.emit(depth, f"place({target}, {self.value(statement.indices[-1])}, {value})")
 
-    def _command(self, statement: Command, depth: int) -> None:
+    def _command(self, statement: syntax.Command, depth: int) -> None:
         value = self.value(statement.value) if statement.value is not None else ""
         match statement.word:
             case "halt":
@@ -198,18 +183,18 @@ class _Emitter:
 
     def value(self, expression: Expression) -> str:
         match expression:
-            case Literal(value=value):
+            case syntax.Literal(value=value):
                 return repr(value)
-            case Name(name=name):
+            case syntax.Name(name=name):
                 return f"v_{name}"
-            case Items(items=items, pose=pose):
+            case syntax.Items(items=items, pose=pose):
                 listed = "[" + ", ".join(self.value(item) for item in items) + "]"
                 return f"Pose({listed})" if pose else listed
-            case Index(target=target, index=index):
+            case syntax.Index(target=target, index=index):
                 return f"item({self.value(target)}, {self.value(index)})"
-            case Call():
+            case syntax.Call():
                 return self._call(expression)
-            case Operation(operator=operator, operands=operands):
+            case syntax.Operation(operator=operator, operands=operands):
                 return self._operation(operator, [self.value(operand) for operand in operands])
 
     def _operation(self, operator: str, values: list[str]) -> str:
@@ -228,7 +213,7 @@ class _Emitter:
             return f"(number({left}) {operator} number({right}))"
         return f"({left} {operator} {right})"
 
-    def _call(self, call: Call) -> str:
+    def _call(self, call: syntax.Call) -> str:
         arguments = [self.value(argument) for argument in call.arguments]
         if call.name in self._routines:
             arguments += [f"v_{key}={self.value(value)}" for key, value in call.keywords]
@@ -245,15 +230,15 @@ class _Emitter:
         return f"(yield from {made})" if call.name in self._blocking else made
 
 
-def _walk(statements: tuple[Statement, ...]) -> Iterable[Assign]:
+def _walk(statements: tuple[Statement, ...]) -> Iterable[syntax.Assign]:
     for statement in statements:
-        if isinstance(statement, Assign):
+        if isinstance(statement, syntax.Assign):
             yield statement
-        elif isinstance(statement, Conditional):
+        elif isinstance(statement, syntax.Conditional):
             for _, body in statement.branches:
                 yield from _walk(body)
             yield from _walk(statement.otherwise)
-        elif isinstance(statement, Loop):
+        elif isinstance(statement, syntax.Loop):
             yield from _walk(statement.body)
 
 

@@ -1,4 +1,4 @@
-"""URScript's functions about the arm's mechanics, by their own names (PolyScope 5.23, 10.9): Jacobian, mass matrix."""
+"""URScript functions of the arm's mechanics (PolyScope 5.23, 10.9): Jacobian, mass matrix."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URScript text cut into words, numbers, texts and signs; also where one program ends on the wire."""
+"""Splits URScript text into tokens, and a stream into programs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URScript's functions that take frames, by their own names: motions hold the arm until they return."""
+"""URScript functions that take frames: motions hold the arm until they return."""
 
 from __future__ import annotations
 

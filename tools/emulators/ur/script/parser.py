@@ -1,25 +1,12 @@
-"""URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
+"""Parses URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+from weldcal.tools.emulators.ur.script import syntax
 from weldcal.tools.emulators.ur.script.lexer import Token, tokenize
-from weldcal.tools.emulators.ur.script.syntax import (
-    Assign,
-    Call,
-    Command,
-    Conditional,
-    Evaluate,
-    Expression,
-    Index,
-    Items,
-    Literal,
-    Loop,
-    Name,
-    Operation,
-    Routine,
-    ScriptError,
-    Statement,
-)
+from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
 
 # Loosest first, as the URScript manual orders them; `not` binds tighter than `and`.
 _BINARY = (
@@ -141,19 +128,19 @@ class _Parser:
             self.expect(":")
             body = self.statements("end")
             self.expect("end")
-            return Loop(line, condition, body)
+            return syntax.Loop(line, condition, body)
         if self.at("break", "continue", "halt", "pass", "enter_critical", "exit_critical"):
             word = self.take().text
             if self.at("("):
                 self.take()
                 self.expect(")")
-            return Command(line, word)
+            return syntax.Command(line, word)
         if self.at("kill", "join"):
-            return Command(line, self.take().text, self.expression())
+            return syntax.Command(line, self.take().text, self.expression())
         if self.at("return"):
             self.take()
             nothing = self.token.kind in ("newline", "end") or self.at("end", "else", "elif")
-            return Command(line, "return", None if nothing else self.expression())
+            return syntax.Command(line, "return", None if nothing else self.expression())
         scope = self.take().text if self.at("global", "local") else ""
         target = self.expression()
         if self.at("="):
@@ -161,18 +148,18 @@ class _Parser:
             return self._assignment(line, target, scope)
         if scope:
             raise self.error()
-        return Evaluate(line, target)
+        return syntax.Evaluate(line, target)
 
-    def _assignment(self, line: int, target: Expression, scope: str) -> Assign:
+    def _assignment(self, line: int, target: Expression, scope: str) -> syntax.Assign:
         indices: list[Expression] = []
-        while isinstance(target, Index):
+        while isinstance(target, syntax.Index):
             indices.append(target.index)
             target = target.target
-        if not isinstance(target, Name):
+        if not isinstance(target, syntax.Name):
             raise self.error("the left side of =")
-        return Assign(line, target.name, tuple(reversed(indices)), self.expression(), scope)
+        return syntax.Assign(line, target.name, tuple(reversed(indices)), self.expression(), scope)
 
-    def conditional(self) -> Conditional:
+    def conditional(self) -> syntax.Conditional:
         line = self.take().line
         branches: list[tuple[Expression, tuple[Statement, ...]]] = []
         otherwise: tuple[Statement, ...] = ()
@@ -188,7 +175,7 @@ class _Parser:
             self.expect(":")
             otherwise = self.statements("end")
         self.expect("end")
-        return Conditional(line, tuple(branches), otherwise)
+        return syntax.Conditional(line, tuple(branches), otherwise)
 
     def expression(self, level: int = 0) -> Expression:
         if level == len(_BINARY):
@@ -196,25 +183,25 @@ class _Parser:
         left = self.expression(level + 1)
         while self.at(*_BINARY[level]):
             operator = self.take().text
-            left = Operation(operator, (left, self.expression(level + 1)))
+            left = syntax.Operation(operator, (left, self.expression(level + 1)))
         return left
 
     def unary(self) -> Expression:
         self.skip_newlines()
         if self.at("not", "-", "+"):
             operator = self.take().text
-            return Operation(operator, (self.unary(),))
+            return syntax.Operation(operator, (self.unary(),))
         return self.postfix()
 
     def postfix(self) -> Expression:
         value = self.primary()
         while self.at("["):
             self.take()
-            value = Index(value, self.expression())
+            value = syntax.Index(value, self.expression())
             while self.at(","):
                 # a matrix: m[row, column]
                 self.take()
-                value = Index(value, self.expression())
+                value = syntax.Index(value, self.expression())
             self.expect("]")
         return value
 
@@ -222,22 +209,22 @@ class _Parser:
         token = self.take()
         if token.kind == "number":
             whole = token.text.isdigit()
-            return Literal(int(token.text) if whole else float(token.text))
+            return syntax.Literal(int(token.text) if whole else float(token.text))
         if token.kind == "text":
-            return Literal(token.text[1:-1])
+            return syntax.Literal(token.text[1:-1])
         if token.text in ("True", "False"):
-            return Literal(token.text == "True")
+            return syntax.Literal(token.text == "True")
         if token.text == "(":
             value = self.expression()
             self.expect(")")
             return value
         if token.text == "[":
-            return Items(self.items("]"), pose=False)
+            return syntax.Items(self.items("]"), pose=False)
         if token.text == "run":
             call = self.primary()
-            if not isinstance(call, Call):
+            if not isinstance(call, syntax.Call):
                 raise self.error("what follows run")
-            return Call(call.name, call.arguments, call.keywords, run=True)
+            return syntax.Call(call.name, call.arguments, call.keywords, run=True)
         if token.kind == "word":
             return self.named(token)
         self._position -= token.kind != "end"
@@ -251,42 +238,43 @@ class _Parser:
             self.take()
             items = self.items("]")
             if len(items) == 1:
-                return Index(Name("p"), items[0])
+                return syntax.Index(syntax.Name("p"), items[0])
             if len(items) != 6:
                 raise self.error("a pose that has not six numbers")
-            return Items(items, pose=True)
-        return Name(token.text)
+            return syntax.Items(items, pose=True)
+        return syntax.Name(token.text)
 
-    def call(self, name: str) -> Call:
+    def call(self, name: str) -> syntax.Call:
         self.expect("(")
         arguments: list[Expression] = []
         keywords: list[tuple[str, Expression]] = []
-        self.skip_newlines()
-        while not self.at(")"):
+
+        def take_one() -> None:
             following = self._tokens[min(self._position + 1, len(self._tokens) - 1)]
             if self.token.kind == "word" and following.text == "=":
                 key = self.word()
                 self.take()
                 keywords.append((key, self.expression()))
+            elif keywords:
+                raise self.error("a positional argument after a named one")
             else:
-                if keywords:
-                    raise self.error("a positional argument after a named one")
                 arguments.append(self.expression())
-            self.skip_newlines()
-            if not self.at(")"):
-                self.expect(",")
-                self.skip_newlines()
-        self.expect(")")
-        return Call(name, tuple(arguments), tuple(keywords))
+
+        self.listed(")", take_one)
+        return syntax.Call(name, tuple(arguments), tuple(keywords))
 
     def items(self, closing: str) -> tuple[Expression, ...]:
         found: list[Expression] = []
+        self.listed(closing, lambda: found.append(self.expression()))
+        return tuple(found)
+
+    def listed(self, closing: str, take_one: Callable[[], object]) -> None:
+        """Items with commas between them, newlines allowed, up to and with the closing sign."""
         self.skip_newlines()
         while not self.at(closing):
-            found.append(self.expression())
+            take_one()
             self.skip_newlines()
             if not self.at(closing):
                 self.expect(",")
                 self.skip_newlines()
         self.expect(closing)
-        return tuple(found)

@@ -1,4 +1,4 @@
-"""One running URScript program: its threads, one slice each per frame, and who of them moves the arm."""
+"""Runs one URScript program: its threads, one slice each per frame, and which thread moves the arm."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""URScript's sockets, by their own names: the script is the client of somebody on loopback, and waits frame by frame."""
+"""URScript socket functions: the script is a client on loopback and waits frame by frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The parts of a URScript program, as a tree."""
+"""Syntax tree of a URScript program."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control channel: one JSON object a line injects a fault or asks a question, one JSON object a line answers."""
+"""Control channel: a line of JSON injects a fault or asks a question, a line of JSON answers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
 from weldcal.tools.emulators.ur.wire.external_control import CLIENT_PORT, ExternalControl
-from weldcal.tools.emulators.ur.wire.net import Connection, Network, Server
+from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 
 Request = Mapping[str, Any]
@@ -187,18 +187,8 @@ class ControlServer(Server):
 
     def _clear_links(self, request: Request, now: float) -> None:
         self._world.jitter_s = 0.0
-        self._each(
-            {"kind": "all"} | dict(request),
-            drop_until=0.0,
-            drop_share=0.0,
-            delay_until=0.0,
-            freeze_until=0.0,
-            deaf_until=0.0,
-            corrupt=0,
-            wrong_size=0,
-            piece=0,
-            half_open=False,
-        )
+        for connection in self._links({"kind": "all"} | dict(request)):
+            connection.faults = LinkFaults()
 
     def _recover(self, request: Request, now: float) -> None:
         """Everything right again at once, the program stopped and the arm where it is; the checker keeps its latch."""

@@ -1,4 +1,4 @@
-"""The dashboard server on port 29999: one line in, one line out."""
+"""Dashboard server on port 29999: one reply per command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The External Control node of a program on the pendant: it fetches its URScript from a client when a person presses play.
+"""External Control node of a program on the pendant: fetches its URScript from a client on play.
 
 This is the only way in on PolyScope X before 10.10, where ur_rtde neither opens the script port nor uploads. As the
 URCap does, it connects to the client's script sender, asks `request_program`, and takes what comes until 0.1 s of silence.

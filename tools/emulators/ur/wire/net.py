@@ -1,4 +1,4 @@
-"""Sockets of the emulator: one loop, many connections, and the faults that a network can have, one connection at a time."""
+"""Sockets of the emulator in one loop, with injected network faults per connection."""
 
 from __future__ import annotations
 

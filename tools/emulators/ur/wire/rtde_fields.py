@@ -1,4 +1,4 @@
-"""Every RTDE field with its type and where its value comes from, as Universal Robots' RTDE guide lists them."""
+"""RTDE fields, their types and their values, as in Universal Robots' RTDE guide."""
 
 from __future__ import annotations
 
@@ -49,6 +49,11 @@ class Input:
 
 def _constant(value: Any) -> Getter:
     return lambda _: value
+
+
+def _constants(value: Any, names: str) -> dict[str, Getter]:
+    """The same constant for several fields, named with spaces between."""
+    return dict.fromkeys(names.split(), _constant(value))
 
 
 def _status_bits(c: Controller) -> int:
@@ -103,65 +108,50 @@ _SINCE = {
 _SCALARS: dict[str, dict[str, Getter]] = {
     "DOUBLE": {
         "timestamp": lambda c: c.timestamp,
-        "actual_execution_time": _constant(0.4),
-        "target_execution_time": _constant(2.0),
         "speed_scaling": lambda c: c.speed_scaling,
         "target_speed_fraction": lambda c: c.terminals.speed_slider,
-        "actual_momentum": _constant(0.0),
-        "actual_main_voltage": _constant(48.0),
         "actual_robot_voltage": lambda c: 48.0 if c.robot_mode > RobotMode.POWER_OFF else 0.0,
         "actual_robot_current": lambda c: 0.8 if c.robot_mode > RobotMode.POWER_OFF else 0.0,
-        "standard_analog_input0": _constant(0.0),
-        "standard_analog_input1": _constant(0.0),
         "standard_analog_output0": lambda c: c.terminals.analog_outputs[0],
         "standard_analog_output1": lambda c: c.terminals.analog_outputs[1],
-        "io_current": _constant(0.0),
-        "actual_robot_energy_consumed": _constant(0.0),
-        "actual_robot_braking_energy_dissipated": _constant(0.0),
-        "euromap67_24V_voltage": _constant(0.0),
-        "euromap67_24V_current": _constant(0.0),
-        "tool_analog_input0": _constant(0.0),
-        "tool_analog_input1": _constant(0.0),
-        "tool_output_current": _constant(0.0),
-        "tool_temperature": _constant(25.0),
-        "tcp_force_scalar": _constant(0.0),
-        "joint_position_deviation_ratio": _constant(0.0),
-        "collision_detection_ratio": _constant(0.0),
         "payload": lambda c: c.payload.mass,
+        "actual_execution_time": _constant(0.4),
+        "target_execution_time": _constant(2.0),
+        **_constants(0.0, "actual_momentum standard_analog_input0 standard_analog_input1 io_current"),
+        **_constants(0.0, "actual_robot_energy_consumed actual_robot_braking_energy_dissipated euromap67_24V_voltage"),
+        **_constants(
+            0.0, "euromap67_24V_current tool_analog_input0 tool_analog_input1 tool_output_current tcp_force_scalar"
+        ),
+        **_constants(0.0, "joint_position_deviation_ratio collision_detection_ratio"),
+        "actual_main_voltage": _constant(48.0),
+        "tool_temperature": _constant(25.0),
     },
     "VECTOR6D": {
         "target_q": lambda c: c.arm.q_target.tolist(),
         "target_qd": lambda c: c.arm.qd_target.tolist(),
         "target_qdd": lambda c: c.arm.qdd_target.tolist(),
-        "target_current": _constant(ZERO6),
-        "target_moment": _constant(ZERO6),
         "actual_q": lambda c: c.arm.q.tolist(),
         "actual_qd": lambda c: c.arm.qd.tolist(),
-        "actual_current": _constant(ZERO6),
-        "actual_current_window": _constant(ZERO6),
-        "actual_current_as_torque": _constant(ZERO6),
-        "joint_control_output": _constant(ZERO6),
         "actual_TCP_pose": lambda c: c.arm.tool_pose(),
         "actual_TCP_speed": lambda c: c.arm.tool_speed(),
-        "actual_TCP_force": _constant(ZERO6),
         "target_TCP_pose": lambda c: c.arm.tool_pose(target=True),
         "target_TCP_speed": lambda c: c.arm.tool_speed(target=True),
         "tcp_offset": lambda c: c.tcp_offset,
-        "actual_TCP_acceleration": _constant(ZERO6),
-        "target_TCP_acceleration": _constant(ZERO6),
+        "ft_raw_wrench": lambda c: c.external_wrench,
+        "payload_inertia": lambda c: c.payload.inertia,
+        **_constants(
+            ZERO6, "target_current target_moment actual_current actual_current_window actual_current_as_torque"
+        ),
+        **_constants(ZERO6, "joint_control_output actual_TCP_force actual_TCP_acceleration target_TCP_acceleration"),
+        **_constants(ZERO6, "wrench_calc_from_currents target_base_acceleration target_base_wrench"),
         "joint_temperatures": _constant([30.0] * 6),
         "actual_joint_voltage": _constant([48.0] * 6),
-        "ft_raw_wrench": lambda c: c.external_wrench,
-        "wrench_calc_from_currents": _constant(ZERO6),
-        "payload_inertia": lambda c: c.payload.inertia,
-        "target_base_acceleration": _constant(ZERO6),
-        "target_base_wrench": _constant(ZERO6),
     },
     "VECTOR3D": {
-        "actual_tool_accelerometer": _constant([0.0, 0.0, 9.81]),
         "elbow_position": _elbow,
-        "elbow_velocity": _constant(ZERO3),
         "payload_cog": lambda c: c.payload.center,
+        "actual_tool_accelerometer": _constant([0.0, 0.0, 9.81]),
+        "elbow_velocity": _constant(ZERO3),
         "target_gravity": _constant([0.0, 0.0, 9.82]),
     },
     "VECTOR6INT32": {"joint_mode": _joint_modes},
@@ -169,21 +159,16 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "robot_mode": lambda c: int(c.robot_mode),
         "safety_mode": lambda c: int(c.safety_mode),
         "safety_status": lambda c: int(c.safety_mode),
-        "encoder0_raw": _constant(0),
-        "encoder1_raw": _constant(0),
-        "tool_output_voltage": _constant(0),
-        "time_scale_source": _constant(0),
+        **_constants(0, "encoder0_raw encoder1_raw tool_output_voltage time_scale_source"),
     },
     "UINT32": {
         "runtime_state": lambda c: int(c.runtime_state),
         "robot_status_bits": _status_bits,
         "safety_status_bits": lambda c: safety_status_bits(c.safety_mode),
         "analog_io_types": lambda c: c.terminals.analog_output_types << 2,
-        "euromap67_input_bits": _constant(0),
-        "euromap67_output_bits": _constant(0),
-        "tool_mode": _constant(TOOL_IDLE),
-        "tool_analog_input_types": _constant(0),
         "script_control_line": lambda c: c.program.line if c.program else 0,
+        **_constants(0, "euromap67_input_bits euromap67_output_bits tool_analog_input_types"),
+        "tool_mode": _constant(TOOL_IDLE),
     },
     "UINT64": {
         "actual_digital_input_bits": lambda c: c.terminals.digital_inputs,
@@ -193,9 +178,7 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "control_step": lambda c: c.frame,
     },
     "UINT8": {
-        "tool_output_mode": _constant(0),
-        "tool_digital_output0_mode": _constant(0),
-        "tool_digital_output1_mode": _constant(0),
+        **_constants(0, "tool_output_mode tool_digital_output0_mode tool_digital_output1_mode"),
     },
 }
 

@@ -1,4 +1,4 @@
-"""RTDE on port 30004: recipes, claims, and packages at an integer share of 500 Hz (protocol versions 1 and 2)."""
+"""RTDE server on port 30004: recipes, claims, and packages at an integer share of 500 Hz (protocols 1 and 2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ports that take script text and stream state: primary 30001, secondary 30002, real-time 30003."""
+"""Ports that accept script text and stream state: primary 30001, secondary 30002, real-time 30003."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Both methods on the same real scans: circles, registrations, Algorithm 1 run again, and errors on scans kept aside."""
+"""Compares both methods on the same real scans: circles, registrations, Algorithm 1, and errors on held-out scans."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +75,7 @@ class SightRow:
 
 @dataclass(frozen=True, eq=False)
 class SplitRow:
-    """One way to calibrate, over all splits: errors (m) on scans kept aside, and what it reports itself, by split (NaN: no
+    """One way to calibrate, over all splits: errors (m) on held-out scans, and what it reports itself, by split (NaN: no
     figure of its own)."""
 
     name: str
@@ -102,10 +103,24 @@ class CloudsOutcome:
     splits: tuple[SplitRow, ...]
     n_fit: int
 
+    @property
+    def circle_repeat_mm(self) -> float:
+        """Rms (3-D) of the published centres of one cloud over seeds."""
+        return 1e3 * float(np.sqrt(np.mean([r.repeat_m**2 for r in self.circles])))
+
+    @property
+    def circle_bias_R_mm(self) -> Array:
+        """Mean offset (3,) of the published centres in the axes of the flange."""
+        return np.asarray(1e3 * np.mean([r.offset_R for r in self.circles], axis=0))
+
+    def halves_mm(self, method: Literal["published", "ours"]) -> float:
+        """Median distance between the centres from two halves of a cloud."""
+        return 1e3 * float(np.median([getattr(r, f"halves_{method}_m") for r in self.circles]))
+
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What both methods see of one folder: our sightings and the published circles of the same scans, and the CAD."""
+    """What both methods see of one folder: our observations and the published circles of the same scans, and the CAD."""
 
     data: Dataset
     standard: FlangeStandard
@@ -135,8 +150,8 @@ def study_clouds(
     progress: Progress,
     circles: int | None = None,
 ) -> CloudsOutcome:
-    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on scans kept
-    aside, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
+    """Everything of one folder of segmented scans: ``orders`` shuffled runs of Algorithm 1, ``splits`` comparisons on held-out
+    scans, repeated circles of the first ``circles`` scans (all where None). Raises InputError when fewer than ten show a
     flange to both methods."""
     progress("circles and edges", 0.0)
     material = read_material(data, standard, seed)

@@ -1,22 +1,28 @@
-"""The flange study as one call: simulation, the authors' runs, both methods on real scans; tables, pictures, report."""
+"""Runs the flange study: simulation, the authors' runs, both methods on real scans; writes tables, pictures and report."""
 
 from __future__ import annotations
 
-import json
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.console import Progress, plain
+from weldcal.tools.console import Progress
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
-from weldcal.tools.studies.flange.published.kinect import KinectOutcome, study_kinect
-from weldcal.tools.studies.flange.published.pairs import PairsOutcome, load_runs, study_pairs
-from weldcal.tools.studies.flange.published.simulation import Simulation, simulate
+from weldcal.tools.studies.flange.published.pairs import (
+    KinectOutcome,
+    PairsOutcome,
+    load_runs,
+    study_kinect,
+    study_pairs,
+)
+from weldcal.tools.studies.flange.published.report import pictures, study_report
+from weldcal.tools.studies.flange.published.results import Study, StudyOptions
+from weldcal.tools.studies.flange.published.simulation import simulate
+from weldcal.tools.studies.output import write_json
 
 NO_DATA = (
     "No data folder was given: only the simulated parts were run; give the folder that holds the recorded datasets."
@@ -25,34 +31,6 @@ TITLES = {"aubo_i5": "AUBO i5", "franka": "Franka Emika", "azure_kinect": "Azure
 _SHARE_SIMULATION = 0.3
 _LEAST_CLOUDS = 10
 _USUAL_CLOUDS = 18  # more scans make each run of Algorithm 1 longer: fewer runs then, and the same time
-
-
-@dataclass(frozen=True)
-class StudyOptions:
-    """Where to write, the folder of datasets (None: only what is simulated), the seed, and whether in short."""
-
-    folder: Path
-    data: Path | None = None
-    seed: int = 0
-    quick: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Study:
-    """Everything that was found; ``notes`` are sentences about data that were not there or not usable."""
-
-    options: StudyOptions
-    simulation: Simulation
-    pairs: tuple[PairsOutcome, ...]
-    clouds: tuple[CloudsOutcome, ...]
-    kinect: tuple[KinectOutcome, ...]
-    notes: tuple[str, ...]
-    wall_seconds: float
-
-    @property
-    def folder(self) -> Path:
-        """Where it was written."""
-        return self.options.folder
 
 
 def run_study(options: StudyOptions, progress: Progress) -> Study:
@@ -86,7 +64,7 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
                 pairs.append(study_pairs(name, title(data), observations, runs, repeats=2 if quick else 10, seed=seed))
         elif len(data.clouds) < _LEAST_CLOUDS:
             scans = "1 scan" if len(data.clouds) == 1 else f"{len(data.clouds)} scans"
-            notes.append(f"{name} holds {scans}, too few to hold any back: it takes no part.")
+            notes.append(f"{name} holds {scans}, too few to hold any out: it is not used.")
         else:
             effort = min(1.0, (_USUAL_CLOUDS - 5) / (len(data.clouds) - 5))
             outcome = study_clouds(
@@ -98,23 +76,18 @@ def run_study(options: StudyOptions, progress: Progress) -> Study:
                 splits=3 if quick else max(5, round(60 * effort)),
                 circles=4 if quick else None,
                 seed=seed,
-                progress=part(progress, begin, width),
+                progress=lambda what, done, at=begin, part=width: progress(what, at + part * done),  # type: ignore[misc]
             )
             clouds.append(outcome)
     study = Study(
         options, simulation, tuple(pairs), tuple(clouds), tuple(kinect), tuple(notes), time.monotonic() - start
     )
-    _write(study)
+    drawn = pictures(study)
+    for name, picture in drawn.items():
+        write_atomic(options.folder / "figures" / f"{name}.svg", picture)
+    write_json(options.folder / "table.json", study.summary())
+    write_atomic(options.folder / "report.html", study_report(study, drawn))
     return study
-
-
-def part(progress: Progress, begin: float, width: float) -> Progress:
-    """The reporter of a piece of the work that is ``width`` of the whole and starts at ``begin``."""
-
-    def report(what: str, done: float) -> None:
-        progress(what, begin + width * done)
-
-    return report
 
 
 def find_datasets(folder: Path) -> list[Dataset]:
@@ -134,15 +107,3 @@ def title(data: Dataset) -> str:
     robot = TITLES.get(data.header.robot, data.header.robot.upper().replace("E", "e"))
     scanner = data.header.scanner.replace("phoxi_", "PhoXi ").replace("azure_kinect", "Azure Kinect")
     return f"{robot} & {scanner[:-1] + scanner[-1].upper() if 'PhoXi' in scanner else scanner}"
-
-
-def _write(study: Study) -> None:
-    from weldcal.tools.studies.flange.published.report import pictures, study_report
-    from weldcal.tools.studies.flange.published.rows import summary
-
-    drawn = pictures(study)
-    for name, picture in drawn.items():
-        write_atomic(study.folder / "figures" / f"{name}.svg", picture)
-    text = json.dumps(plain(summary(study)), allow_nan=False, indent=1)
-    write_atomic(study.folder / "table.json", text + "\n")
-    write_atomic(study.folder / "report.html", study_report(study, drawn))

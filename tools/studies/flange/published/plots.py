@@ -1,4 +1,4 @@
-"""The flange study's pictures, drawn as the paper's Fig. 9, 10 and 11, and what they leave out beside them."""
+"""Pictures of the flange study: the paper's Fig. 9, 10 and 11 with the true errors, circles and held-out errors."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from weldcal.tools.report.plots_weld import OURS, PLANNED, THEIRS, TRUTH, svg
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
-from weldcal.tools.studies.flange.published.kinect import KinectOutcome
-from weldcal.tools.studies.flange.published.pairs import PairsOutcome
+from weldcal.tools.studies.flange.published.pairs import KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Simulation
 
 Array = NDArray[np.float64]
@@ -21,6 +20,7 @@ PANELS = (
     (3, "x", "mm", 1e3), (4, "y", "mm", 1e3), (5, "z", "mm", 1e3),
     (0, "roll", "degrees", np.degrees(1.0)), (1, "pitch", "degrees", np.degrees(1.0)), (2, "yaw", "degrees", np.degrees(1.0)),
 )  # fmt: skip
+REPORTED = ("reported translation, mm", "reported rotation, degrees")
 COLOURS = ("#c2503f", "#3f8f5b", "#2f6fb0")
 
 
@@ -43,34 +43,20 @@ def fig9(s: Simulation) -> bytes:
 
 def fig10(s: Simulation) -> bytes:
     """Errors at the camera against the scans used, 1 mm of noise, and the error that the paper does not plot: at the flanges."""
-    picture = Figure(figsize=(7.6, 2.7), layout="constrained")
-    at_camera, turns, true = picture.subplots(1, 3)
     steps = np.arange(4, 4 + len(s.history))
-    for ax, panels in ((at_camera, PANELS[:3]), (turns, PANELS[3:])):
-        _bands(ax, steps, s.history.transpose(1, 0, 2), panels)
+    picture, true = _steps(steps, s.history.transpose(1, 0, 2), ("translation at the camera, mm", "rotation, degrees"))
     high = 1e3 * s.history_tcp
     true.fill_between(steps, *np.percentile(high, [16, 84], axis=1), color=TRUTH, alpha=0.3)
     true.plot(steps, high.mean(axis=1), color=TRUTH, lw=1.2, label="Algorithm 1")
     true.axhline(1e3 * float(s.costs["all"].at_tcp.mean()), color="black", lw=0.8, ls="--", label="all pairs, SVD")
-    true.set_ylim(0.0, None)
-    true.legend(frameon=False, fontsize=7)
-    _plain(at_camera, "scans", "translation at the camera, mm")
-    _plain(turns, "scans", "rotation, degrees")
-    _whole_steps(true)
-    _plain(true, "scans", "true error at the flanges, mm")
+    _finish(true, "true error at the flanges, mm")
     return svg(picture)
 
 
 def fig11_stored(p: PairsOutcome) -> bytes:
-    """The authors' stored runs: what they reported step by step, and beside it the truth of the ends."""
+    """The authors' stored runs: their reported errors step by step, and the true errors at the end."""
     assert p.runs is not None
-    picture = Figure(figsize=(7.6, 2.7), layout="constrained")
-    at_camera, turns, true = picture.subplots(1, 3)
-    steps = np.arange(5, 5 + p.runs.components.shape[1])
-    _bands(at_camera, steps, p.runs.components, PANELS[:3])
-    _bands(turns, steps, p.runs.components, PANELS[3:])
-    _plain(at_camera, "scans", "reported translation, mm")
-    _plain(turns, "scans", "reported rotation, degrees")
+    picture, true = _steps(np.arange(5, 5 + p.runs.components.shape[1]), p.runs.components, REPORTED)
     rows = [
         ("reported", 1e3 * p.runs.reported[:, -1], THEIRS),
         ("its own 4 pairs", 1e3 * p.own_pool, THEIRS),
@@ -84,29 +70,21 @@ def fig11_stored(p: PairsOutcome) -> bytes:
 
 def fig11_rerun(c: CloudsOutcome) -> bytes:
     """Algorithm 1 on the scans themselves: e_icp step by step, and the true error at the same steps."""
-    picture = Figure(figsize=(7.6, 2.7), layout="constrained")
-    at_camera, turns, true = picture.subplots(1, 3)
     steps = np.arange(4, 4 + c.path.shape[1])
     finite = np.where(np.isfinite(c.path), c.path, np.nan)
-    _bands(at_camera, steps, finite, PANELS[:3])
-    _bands(turns, steps, finite, PANELS[3:])
+    picture, true = _steps(steps, finite, REPORTED)
     figure = 1e3 * np.linalg.norm(finite[:, :, 3:], axis=2)
     for values, colour, label in ((figure, THEIRS, "reported"), (1e3 * c.path_true, TRUTH, "true, other scans")):
         true.fill_between(steps, *np.nanpercentile(values, [16, 84], axis=0), color=colour, alpha=0.3)
         true.plot(steps, np.nanmedian(values, axis=0), color=colour, lw=1.2, label=label)
     ours = next(s for s in c.splits if s.name == "ours").held_out
     true.axhline(1e3 * float(np.nanmedian(ours)), color=OURS, lw=1.2, ls="--", label="weldcal, held out")
-    true.set_ylim(0.0, None)
-    true.legend(frameon=False, fontsize=7)
-    _plain(at_camera, "scans", "reported translation, mm")
-    _plain(turns, "scans", "reported rotation, degrees")
-    _whole_steps(true)
-    _plain(true, "scans", "error, mm")
+    _finish(true, "error, mm")
     return svg(picture)
 
 
 def held_out(c: CloudsOutcome) -> bytes:
-    """Errors on scans kept aside, method by method, and what each reports of itself."""
+    """Errors on held-out scans, method by method, and what each reports of itself."""
     picture = Figure(figsize=(7.6, 3.2), layout="constrained")
     axes = picture.subplots()
     rows = []
@@ -118,20 +96,14 @@ def held_out(c: CloudsOutcome) -> bytes:
         own = s.reported[np.isfinite(s.reported)]
         if len(own):
             at = 1e3 * float(np.median(own))
-            axes.plot(
-                [at],
-                [len(rows) - 1 - k],
-                "D",
-                color=THEIRS,
-                ms=6,
-                label="what it reports of itself" if k == 0 else None,
-            )
+            label = "its own figure" if k == 0 else None
+            axes.plot([at], [len(rows) - 1 - k], "D", color=THEIRS, ms=6, label=label)
     axes.legend(frameon=False, fontsize=8, loc="lower right")
     return svg(picture)
 
 
 def costs(s: Simulation) -> bytes:
-    """Simulated, 1 mm of noise: error at the camera's origin, which the cost looks at, beside the error at the flanges."""
+    """Simulated, 1 mm of noise: error at the camera's origin, which the cost uses, and at the flanges."""
     picture = Figure(figsize=(7.6, 2.9), layout="constrained")
     axes = picture.subplots()
     names = {
@@ -141,7 +113,7 @@ def costs(s: Simulation) -> bytes:
     y = np.arange(len(s.costs))[::-1]
     camera = [1e3 * float(np.linalg.norm(e.e[:, 3:], axis=1).mean()) for e in s.costs.values()]
     flanges = [1e3 * float(e.at_tcp.mean()) for e in s.costs.values()]
-    axes.barh(y + 0.19, camera, 0.36, color=THEIRS, label="at the camera's origin, which the cost looks at")
+    axes.barh(y + 0.19, camera, 0.36, color=THEIRS, label="at the camera's origin, which the cost uses")
     axes.barh(y - 0.19, flanges, 0.36, color=TRUTH, label="at the 75 flange centres, where the robot works")
     axes.set_yticks(y, [names[n] for n in s.costs])
     _plain(axes, "mean error, mm (1 mm of noise)", "")
@@ -161,16 +133,8 @@ def circles(c: CloudsOutcome) -> bytes:
     _plain(halves, "scan", "between two halves, mm")
     for row in c.circles:
         x, y = 1e3 * row.offset_R[:2]
-        axes.errorbar(
-            x,
-            y,
-            xerr=1e3 * row.repeat_m / np.sqrt(3),
-            yerr=1e3 * row.repeat_m / np.sqrt(3),
-            color=THEIRS,
-            lw=0.8,
-            fmt="o",
-            ms=3,
-        )
+        spread = 1e3 * row.repeat_m / np.sqrt(3)
+        axes.errorbar(x, y, xerr=spread, yerr=spread, color=THEIRS, lw=0.8, fmt="o", ms=3)
     axes.plot(0, 0, "+", color=OURS, ms=14, mew=2)
     reach = 1.1 * max(1.0, *(1e3 * float(np.abs(r.offset_R[:2]).max() + r.repeat_m) for r in c.circles))
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
@@ -191,6 +155,24 @@ def kinect(k: KinectOutcome) -> bytes:
     ]
     _boxes(axes, rows)
     return svg(picture)
+
+
+def _steps(steps: NDArray[np.int64], values: Array, labels: tuple[str, str]) -> tuple[Figure, Axes]:
+    """Translations and rotations (runs, steps, 6) over the scans in two panels, and a third panel to draw in."""
+    picture = Figure(figsize=(7.6, 2.7), layout="constrained")
+    *both, third = picture.subplots(1, 3)
+    for axes, panels, label in zip(both, (PANELS[:3], PANELS[3:]), labels, strict=True):
+        _bands(axes, steps, values, panels)
+        _plain(axes, "scans", label)
+    return picture, third
+
+
+def _finish(axes: Axes, label: str) -> None:
+    """Legend and axes of a panel of errors over the scans."""
+    axes.set_ylim(0.0, None)
+    axes.legend(frameon=False, fontsize=7)
+    _whole_steps(axes)
+    _plain(axes, "scans", label)
 
 
 def _bands(axes: Axes, x: NDArray[np.int64], values: Array, panels: tuple[tuple[int, str, str, float], ...]) -> None:

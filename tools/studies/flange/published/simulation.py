@@ -1,4 +1,4 @@
-"""Section 3.1 simulated again, many realisations at once: what Algorithm 1's cost does to the errors it is judged by."""
+"""Simulates section 3.1 of the paper: the effect of Algorithm 1's cost on the errors that it is judged by."""
 
 from __future__ import annotations
 

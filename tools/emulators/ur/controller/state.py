@@ -1,0 +1,130 @@
+"""The state of the emulated controller: power, safety, arm, registers and clock, without programs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
+from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.controller.registers import Payload, Registers, Terminals, Watchdog
+from weldcal.tools.emulators.ur.versions import Version
+
+START_TIMESTAMP_S = 100.0  # a controller has been on for a while; some clients wait for more than 40 s
+UNLOCK_AFTER_S = 5.0
+POWER_STEP_S = 0.5  # [M] how long power on and brake release take
+
+
+class ControllerState:
+    """What scripts read and change. Times count in frames of 2 ms."""
+
+    def __init__(self, model: ArmModel, q: NDArray[np.float64], version: Version) -> None:
+        self.version = version
+        self.arm = EmulatedArm(model, q)
+        self.inputs, self.outputs, self.terminals = Registers(), Registers(), Terminals()
+        self.external_wrench = [0.0] * 6
+        self.tcp_offset = [0.0] * 6
+        self.payload = Payload(0.0, [0.0] * 3, [0.0] * 6)
+        self.tool_contact_steps = 0
+        self.frame = 0
+        self.timestamp = START_TIMESTAMP_S
+        self.clock_rate = 1.0
+        self.robot_mode = RobotMode.RUNNING
+        self.safety_mode = SafetyMode.NORMAL
+        self.runtime_state = RuntimeState.STOPPED
+        self.remote = True
+        self.refuse_upload = False
+        self.start_delay_s = 0.0
+        self.watchdogs: dict[str, Watchdog] = {}
+        self.log: deque[str] = deque(maxlen=200)
+        self.events: deque[tuple[str, str, int]] = deque(maxlen=200)
+        self.protective_since = -(10**9)
+        self._later: list[tuple[int, Callable[[], object]]] = []
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since start, by the count of frames."""
+        return self.frame * STEP_S
+
+    @property
+    def speed_scaling(self) -> float:
+        """Share of the commanded speed that the slider lets through."""
+        return self.terminals.speed_slider
+
+    @property
+    def ready(self) -> bool:
+        """The arm has power and no safety stop is active."""
+        return self.robot_mode == RobotMode.RUNNING and self.safety_mode in MOVING
+
+    def note(self, text: str) -> None:
+        """Writes to the log."""
+        self.log.append(f"{self.time_s:.3f} {text}")
+
+    def later(self, seconds: float, action: Callable[[], object]) -> None:
+        """Does something after some time."""
+        self._later.append((self.frame + round(seconds / STEP_S), action))
+
+    def pause_program(self) -> None:
+        """The program stands still and the arm brakes on its path; `resume_program` goes on from there."""
+        if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
+            self.runtime_state = RuntimeState.PAUSING
+
+    def protective_stop(self, reason: str) -> None:
+        """The arm brakes and the program pauses until somebody unlocks."""
+        if self.safety_mode in MOVING:
+            self.set_safety_mode(SafetyMode.PROTECTIVE_STOP)
+            self.note(f"protective stop: {reason}")
+
+    def set_safety_mode(self, mode: SafetyMode) -> None:
+        """What the safety system would do; modes that stop also pause the program."""
+        self.safety_mode = mode
+        if mode == SafetyMode.PROTECTIVE_STOP:
+            self.protective_since = self.frame
+        if mode not in MOVING:
+            self.pause_program()
+        if mode in POWERLESS:
+            self.robot_mode = RobotMode.POWER_OFF
+        self.note(f"safety mode {mode.name}")
+
+    def unlock_protective_stop(self) -> bool:
+        """Only a protective stop that is at least 5 s old unlocks."""
+        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
+            return True
+        if (self.frame - self.protective_since) * STEP_S < UNLOCK_AFTER_S:
+            return False
+        self.set_safety_mode(SafetyMode.NORMAL)
+        return True
+
+    def power_on(self) -> None:
+        """POWER_OFF -> POWER_ON -> IDLE."""
+        if self.robot_mode == RobotMode.POWER_OFF and self.safety_mode not in POWERLESS:
+            self.robot_mode = RobotMode.POWER_ON
+            self.later(POWER_STEP_S, lambda: self._advance(RobotMode.POWER_ON, RobotMode.IDLE))
+
+    def release_brakes(self) -> None:
+        """IDLE -> RUNNING."""
+        if self.robot_mode == RobotMode.IDLE:
+            self.later(POWER_STEP_S, lambda: self._advance(RobotMode.IDLE, RobotMode.RUNNING))
+        elif self.robot_mode == RobotMode.POWER_OFF:
+            self.power_on()
+            self.later(POWER_STEP_S + STEP_S, self.release_brakes)
+
+    def _advance(self, before: RobotMode, after: RobotMode) -> None:
+        if self.robot_mode == before:
+            self.robot_mode = after
+
+    def written(self, names: tuple[str, ...]) -> None:
+        """Inputs arrived: those with a watchdog have been fed."""
+        for name in names:
+            if name in self.watchdogs:
+                self.watchdogs[name].fed_at = self.frame
+
+    def set_tcp(self, pose: list[float]) -> None:
+        """The tool centre point in the flange frame."""
+        self.tcp_offset = [float(value) for value in pose]
+        self.arm.set_tcp(self.tcp_offset)
