@@ -178,7 +178,7 @@ def refine_joints(
         if u < _SHOWN
     )
     said = (
-        f"Robot errors applied ({told}); {change}. The result applies to the robot with these corrections: enter them in its "
+        f"Robot errors applied ({told}); {change}. The result applies to the robot with these corrections: enter these errors in its "
         "kinematics, or calibrate without them."
     )
     return JointRefinement(names, values, sigma * robot.scale, True, better, said)
