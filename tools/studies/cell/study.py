@@ -109,7 +109,7 @@ class PhaseCpu:
         self.seconds: dict[str, float] = {}
 
     def progress(self, stage: str, share: float) -> None:
-        """A phase goes on, or another begins."""
+        """Count the time up to now for the phase that was running."""
         now = time.process_time()
         if stage != self._phase:
             self.seconds[self._phase] = self.seconds.get(self._phase, 0.0) + now - self._since
@@ -156,7 +156,7 @@ def weld_once(name: str, seed: int, options: CellStudyOptions, progress: Progres
 
 
 def figures(result: DemoResult, name: str, law: str, seed: int, cpu_per_second: float) -> CellRun:
-    """What a finished run came to, in mm."""
+    """The figures of a finished run, in mm."""
     run, weld = result.run, result.weld
     felt: FeltSeam | None = felt_seam(run.cell, run.root)
     if weld is None or weld.error is None or weld.speed is None or felt is None:

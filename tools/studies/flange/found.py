@@ -18,6 +18,7 @@ from weldcal.tools.studies.flange.frames import Frame, box, empty_frame, flange_
 
 Array = NDArray[np.float64]
 
+WAYS = ("plate", "border", "missing")
 SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it
 
 
@@ -96,9 +97,6 @@ def study_frames(
         except FlangeNotFound:
             pass
     return Found(frames, len(errors), mistaken, imagined, np.array(errors), np.array(normalised), tuple(missed))
-
-
-WAYS = ("plate", "border", "missing")
 
 
 @dataclass(frozen=True, eq=False)

@@ -190,7 +190,7 @@ def study_live(
             run = run_cell(cell)
         status, truth = cell.job.calibration_status(run.root), cell.station.truth.X_BC
         if status.estimate is None or truth is None or run.held:
-            raise RuntimeError(f"The calibration of seed {seed} came to no end: {run.reason}")
+            raise RuntimeError(f"The calibration of seed {seed} did not finish: {run.reason}")
         work = work_point(scenario)
         error = calibration_error(status.estimate.X_BC, truth, work)
         found = status.observations

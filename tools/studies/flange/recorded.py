@@ -29,6 +29,8 @@ from weldcal.systems.runner import Progress, no_progress
 Array = NDArray[np.float64]
 
 LEAST = 12
+SIZES = (1, 2, 3, 4, 6, 8, 12)
+KEPT = 4  # scans that at least are left to judge by
 _DRAWS = 2000
 
 
@@ -122,10 +124,6 @@ def _holes_alone(good: Sequence[Observation], patterns: Mapping[str, HolePattern
         errors[k], tilts[k] = float(position_errors(e.X_BC, seen)[0]), float(tilt_errors(e.X_BC, seen)[0])
         sigma += e.sigma_position_m / len(good)
     return Ingredient("scale and gradient, hole circle alone", errors, tilts, _floor(sigma))
-
-
-SIZES = (1, 2, 3, 4, 6, 8, 12)
-KEPT = 4  # scans that at least are left to judge by
 
 
 @dataclass(frozen=True)

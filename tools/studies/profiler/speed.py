@@ -89,7 +89,7 @@ def run_profiler_benchmark(folder: Path, seed: int, data: Path | None, progress:
 
 
 def lines(summary: dict[str, object]) -> dict[str, str]:
-    """For a person: method and poses, then what it took and found."""
+    """Rows for the terminal: method and poses, then times and errors."""
     out = {}
     rows = summary["rows"]
     assert isinstance(rows, list)

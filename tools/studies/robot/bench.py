@@ -35,7 +35,7 @@ CRUISE_LIMIT_S = 8.0
 
 
 class StoppedUnasked(WeldcalError):
-    """The link stopped the arm though nobody had done anything to it."""
+    """The link stopped the arm although no fault had been injected."""
 
 
 class Stroke:
@@ -125,7 +125,7 @@ class Bench:
         return self._stream
 
     def start(self, *, look: bool = False) -> None:
-        """A person acknowledges; then a fresh link (`look`: the pre-flight before it), and commands.
+        """Acknowledge faults, then start a new link (`look`: with pre-flight checks) and the command stream.
 
         Raises:
             RobotRefused: the controller is not ready.
@@ -206,7 +206,7 @@ class Bench:
         return self.emulator.ask(check="at_rest_after", fault_time=fault_time, within=within_s)
 
     def press_play(self) -> str:
-        """What the dashboard says to a person who presses Play."""
+        """Press Play on the dashboard; its answer."""
         try:
             return ask(self.host, "play")
         except WeldcalError as error:
@@ -228,7 +228,7 @@ class Bench:
 
 
 def main() -> None:
-    """Moves the arm at argv[1] until stdin closes or somebody kills this process; answers each line when it cruises."""
+    """Moves the arm at argv[1] until stdin closes or the process is killed; answers each line when it cruises."""
     host = sys.argv[1]
     arm, config = load_arm(), UrRtde(host=host)
     link = UrLink.start(host, arm, config.limits(arm), payload_kg=config.payload_kg)

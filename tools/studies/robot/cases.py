@@ -21,8 +21,8 @@ ALL = frozenset(Fault) - {Fault.NONE}
 
 
 @dataclass(frozen=True)
-class Deed:
-    """One step of putting the world right, and how long it takes."""
+class Action:
+    """One step of a repair, and how long it takes (s)."""
 
     name: str
     after_s: float = 0.0
@@ -37,7 +37,7 @@ class Case:
     throw: Callable[[Bench], float]
     must: str
     faults: frozenset[Fault] = frozenset()
-    repair: tuple[Deed, ...] = ()
+    repair: tuple[Action, ...] = ()
     watch_s: float = 0.6
     rest_s: float = REST_S
     wrist_3: float = 0.0
@@ -60,16 +60,16 @@ def _joint(number: int, speed: float) -> Array:
     return qd
 
 
-CLEAR = (Deed("clear_links"),)
-UNLOCK = (Deed("clear_pstop_timer"), Deed("unlock"))
-POWER = (Deed("normal"), Deed("power_on", 1.15))
+CLEAR = (Action("clear_links"),)
+UNLOCK = (Action("clear_pstop_timer"), Action("unlock"))
+POWER = (Action("normal"), Action("power_on", 1.15))
 
 
 def _stops(
     name: str,
     throw: Callable[[Bench], float],
     faults: Fault | frozenset[Fault],
-    repair: tuple[Deed, ...] = (),
+    repair: tuple[Action, ...] = (),
     *,
     short: bool = True,
     **settings: Any,
@@ -80,7 +80,7 @@ def _stops(
 
 
 def _either(
-    name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: Deed, short: bool = True
+    name: str, throw: Callable[[Bench], float], faults: Iterable[Fault], *repair: Action, short: bool = True
 ) -> Case:
     """A fault in which the arm may go on, or stop and report one of these."""
     return Case(name, throw, GO_OR_STOP, frozenset(faults), repair, short=short)
@@ -131,24 +131,26 @@ RUNNING: tuple[Case, ...] = (
     _either("one byte wrong in a package", _fault("corrupt", n=1), ALL, *CLEAR),
     _either("bytes wrong in 20 packages", _fault("corrupt", n=20), ALL, *CLEAR, short=False),
     _either("one package of a wrong size", _fault("wrong_size", n=1), ALL, *CLEAR),
-    _stops("controller restarts", _fault("reboot", seconds=0.5), ALL, (Deed("power_on", 1.15),)),
+    _stops("controller restarts", _fault("reboot", seconds=0.5), ALL, (Action("power_on", 1.15),)),
     _stops(
         "controller's clock jumps 10 s ahead", _fault("timestamp_jump", seconds=10.0), Fault.CLOCK_JUMPED, short=False
     ),
     _stops("controller's clock jumps 10 s back", _fault("timestamp_jump", seconds=-10.0), Fault.CLOCK_JUMPED),
     # the robot
-    Case("reduced mode", _fault("reduced"), GO, repair=(Deed("normal"),)),
+    Case("reduced mode", _fault("reduced"), GO, repair=(Action("normal"),)),
     Case("tool contact", _fault("tool_contact", n=1), GO, short=False),
-    _either("pendant switched to local", _fault("local_mode"), ALL, Deed("remote")),
+    _either("pendant switched to local", _fault("local_mode"), ALL, Action("remote")),
     _stops("protective stop", _fault("protective_stop"), Fault.PROTECTIVE_STOP, UNLOCK),
     _stops("emergency stop on the robot", _fault("estop"), Fault.EMERGENCY_STOP, POWER),
     _stops("emergency stop of the cell", _fault("estop", system=True), Fault.EMERGENCY_STOP, POWER, short=False),
-    _stops("safeguard stop", _fault("safeguard"), Fault.SAFEGUARD_STOP, (Deed("safeguard_release"),)),
-    _stops("recovery mode", _fault("safety_mode", value=4), Fault.RECOVERY_MODE, (Deed("normal"),)),
+    _stops("safeguard stop", _fault("safeguard"), Fault.SAFEGUARD_STOP, (Action("safeguard_release"),)),
+    _stops("recovery mode", _fault("safety_mode", value=4), Fault.RECOVERY_MODE, (Action("normal"),)),
     _stops("safety violation", _fault("safety_mode", value=8), Fault.SAFETY_VIOLATION, POWER),
     _stops("safety fault", _fault("safety_mode", value=9), Fault.SAFETY_VIOLATION, POWER, short=False),
-    _stops("arm without power", _fault("robot_mode", value=3), Fault.ROBOT_NOT_RUNNING, (Deed("power_on", 1.15),)),
-    _stops("brakes on", _fault("robot_mode", value=5), Fault.ROBOT_NOT_RUNNING, (Deed("power_on", 0.6),), short=False),
+    _stops("arm without power", _fault("robot_mode", value=3), Fault.ROBOT_NOT_RUNNING, (Action("power_on", 1.15),)),
+    _stops(
+        "brakes on", _fault("robot_mode", value=5), Fault.ROBOT_NOT_RUNNING, (Action("power_on", 0.6),), short=False
+    ),
     _stops("program stopped", _fault("stop_program"), Fault.PROGRAM_STOPPED),
     _stops("program paused", _fault("pause_program"), Fault.PROGRAM_PAUSED),
     _stops("program replaced", _fault("replace_program"), ALL),

@@ -34,7 +34,7 @@ SEQUENCE_COLUMNS = (
 
 GOING_S = 0.4
 STARTS = 3
-# what a computer that is busy with something else looks like: a row that is not as it must be is tried again then, and counted
+# faults of a loaded computer: a wrong result with one of these is tried again, and counted
 LOADED = ("LINK_STALE", "COMMAND_LATE", "WORKER_DIED")
 PLAYED_S = 0.25
 HASTE_S = 0.1
@@ -43,7 +43,7 @@ ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes i
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one fault led to. Times from the fault on; `problems` is empty where everything is as it must be."""
+    """The result of one fault. Times count from the fault; `problems` is empty where the result is as required."""
 
     name: str
     must: str
@@ -59,12 +59,12 @@ class Outcome:
 
     @property
     def ok(self) -> bool:
-        """As it must be."""
+        """Whether the result is as required."""
         return not self.problems
 
     @property
     def line(self) -> str:
-        """For a person."""
+        """The outcome as one line of text."""
         parts = [] if self.ok else ["WRONG"]
         parts.append(self.did)
         if self.rest_after_ms is not None and self.travel_mm is not None:
@@ -73,7 +73,7 @@ class Outcome:
 
 
 def run_case(bench: Bench, case: Case, *, hasty: bool = False) -> Outcome:
-    """Throws in one fault and watches; leaves the controller in order, with no link.
+    """Injects one fault and observes; leaves the controller in order, without a link.
 
     `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long.
     """
@@ -156,10 +156,10 @@ def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played
 
 
 def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:
-    """Put the world right and press Play, as a person would who does not know better; commands go on all the while."""
-    for deed in case.repair:
-        bench.emulator.do(deed.name)
-        time.sleep(deed.after_s)
+    """Repair the fault and press Play without a new start, while commands continue to arrive."""
+    for action in case.repair:
+        bench.emulator.do(action.name)
+        time.sleep(action.after_s)
     played = bench.press_play()
     time.sleep(watch_s)
     return played
@@ -201,7 +201,7 @@ def run_matrix(
     *,
     hasty: bool = False,
 ) -> list[Outcome]:
-    """Every case, one after the other, on one controller: that the next one starts is what a fresh start must do."""
+    """Every case, one after the other, on one controller; each must be able to start after the one before."""
     outcomes = []
     for k, case in enumerate(cases):
         progress(case.name, k / len(cases))
@@ -220,13 +220,13 @@ class FaultReport:
     folder: Path
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names what was not as it must be."""
+        """The JSON object: times in ms, travel in mm at the tool, from the fault on; `wrong` names the results that are not as required."""
         stopped = [outcome for outcome in self.outcomes if outcome.did == "stopped"]
         wrong = [{"id": o.name, "reason": "; ".join(o.problems)} for o in self.outcomes if not o.ok]
         wrong += [{"id": f"sequence {s.seed}", "reason": s.verdict} for s in self.sequences if not s.ok]
         return {
             "state": "failed" if wrong else "done",
-            "reason": f"{len(wrong)} faults or sequences were not as they must be; see `wrong`." if wrong else None,
+            "reason": f"{len(wrong)} faults or sequences had a wrong result; see `wrong`." if wrong else None,
             "faults": len(self.outcomes),
             "stopped": len(stopped),
             "went_on": sum(outcome.did == "went on" for outcome in self.outcomes),

@@ -11,10 +11,10 @@ import numpy as np
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.tools.studies.robot.bench import Bench
-from weldcal.tools.studies.robot.cases import RUNNING, STOP, Case, Deed
+from weldcal.tools.studies.robot.cases import RUNNING, STOP, Action, Case
 
 SEEN_S = 1.2  # a fault that must stop the arm is reported by then
-ANY_REPAIR = tuple({deed.name: deed for case in RUNNING for deed in case.repair}.values())
+ANY_REPAIR = tuple({action.name: action for case in RUNNING for action in case.repair}.values())
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Sequence:
 
 
 def run_sequence(bench: Bench, seed: int, seconds: float) -> Sequence:
-    """Throws faults at the arm for so long; what the checker counts meanwhile is the answer."""
+    """Inject random faults for this long; the result is what the checker counted."""
     before = bench.emulator.ask(check="summary")
     rng, done = np.random.default_rng(seed), Sequence(seed)
     cases = [case for case in RUNNING if case.random]
@@ -73,7 +73,7 @@ def run_sequence(bench: Bench, seed: int, seconds: float) -> Sequence:
 
 
 def _start(bench: Bench, rng: np.random.Generator, done: Sequence) -> bool:
-    """A person puts everything right, or in one of five cases only thinks so, and starts."""
+    """Repair everything, in one of five cases only in part, and start."""
     if rng.random() < 0.8:
         bench.emulator.do("recover")
         time.sleep(0.05)
@@ -114,14 +114,14 @@ def _end(bench: Bench, rng: np.random.Generator, done: Sequence) -> None:
     # the arm brakes now; that it is at rest from then on is what the checker sees to
     bench.emulator.fault("tool_contact", n=0)
     time.sleep(rng.uniform(0.05, 0.6))
-    deeds: list[Deed | None] = [None, *(ANY_REPAIR[k] for k in rng.choice(len(ANY_REPAIR), 4, replace=False))]
+    deeds: list[Action | None] = [None, *(ANY_REPAIR[k] for k in rng.choice(len(ANY_REPAIR), 4, replace=False))]
     for k in rng.permutation(len(deeds)):
-        deed = deeds[k]
-        if deed is None:
+        action = deeds[k]
+        if action is None:
             bench.press_play()
         else:
             try:
-                bench.emulator.do(deed.name)
+                bench.emulator.do(action.name)
             except WeldcalError:
                 continue  # a protective stop is too young to be unlocked, or there is none
         time.sleep(rng.uniform(0.0, 0.25))

@@ -106,7 +106,7 @@ class Controller(ControllerState):
         self.watchdogs.clear()
 
     def resume_program(self) -> bool:
-        """Dashboard `play`, also after a protective stop: the program goes on with whatever its registers hold."""
+        """Dashboard `play`, also after a protective stop: the program continues with the values in its registers."""
         if self.program is None or not self.ready or not self.remote:
             return False
         self.runtime_state = RuntimeState.PLAYING

@@ -70,12 +70,12 @@ class ControllerState:
         self._later.append((self.frame + round(seconds / STEP_S), action))
 
     def pause_program(self) -> None:
-        """The program stands still and the arm brakes on its path; `resume_program` goes on from there."""
+        """The program stands still and the arm brakes on its path; `resume_program` continues from there."""
         if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
             self.runtime_state = RuntimeState.PAUSING
 
     def protective_stop(self, reason: str) -> None:
-        """The arm brakes and the program pauses until somebody unlocks."""
+        """The arm brakes and the program pauses until it is unlocked."""
         if self.safety_mode in MOVING:
             self.set_safety_mode(SafetyMode.PROTECTIVE_STOP)
             self.note(f"protective stop: {reason}")

@@ -88,7 +88,7 @@ class ControlServer(Server):
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
             "tool_contact": lambda r, now: setattr(c, "tool_contact_steps", int(_number(r, "n", 1))),
         }
-        self._deeds: dict[str, Callable[[Request, float], None]] = {
+        self._actions: dict[str, Callable[[Request, float], None]] = {
             "estop_release": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
             "safeguard_release": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
             "normal": lambda r, now: c.set_safety_mode(SafetyMode.NORMAL),
@@ -136,9 +136,9 @@ class ControlServer(Server):
             return {}
         if "do" in request:
             name = str(request["do"])
-            if name not in self._deeds:
-                raise InputError(f"There is no deed {name!r}; choose one of: {', '.join(sorted(self._deeds))}.")
-            self._deeds[name](request, now)
+            if name not in self._actions:
+                raise InputError(f"There is no action {name!r}; choose one of: {', '.join(sorted(self._actions))}.")
+            self._actions[name](request, now)
             return {}
         if request.get("check") == "at_rest_after":
             return self._checker.at_rest_after(

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 RUNS_FILE = "paper_algorithm1_50_runs.npz"
 _SAME_H_M = 1e-5  # a stored H and the fit of its four pairs agree to rounding; other sets of four differ by much more
 _BLOCK = 20_000
+PAPER_E_RPY_DEG = (-0.15, 0.92, 1.56)
+PAPER_E_XYZ_MM = (-11.11, 3.90, 7.15)
+"""Section 4.2: e_icp of all data points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,11 +149,6 @@ def _svd_folds(pairs: list[Observation], good: list[Observation], repeats: int, 
             X = all_pairs([o for i, o in enumerate(pairs) if i not in test])
             errors.append(position_errors(X, [pairs[i] for i in sorted(test) if pairs[i].id in scored]))
     return np.concatenate(errors)
-
-
-PAPER_E_RPY_DEG = (-0.15, 0.92, 1.56)
-PAPER_E_XYZ_MM = (-11.11, 3.90, 7.15)
-"""Section 4.2: e_icp of all data points."""
 
 
 @dataclass(frozen=True, eq=False)
