@@ -34,7 +34,7 @@ class Run:
         return self.commands[-1]
 
     def phases(self) -> tuple[Phase, ...]:
-        """The phases in order, each told once per visit."""
+        """The phases in order, each listed once per visit."""
         return tuple(p for i, p in enumerate(self.phase) if i == 0 or p != self.phase[i - 1])
 
 

@@ -140,7 +140,7 @@ def test_an_arm_over_a_third_of_the_part_leaves_a_shorter_seam_that_says_so() ->
     groove = extract_groove(scene.cloud_B)
     assert groove.s[-1] < 0.25
     assert groove.ends_seen.count(False) == 1
-    assert "out of sight" in groove.summary
+    assert "out of view" in groove.summary
     side, _ = sideways(groove.root, part, scene.X_BP)
     assert np.abs(side).max() < 0.6e-3
     assert np.sqrt(np.mean((side / groove.sigma) ** 2)) < 1.7

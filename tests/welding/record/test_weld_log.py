@@ -87,7 +87,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut off": (change("weld.csv", lambda t: t[: len(t) // 2]), "cut off or changed"),
     "one number changed": (change("weld.csv", lambda t: t.replace("4.446", "4.447")), "cut off or changed"),
     "binary table": (lambda f: (f / "weld.csv").write_bytes(b"\xff\xfe\x00\x01"), "cannot be read as text"),
-    "half a header": (change("weld.json", lambda t: t[:200]), "not whole JSON"),
+    "half a header": (change("weld.json", lambda t: t[:200]), "not complete JSON"),
     "another header": (change("weld.json", lambda _: '{"schema": "cooking"}'), "not the header of a weld log"),
     "a list": (change("weld.json", lambda _: "[1, 2]"), "not the header of a weld log"),
     "from the future": (change("weld.json", lambda t: t.replace('"version": 1', '"version": 9')), "version 9"),

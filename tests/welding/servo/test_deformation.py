@@ -89,7 +89,7 @@ def test_a_tag_that_is_not_there_is_not_seen() -> None:
     other = picture(facing(0.0, 0.0, 0.040), TagModel("4X4_50", 3))
     seen = detect_tag(other, K, TAG)
     assert not seen.valid
-    assert "not in sight" in seen.reason
+    assert "not visible" in seen.reason
 
 
 def test_the_same_tag_twice_is_ambiguous() -> None:

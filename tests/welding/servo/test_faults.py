@@ -1,4 +1,4 @@
-"""Whatever the servo is told, it answers with finite, bounded motion, and stops in a named way where it must."""
+"""The servo answers any input with finite, bounded motion, and stops with a named fault where it must."""
 
 from __future__ import annotations
 
