@@ -1,33 +1,92 @@
-"""What the documents say can be typed and found: every command, every option, every linked file."""
+"""What the documents say can be typed and found: every command, every option, every linked file, every example file."""
 
 from __future__ import annotations
 
 import re
 import shlex
 import subprocess
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer.main
 
-from tests.places import ROOT
+from weldcal.calibration.data.dataset import load_dataset
+from weldcal.systems.scenario.loading import load_scenario, scenario_names
 from weldcal.tools.cli.app import app
 
+ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+LONGEST_README = 90
+FOLDERS = ("models", "calibration", "welding", "systems", "tools", "tests")
+
+FENCED = re.compile(r"^```([a-z]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 # Places of one machine or one mirror; in two parts so that this file does not name them itself.
 PRIVATE = re.compile("|".join([r"(?<![\w.~])/" + "(work|root|home|Users)/", "pypi" + r"\.org", "python" + "hosted"]))
 
 
+def blocks(document: Path, language: str | None = None) -> list[str]:
+    """The document's fenced code blocks, all of them or those of one language ("": of none)."""
+    found = FENCED.findall(document.read_text())
+    return [text for its_language, text in found if language in (None, its_language)]
+
+
 def typed_lines(document: Path) -> list[str]:
     """The lines of the document's code blocks that run weldcal."""
-    blocks = re.findall(r"^```[a-z]*\n(.*?)^```", document.read_text(), re.MULTILINE | re.DOTALL)
-    lines = (line.strip().removeprefix("$ ") for block in blocks for line in block.splitlines())
+    lines = (line.strip().removeprefix("$ ") for block in blocks(document) for line in block.splitlines())
     return [line for line in lines if line.startswith(("./tools/run", "weldcal "))]
 
 
-COMMANDS = [(document.relative_to(ROOT).as_posix(), line) for document in DOCUMENTS for line in typed_lines(document)]
+def quoted_commands(document: Path) -> list[str]:
+    """The commands in the running text and in tables, between backticks; FILE, NAME and ... may stand for arguments."""
+    text = FENCED.sub("", document.read_text())
+    return [
+        command.strip()
+        for quoted in re.findall(r"`((?:\./tools/run|weldcal) [^`]+)`", text)
+        for command in re.split(r";|\n", quoted)
+    ]
+
+
+TYPED = [(document.relative_to(ROOT).as_posix(), line) for document in DOCUMENTS for line in typed_lines(document)]
+QUOTED = [(document.relative_to(ROOT).as_posix(), line) for document in DOCUMENTS for line in quoted_commands(document)]
+
+
+@cache
+def program() -> Any:
+    """The whole command line; made once, since making it takes a fifth of a second."""
+    return typer.main.get_command(app)
+
+
+def leaves(command: Any, name: str = "") -> Iterator[str]:
+    """Every command that does something, with its full name after `weldcal`."""
+    if hasattr(command, "commands"):
+        for word, child in command.commands.items():
+            yield from leaves(child, f"{name} {word}".strip())
+    else:
+        yield name
+
+
+def resolve(line: str) -> tuple[Any, list[str]]:
+    """The command that a line runs, and the words after its name.
+
+    Raises:
+        AssertionError: if the command does not exist.
+    """
+    words = shlex.split(line, comments=True)[1:]
+    command = program()
+    while words and hasattr(command, "commands"):
+        assert words[0] in command.commands, f"there is no command {words[0]!r} in {line!r}"
+        command = command.commands[words.pop(0)]
+    return command, words
+
+
+def is_the_test_run(line: str) -> bool:
+    """Whether the line runs the tests, which is not a weldcal command."""
+    return line.split()[:2] == ["./tools/run", "test"]
 
 
 def check(line: str) -> None:
@@ -37,20 +96,35 @@ def check(line: str) -> None:
         AssertionError: if the command does not exist.
         Exception: click's usage error, if an option or argument does not fit.
     """
-    words = shlex.split(line, comments=True)[1:]
-    if words[:1] == ["test"]:
+    if is_the_test_run(line):
         return
-    command: Any = typer.main.get_command(app)
-    while words and hasattr(command, "commands"):
-        assert words[0] in command.commands, f"there is no command {words[0]!r} in {line!r}"
-        command = command.commands[words.pop(0)]
+    command, words = resolve(line)
     if not hasattr(command, "commands"):
         command.make_context("weldcal", words)
 
 
-@pytest.mark.parametrize(("document", "line"), COMMANDS)
+def check_names(line: str) -> None:
+    """Checks that the command and the options of a line exist; its arguments may be placeholders.
+
+    Raises:
+        AssertionError: if the command or an option does not exist.
+    """
+    if is_the_test_run(line) or line in ("./tools/run COMMAND", "weldcal COMMAND"):
+        return
+    command, words = resolve(line)
+    known = {option for p in command.params for option in (*p.opts, *p.secondary_opts)} | {"--help"}
+    unknown = {word.partition("=")[0] for word in words if word.startswith("--")} - known
+    assert not unknown, f"{line!r} has no option {', '.join(sorted(unknown))}"
+
+
+@pytest.mark.parametrize(("document", "line"), TYPED)
 def test_every_command_of_the_documents_exists(document: str, line: str) -> None:
     check(line)
+
+
+@pytest.mark.parametrize(("document", "line"), QUOTED)
+def test_every_command_in_the_text_exists_with_its_options(document: str, line: str) -> None:
+    check_names(line)
 
 
 @pytest.mark.parametrize(
@@ -61,14 +135,71 @@ def test_a_command_that_does_not_exist_would_be_caught(line: str) -> None:
         check(line)
 
 
-def test_the_readme_shows_the_two_first_commands_and_the_real_data() -> None:
+@pytest.mark.parametrize("line", ["weldcal dance FILE", "weldcal demo SCENARIO --colour red"])
+def test_a_command_of_the_text_that_does_not_exist_would_be_caught(line: str) -> None:
+    with pytest.raises(AssertionError, match=r"no command|no option"):
+        check_names(line)
+
+
+def test_the_readme_shows_the_two_first_commands_and_the_users_own_data() -> None:
     lines = typed_lines(ROOT / "README.md")
     assert lines[:2] == ["./tools/run demo", "./tools/run test"]
     assert any("calibrate" in line for line in lines)
+    assert any("verify" in line for line in lines)
 
 
 def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text().splitlines()) <= 150
+    assert len((ROOT / "README.md").read_text().splitlines()) <= LONGEST_README
+
+
+def test_the_readme_says_what_is_not_real() -> None:
+    text = " ".join((ROOT / "README.md").read_text().split())
+    for sentence in (
+        "tested against an emulated one, not yet against a real one",
+        "The simulated arm is exact, and its scanner has noise but no distortion",
+        "Nothing here is a safety function.",
+    ):
+        assert sentence in text
+
+
+def test_the_readme_leads_to_every_page_and_names_every_root_folder() -> None:
+    text = (ROOT / "README.md").read_text()
+    pages = {path.relative_to(ROOT).as_posix() for path in DOCUMENTS} - {"README.md"}
+    assert pages - set(re.findall(r"\]\(([^)#:]+)", text)) == set()
+    assert [name for name in FOLDERS if not (ROOT / name).is_dir() or f"\n- `{name}`: " not in text] == []
+
+
+def test_the_page_of_commands_has_every_command() -> None:
+    text = (ROOT / "docs/commands.md").read_text()
+    missing = [name for name in leaves(program()) if not re.search(rf"`{name}[ `]|`{name}\]", text)]
+    assert missing == []
+
+
+def test_the_page_of_scenarios_has_every_scenario() -> None:
+    text = (ROOT / "docs/scenarios.md").read_text()
+    assert [name for name in scenario_names() if f"`{name}`" not in text] == []
+
+
+def test_the_scenario_that_the_documents_show_can_be_loaded(tmp_path: Path) -> None:
+    (example,) = blocks(ROOT / "docs/scenarios.md", "yaml")
+    file = tmp_path / "my_cell.yaml"
+    file.write_text(example)
+    assert load_scenario(str(file)).welding.speed_mm_s == 6.0
+
+
+def test_the_dataset_that_the_documents_show_can_be_loaded(tmp_path: Path) -> None:
+    page = ROOT / "docs/calibration.md"
+    (header,) = blocks(page, "yaml")
+    poses = next(block for block in blocks(page, "") if block.startswith("id,x,y,z"))
+    (tmp_path / "clouds").mkdir()
+    (tmp_path / "dataset.yaml").write_text(header)
+    (tmp_path / "poses.csv").write_text(poses)
+    points = np.random.default_rng(0).normal(size=(50, 3))
+    np.save(tmp_path / "clouds/pose01.npy", points)
+    data = load_dataset(tmp_path)
+    assert set(data.clouds) == {"pose01"}
+    assert data.cloud("pose01") == pytest.approx(points)
+    assert data.guess("pose01") is not None
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
