@@ -26,7 +26,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.verify import VerifyReport, verify_dataset
+from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.report.results import VerifyReport
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"

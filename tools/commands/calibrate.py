@@ -7,9 +7,8 @@ import csv
 import io
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +19,6 @@ from weldcal.calibration.data.results import (
     CalibrationResult,
     PoseRecord,
     export_all,
-    matrix4,
     save_result,
     software_version,
 )
@@ -29,85 +27,28 @@ from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.self_calibration import (
-    SelfCalibration,
     apply_self_calibration,
     calibrate_corrected,
 )
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import (
-    Convergence,
     convergence,
     k_fold,
 )
-from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.commands.algorithm1_comparison import Algorithm1Outcome, compare_algorithm1, summary_of
-from weldcal.tools.report.flange_features import feature_residuals
-from weldcal.tools.report.plots_calibration import calibration_report
+from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
+from weldcal.tools.report.calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.results import CalibrationReport, error_summary
 
 Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 Progress = Callable[[str, float], None]
 """Told what is being done and which fraction of the whole is behind us (0 to 1)."""
-
-
-@dataclass(frozen=True)
-class CalibrationReport:
-    """What a run of the job leaves: the estimate, the records written, and where. ``observations`` carry the scanner
-    correction where one was accepted."""
-
-    result: CalibrationResult
-    estimate: CalibrationEstimate
-    observations: tuple[Observation, ...]
-    scanner: SelfCalibration | None
-    fits: dict[str, FlangeFit]
-    refused: tuple[tuple[str, str], ...]
-    outliers: tuple[str, ...]
-    algorithm1: Algorithm1Outcome | None
-    convergence: Convergence
-    k_fold_mm: dict[str, float]
-    seconds: float
-    out: Path
-    advice: tuple[str, ...] = ()
-    patterns: dict[str, HolePattern] = field(default_factory=dict)
-
-    def summary(self) -> dict[str, Any]:
-        """The JSON object of `--json` (keys of the design's "calibrate" line, and Algorithm 1's figure beside them)."""
-        r = self.result
-        a = self.algorithm1
-        return {
-            "state": "done",
-            "n_used": int(self.estimate.inliers.sum()),
-            "refused": [{"id": i, "reason": t} for i, t in self.refused],
-            "X_BC": matrix4(r.X_BC),
-            "covariance": r.covariance.tolist(),
-            "scanner_correction": r.scanner_correction,
-            "held_out_mm": {k: r.held_out_mm[k] for k in ("median", "mean", "p95")},
-            "tilt_deg": r.tilt_deg,
-            "outliers": list(self.outliers),
-            "warnings": list(r.warnings),
-            "unobservable": list(r.unobservable),
-            "seconds": self.seconds,
-            "k_fold_mm": self.k_fold_mm,
-            "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
-            "advice": list(self.advice),
-            "features": feature_residuals(self.fits, self.patterns),
-            "algorithm1": None
-            if a is None
-            else {
-                "verification": a.verification,
-                "metric": a.metric,
-                "figure_mm": a.figure_mm,
-                "true_mm": a.true_mm,
-                "at_verification_mm": a.at_verification_mm,
-                "unseen": list(a.unseen),
-            },
-        }
 
 
 def calibrate_dataset(
@@ -196,7 +137,7 @@ def calibrate_dataset(
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
-        held_out_mm=summary_of(1e3 * estimate.held_out.position_m[estimate.inliers]),
+        held_out_mm=error_summary(1e3 * estimate.held_out.position_m[estimate.inliers]),
         tilt_deg=_tilts(estimate),
         poses=_pose_records(observations, estimate, refused),
         icp=icp,
@@ -224,7 +165,7 @@ def calibrate_dataset(
         outliers,
         algorithm1,
         curve,
-        summary_of(1e3 * folds[np.isfinite(folds)]),
+        error_summary(1e3 * folds[np.isfinite(folds)]),
         time.monotonic() - started,
         Path(out),
         sampling_advice(estimate, corrected),
@@ -270,7 +211,7 @@ def _axis_turn(
 
 
 def _tilts(estimate: CalibrationEstimate) -> dict[str, float | None]:
-    s = summary_of(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
+    s = error_summary(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
     return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
 
 
@@ -303,6 +244,3 @@ def _centres_csv(observations: list[Observation]) -> str:
         normal = ["", "", ""] if o.n_C is None else [f"{v:.9f}" for v in o.n_C]
         writer.writerow([o.id, *(f"{v:.9f}" for v in o.p_CR), *normal])
     return stream.getvalue()
-
-
-__all__ = ["Algorithm1Outcome", "CalibrationReport", "calibrate_dataset"]

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +12,15 @@ from numpy.typing import NDArray
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.scanner_model import ScannerCorrection, correction_from_document
+from weldcal.calibration.eye_on_base.scanner_model import correction_from_document
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
-from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.report.plots_verify import verify_report
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.results import PoseError, VerifyReport
+from weldcal.tools.report.verify import verify_report
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -33,61 +31,6 @@ _GROSS = 10.0  # times the usual error: a scan of something else
 _WORST_TILT_DEG = 10.0
 _SAME_MM = 1e-6  # a scan of the same name whose error repeats the recorded residual to a nanometre is the same scan
 _EVIDENT = 4.0  # standard errors of a scale error that is worth naming
-
-
-@dataclass(frozen=True)
-class PoseError:
-    """One scan: distance (mm) between where the calibration puts the flange centre and where the robot says it is, angle
-    (deg) between the face normals (None where none was seen), and whether the calibration was made with this scan."""
-
-    id: str
-    error_mm: float
-    tilt_deg: float | None
-    used_before: bool
-
-
-@dataclass(frozen=True)
-class VerifyReport:
-    """What a verification found. ``observations`` carry the scanner correction where the result has one."""
-
-    result: CalibrationResult
-    correction: ScannerCorrection | None
-    observations: tuple[Observation, ...]
-    fits: dict[str, FlangeFit]
-    poses: tuple[PoseError, ...]
-    refused: tuple[tuple[str, str], ...]
-    warnings: tuple[str, ...]
-    hashes: dict[str, str]
-    out: Path
-
-    @property
-    def position_error_mm(self) -> dict[str, float]:
-        """Median, mean, 95th percentile and largest position error, mm."""
-        e = np.array([p.error_mm for p in self.poses])
-        return {
-            "median": float(np.median(e)),
-            "mean": float(e.mean()),
-            "p95": float(np.percentile(e, 95)),
-            "max": float(e.max()),
-        }
-
-    @property
-    def tilt_deg(self) -> dict[str, float | None]:
-        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
-        t = [p.tilt_deg for p in self.poses if p.tilt_deg is not None]
-        if not t:
-            return {"median": None, "p95": None}
-        return {"median": float(np.median(t)), "p95": float(np.percentile(t, 95))}
-
-    def summary(self) -> dict[str, Any]:
-        """The JSON object of `--json` (keys of the design's "verify" line). A refused scan is named in the warnings."""
-        return {
-            "state": "done",
-            "position_error_mm": self.position_error_mm,
-            "tilt_deg": self.tilt_deg,
-            "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
-            "warnings": list(self.warnings),
-        }
 
 
 _UNCORRECTED = (
@@ -140,7 +83,7 @@ def verify_dataset(
         *uncorrected,
         *(f"{id} was not judged: {reason}" for id, reason in seen.refused),
         *_differences(calibration, data, standard.designation),
-        *_doubts(calibration, data, observations, poses),
+        *_diagnostics(calibration, data, observations, poses),
     )
     report = VerifyReport(
         calibration, correction, observations, seen.fits, poses, seen.refused, warnings, data.hashes, Path(out)
@@ -185,7 +128,7 @@ def _differences(result: CalibrationResult, data: Dataset, flange: str) -> list[
     ]
 
 
-def _doubts(
+def _diagnostics(
     result: CalibrationResult, data: Dataset, observations: tuple[Observation, ...], poses: tuple[PoseError, ...]
 ) -> list[str]:
     """Why the figures may flatter, or what they show of the cell."""
@@ -256,6 +199,3 @@ def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...
     scale = float((c * e).sum()) / spread
     left = float(((e - scale * c) ** 2).sum()) / (3 * n - 4)
     return scale, float(np.sqrt(left / spread))
-
-
-__all__ = ["PoseError", "VerifyReport", "verify_dataset"]

@@ -3,16 +3,12 @@ lie."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, render
-
-if TYPE_CHECKING:
-    from weldcal.tools.commands.verify import VerifyReport
+from weldcal.tools.report.results import VerifyReport
 
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:

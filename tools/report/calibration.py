@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -12,13 +10,11 @@ from numpy.typing import NDArray
 from weldcal.calibration.data.results import export_ros2, export_ur_pose
 from weldcal.calibration.eye_on_base.solve import point_error_covariance
 from weldcal.calibration.geometry.rigid import rotation_vector
+from weldcal.tools.report.calibration_map import knowledge_map
 from weldcal.tools.report.flange_features import HEADER, feature_table
 from weldcal.tools.report.pictures import OURS, error_bars, error_field, svg
-from weldcal.tools.report.plots_advice import knowledge_map
 from weldcal.tools.report.render import fixed, render
-
-if TYPE_CHECKING:
-    from weldcal.tools.commands.calibrate import CalibrationReport
+from weldcal.tools.report.results import CalibrationReport
 
 Array = NDArray[np.float64]
 
