@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.published.two_stage import Sign
-from weldcal.tools.cli.tablet import tablet
+from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.planar import VisitFits, best_model, fit_visit
 from weldcal.tools.studies.tablet.world import TabletTrial, simulate_trial
 
@@ -46,7 +46,7 @@ def run(path: Path, d: Fields, *options: str) -> dict[str, Any]:
     """What the command says of a file with these fields."""
     np.savez(path / "touches.npz", **d)
     command = ["calibrate", str(path / "touches.npz"), "--json", "--out", str(path / "out"), *options]
-    finished = CliRunner().invoke(tablet, command)
+    finished = CliRunner().invoke(app, ["tablet", *command])
     assert "Internal error" not in finished.output
     said: dict[str, Any] = json.loads(finished.stdout.splitlines()[-1])
     assert finished.exit_code == (0 if said["state"] == "done" else 1)

@@ -177,6 +177,21 @@ def sphere_data(
     )  # fmt: skip
 
 
+def parse_tip(text: str) -> Floats | None:
+    """The tip (3,) m of the option --tip, "x,y,z" in mm; None where it is empty.
+
+    Raises:
+        InputError: not three numbers.
+    """
+    if not text:
+        return None
+    try:
+        x, y, z = (1e-3 * float(v) for v in text.split(","))
+    except ValueError as e:
+        raise InputError(f"The tip is three numbers in mm with commas between, as --tip 0,0,150, not '{text}'.") from e
+    return np.array([x, y, z])
+
+
 def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
     """The sphere's points of a profile: all of them where they are one arc, else those that are found to be."""
     p = profile[np.isfinite(profile).all(axis=1)]
