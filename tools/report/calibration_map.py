@@ -1,4 +1,4 @@
-"""Where a scanned point is known how well, the poses taken so far, and where the next one tells most."""
+"""The map of the uncertainty of a scanned point, with the poses taken and the most informative next place."""
 
 from __future__ import annotations
 

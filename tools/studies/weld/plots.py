@@ -26,7 +26,7 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
     on = (off.s >= 0.0) & (off.s <= line.length)
     plan = run.planned.position(np.linspace(0.0, run.planned.length, 400))
     plan_off = path_error(plan, line)
-    work = travel = foretold = None
+    work = travel = predicted = None
     up = line.up(np.clip(off.s, 0.0, line.length))
     if float(np.min(up @ up[0], initial=1.0)) < math.cos(_BENT_RAD):
         seen = on & (off.s <= line.length - config.tool.torch_offset_m)
@@ -37,7 +37,7 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
             line, config.tool.torch_offset_m, config.weld_speed_m_s, spacing=1e-3, tip_left=config.delta_d_m
         )
         work, travel = (np.where(seen, angle, np.nan) for angle in (lean, pitch))
-        foretold = np.where(seen, chart.travel_at(off.s), np.nan)
+        predicted = np.where(seen, chart.travel_at(off.s), np.nan)
     speed = speed_along(run.column("time_s")[moving], torch[moving])[::_EVERY]
     return WeldTrace(
         s=off.s,
@@ -61,6 +61,6 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
         omega_max=config.omega_max_rad_s,
         work=work,
         travel=travel,
-        foretold=foretold,
+        predicted=predicted,
         windows=(config.windows.work_rad, config.windows.travel_rad),
     )
