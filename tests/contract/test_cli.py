@@ -123,7 +123,7 @@ def test_an_earlier_result_is_never_written_over(tmp_path: Path, monkeypatch: py
     [
         (InputError("Name a folder."), "weldcal: Name a folder.\n"),
         (FileNotFoundError(2, "No such file or directory", "x/y"), "weldcal: No such file or directory: x/y."),
-        (RuntimeError("bad luck"), "weldcal: Internal error, not a mistake of yours: RuntimeError: bad luck."),
+        (RuntimeError("bad luck"), "weldcal: Internal error of weldcal: RuntimeError: bad luck."),
     ],
 )
 def test_every_failure_is_a_sentence(failure: Exception, words: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -226,8 +226,8 @@ def test_a_taken_port_is_one_sentence(server: TabletServer, tmp_path: Path) -> N
     port = str(server.server_address[1])
     finished = CliRunner().invoke(app, ["tablet", "serve", "--port", port, "--out", str(tmp_path)])
     assert finished.exit_code == 1
-    assert f"Port {port} is taken on 127.0.0.1; choose another with --port." in finished.output
-    with pytest.raises(InputError, match="no address of this machine"):
+    assert f"Port {port} is in use on 127.0.0.1. Choose another with --port." in finished.output
+    with pytest.raises(InputError, match="not an address of this machine"):
         open_server("203.0.113.7", 0, tmp_path, lambda _: None)
     with pytest.raises(InputError, match="from 0 to 65535"):
         open_server("127.0.0.1", 70000, tmp_path, lambda _: None)

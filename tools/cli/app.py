@@ -32,11 +32,11 @@ COMMANDS = (
     *(profiler.edge, profiler.sphere, profiler.compensate, profiler.seam, runs.profiler_live),
 )
 GROUPS = {
-    "benchmark": "Measure speed and accuracy in simulation and on recorded data.",
-    "reproduce": "Repeat the published studies and compare the figures with their targets.",
-    "tablet": "Calibrate a camera on the wrist with a tablet as the target: its landmarks are seen, then touched.",
-    "hand-eye": "Calibrate a camera from pairs of robot and camera poses, in any mounting.",
-    "profiler": "Calibrate a laser profiler on the flange by an edge or a sphere, and map a seam.",
+    "benchmark": "Measure speed and accuracy.",
+    "reproduce": "Repeat the published studies.",
+    "tablet": "Calibrate a wrist camera with a tablet as target.",
+    "hand-eye": "Calibrate a camera from pairs of poses.",
+    "profiler": "Calibrate a laser profiler and map a seam.",
 }
 
 

@@ -1,4 +1,4 @@
-"""Algorithm 1 on the scans of a calibration: its own figure, the truth on poses outside its pool, and its blind spots."""
+"""Runs Algorithm 1 on the scans of a calibration and compares its reported figure with its error at unused poses."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.results import (
-    IcpRecord,
-)
+from weldcal.calibration.data.results import IcpRecord
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import (
     position_errors,
@@ -41,8 +39,7 @@ def compare_algorithm1(
     standard: FlangeStandard,
     seed: int,
 ) -> tuple[Algorithm1Outcome | None, Verifier | None, tuple[IcpRecord, ...]]:
-    """Algorithm 1 with one pose held out for verification: the one nearest the middle, where the arm will
-    mostly work."""
+    """Algorithm 1 with the pose nearest the middle held out for verification; None for fewer than six inliers."""
     if len(inliers) < 6:
         return None, None, ()
     middle = np.median([o.p_BR for o in inliers], axis=0)
@@ -63,7 +60,7 @@ def compare_algorithm1(
         unseen = shares.unseen
     else:
         verifier = CentreVerification(held)
-        metric = "distance of the verification pair's centre, in place of the ICP, as there are no clouds"
+        metric = "distance of the verification pair's centre instead of the ICP, as there are no clouds"
         unseen = ("every rotation (one centre has none)", "the error at any other pose")
     run = run_algorithm1(pool, verifier)
     if run is None:

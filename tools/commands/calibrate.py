@@ -1,5 +1,4 @@
-"""`weldcal calibrate DATASET`: from a folder of scans to X_BC, its uncertainty, and a report; written whole or not at
-all."""
+"""`weldcal calibrate DATASET`: estimates X_BC and its uncertainty from a folder of scans and writes exports and a report."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ from weldcal.tools.report.results import CalibrationReport, error_summary
 Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 Progress = Callable[[str, float], None]
-"""Told what is being done and which fraction of the whole is behind us (0 to 1)."""
+"""Called with the stage and the completed fraction (0 to 1)."""
 
 
 def calibrate_dataset(
@@ -65,16 +64,18 @@ def calibrate_dataset(
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
-    ``robot`` and ``flange`` override dataset.yaml. ``progress`` is told (stage, fraction). ``centres`` also writes
-    centres.csv (camera frame, metres, uncorrected). Without ``correct_scanner`` the scanner is taken as it is. Nothing
-    is written unless the calibration succeeded. ``axis_turn_deg``, how far the hole pattern is turned about the flange's axis, makes one
-    to three scans enough that show the holes; from four on it is not needed. Raises InputError (one sentence) for bad data; a cloud that cannot be
-    used is refused by name and reported, as long as enough remain.
+    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, uncorrected).
+    ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole pattern about the
+    flange axis; with it, one to three scans that show the holes are enough. A cloud that cannot be used is refused and
+    reported, as long as enough remain. Nothing is written unless the calibration succeeded.
+
+    Raises:
+        InputError: the data cannot be used; TooFewPoses: too few scans can be used.
     """
     started = time.monotonic()
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
-        raise InputError(f"'{out}' is a file; give a folder for the result.")
+        raise InputError(f"'{out}' is a file. Give a folder for the result.")
     data = load_dataset(Path(folder))
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
@@ -89,7 +90,7 @@ def calibrate_dataset(
         if few
         else estimate_eye_on_base(observations, SolveConfig(seed=seed, allow_coplanar=bool(fits)))
     )
-    tell("judging the scanner", 0.72)
+    tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
         observations, rigid, seen.patterns, seed=seed, wanted=correct_scanner and not few
@@ -97,8 +98,7 @@ def calibrate_dataset(
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
     errors = dict(zip((o.id for o in observations), estimate.position_residuals_m, strict=True))
     refused += [
-        (i, f"Its centre disagrees by {1e3 * errors[i]:.1f} mm with the other poses; it was left out.")
-        for i in outliers
+        (i, f"Its centre disagrees by {1e3 * errors[i]:.1f} mm with the other poses; it is not used.") for i in outliers
     ]
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     accepted = None if scanner is None else scanner.accepted
@@ -124,12 +124,11 @@ def calibrate_dataset(
     warnings = list(estimate.warnings)
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(
-            "The pairs have no orientations: whether a constant error of the flange centre hides in the figures cannot be told."
+            "The pairs have no orientations. A constant error of the flange centre would not show in these figures."
         )
     elif turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
-            "The poses hardly differ in orientation: a constant error of the flange centre would not show in these "
-            "figures."
+            "The poses hardly differ in orientation. A constant error of the flange centre would not show in these figures."
         )
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
@@ -185,24 +184,28 @@ def calibrate_dataset(
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:
-    """At least one usable scan, and four where some of more were refused: then more can be taken, and should be."""
+    """Requires one usable scan, and four where others were refused (then more can be taken).
+
+    Raises:
+        InputError, TooFewPoses: there are fewer.
+    """
     n = len(observations)
     if n == 0:
         same = len({r for _, r in refused}) == 1 and len(refused) > 1
         which = "every cloud" if same else f"the first, {refused[0][0]}"
-        raise InputError(f"None of the {len(refused)} clouds can be used; for {which}: {refused[0][1]}")
+        raise InputError(f"None of the {len(refused)} clouds can be used. Reason for {which}: {refused[0][1]}")
     if n < ENOUGH and refused:
         names = "; ".join(f"{i}: {t}" for i, t in refused[:3])
         raise TooFewPoses(
-            f"Only {n} usable poses remain of {n + len(refused)}, at least {ENOUGH} are needed; refused were {names}"
+            f"Only {n} usable poses remain of {n + len(refused)}; at least {ENOUGH} are needed. Refused: {names}"
         )
 
 
 def _axis_turn(
     inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float] | None:
-    """How far the hole pattern is turned about the flange's axis, and the spread of that over the scans (deg); None where fewer
-    than four show it. With it, one scan is enough the next time; it is that of scans as they are, which one scan is taken for, too."""
+    """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as axis_turn_deg;
+    None where fewer than four scans show the holes. From uncorrected scans, as in a calibration from one scan."""
     seen = [o for o in inliers if o.id in patterns]
     if len(seen) < ENOUGH:
         return None

@@ -44,7 +44,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
             ("one sigma, mm", fixed_row(1e3 * sigma[3:], 3)),
             ("rotation vector, deg", fixed_row(np.degrees(rotation_vector(r.X_BC.rotation())), 4)),
             ("one sigma, deg", fixed_row(np.degrees(sigma[:3]), 4)),
-            ("standard deviation of robot and scanner, per axis", f"{r.sigma_position_mm:.3f} mm"),
+            ("noise per axis, one sigma", f"{r.sigma_position_mm:.3f} mm"),
             *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
             ("URScript", export_ur_pose(r.X_BC).strip()),

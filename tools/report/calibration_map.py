@@ -53,7 +53,7 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
             color="#e0872f",
             markeredgecolor="#222",
             markersize=15,
-            label="tells most next",
+            label="best next pose",
         )
         axes.set_xlabel(f"base {'xyz'[i]}, mm")
         axes.set_ylabel(f"base {'xyz'[j]}, mm")

@@ -38,12 +38,10 @@ def error_summary(values: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its own figure beside the truth on poses outside its pool, and the figure's blind
-    spots.
+    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive to.
 
-    ``verification``: id of the pose held out for it. ``figure_mm`` is what Algorithm 1 reports; ``true_mm`` the errors
-    at the flange on poses it did not use; ``unseen`` the components of a true error of which less than half enters the
-    figure.
+    ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at the
+    flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
     """
 
     verification: str
@@ -58,17 +56,17 @@ class Algorithm1Outcome:
     @property
     def sentence(self) -> str:
         """One sentence for the terminal."""
-        blind = f" ({self.metric}); it cannot see: {'; '.join(self.unseen)}" if self.unseen else f" ({self.metric})"
+        blind = f" ({self.metric}), insensitive to: {'; '.join(self.unseen)}" if self.unseen else f" ({self.metric})"
         return (
             f"Algorithm 1 reports {self.figure_mm:.3f} mm at its verification pose {self.verification}{blind}. "
-            f"Its true error on poses it did not use: {self.true_mm['median']:.3f} mm median."
+            f"Its error at unused poses: {self.true_mm['median']:.3f} mm median."
         )
 
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """What a run of the job leaves: the estimate, the records written, and where. ``observations`` carry the scanner
-    correction where one was accepted."""
+    """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
+    scanner correction where one was accepted."""
 
     result: CalibrationResult
     estimate: CalibrationEstimate
@@ -86,7 +84,7 @@ class CalibrationReport:
     patterns: dict[str, HolePattern] = field(default_factory=dict)
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object of `--json` (keys of the design's "calibrate" line, and Algorithm 1's figure beside them)."""
+        """The JSON object of `calibrate`."""
         r = self.result
         a = self.algorithm1
         return {
@@ -121,8 +119,8 @@ class CalibrationReport:
 
 @dataclass(frozen=True)
 class PoseError:
-    """One scan: distance (mm) between where the calibration puts the flange centre and where the robot says it is, angle
-    (deg) between the face normals (None where none was seen), and whether the calibration was made with this scan."""
+    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face normals
+    (None where none was seen), and whether the calibration used this scan."""
 
     id: str
     error_mm: float
@@ -132,7 +130,7 @@ class PoseError:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What a verification found. ``observations`` carry the scanner correction where the result has one."""
+    """The result of a verification. ``observations`` include the scanner correction where the result has one."""
 
     result: CalibrationResult
     correction: ScannerCorrection | None
@@ -156,7 +154,7 @@ class VerifyReport:
         return {key: found[key] if np.isfinite(found[key]) else None for key in ("median", "p95")}
 
     def summary(self) -> dict[str, Any]:
-        """The JSON object of `--json` (keys of the design's "verify" line). A refused scan is named in the warnings."""
+        """The JSON object of `verify`. A refused scan is named in the warnings."""
         return {
             "state": "done",
             "position_error_mm": self.position_error_mm,

@@ -186,7 +186,7 @@ def _millimetres(path: Path) -> None:
 
 def test_options_that_do_not_belong_together_are_told(npz: Path, visit: Path, tmp_path: Path) -> None:
     for arguments, sentence in (
-        ((npz, "--poses", visit / "poses.csv"), "holds everything"),
+        ((npz, "--poses", visit / "poses.csv"), "is complete"),
         ((visit / "touches.csv",), "need the robot's poses"),
         ((visit / "nothing.csv",), "There is no file"),
         ((visit / "picture.png",), "neither .csv nor .npz"),
