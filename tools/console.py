@@ -1,4 +1,4 @@
-"""How a command speaks to a person and to a program: progress, a short summary, one JSON line, one error boundary."""
+"""Output of the commands: progress, summary, JSON and the error boundary."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import typer
 from weldcal.models.errors import WeldcalError
 
 Progress = Callable[[str, float], None]
-"""Reports what is being done now and which fraction of the whole is behind us (0 to 1)."""
+"""Called with the stage and the completed fraction (0 to 1)."""
 
 
 def plain(value: object) -> object:
@@ -39,7 +39,7 @@ def plain(value: object) -> object:
     for converter in ("tolist", "GetAsMatrix4"):  # a NumPy array or scalar; a RigidTransform
         if hasattr(value, converter):
             return plain(getattr(value, converter)())
-    raise TypeError(f"A {type(value).__name__} has no JSON form; convert it before it is reported.")
+    raise TypeError(f"A {type(value).__name__} has no JSON form. Convert it first.")
 
 
 def emit_json(result: Mapping[str, object]) -> None:
@@ -48,7 +48,7 @@ def emit_json(result: Mapping[str, object]) -> None:
 
 
 def emit_summary(title: str, rows: Mapping[str, str]) -> None:
-    """Writes a heading and a two-column list for a person on stdout; empty texts are left out."""
+    """Writes a heading and a two-column list on stdout; rows with empty text are omitted."""
     width = max((len(name) for name in rows), default=0)
     typer.secho(title, bold=True)
     for name, text in rows.items():
@@ -66,18 +66,18 @@ NAMES = {
     "peak_omega": "peak turning rate (rad/s)",
     "next_pose": "next best pose",
     "wall_seconds": "seconds",
-    "late_ms": "late while moving, most (ms)",
-    "thinking_ms": "thinking at rest, most (ms)",
-    "reanchored": "times fallen behind",
+    "late_ms": "largest delay while moving (ms)",
+    "thinking_ms": "longest computation at rest (ms)",
+    "reanchored": "times behind real time",
     "fell_behind": "note",
 }
-"""What a person calls a number of the JSON object, where its key says it too briefly."""
+"""Printed names of the numbers of the JSON object whose keys are too short."""
 
 
 def rows(result: Mapping[str, object]) -> dict[str, str]:
-    """The result's short values as a person reads them, name by name; matrices and `state` stay in the files.
+    """The result's short values as printed, by name, without matrices and `state`.
 
-    A list of {id, reason} becomes one row per id, so that nothing that was refused goes unnamed.
+    A list of {id, reason} becomes one row per id, so that every refusal is named.
     """
     found: dict[str, str] = {}
     for key, value in result.items():
@@ -112,7 +112,7 @@ def _short(value: object) -> str:
 
 
 def emit_warning(text: str) -> None:
-    """Writes one sentence on stderr that does not stop the work."""
+    """Writes one sentence on stderr; the command continues."""
     typer.secho(f"weldcal: {text}", err=True, fg=typer.colors.YELLOW)
 
 
@@ -129,14 +129,14 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
         sentence = str(problem)
     except OSError as problem:
         place = f": {problem.filename}" if problem.filename else ""
-        sentence = f"{problem.strerror or problem}{place}. Check that the path exists and may be written."
+        sentence = f"{problem.strerror or problem}{place}. Check that the path exists and is writable."
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
     except Exception as problem:
         if debug:
             traceback.print_exc()
-        advice = "" if debug else " Run the same command with --debug for the details, and report them."
-        sentence = f"Internal error, not a mistake of yours: {type(problem).__name__}: {problem}.{advice}"
+        advice = "" if debug else " Run the command again with --debug and report the traceback."
+        sentence = f"Internal error of weldcal: {type(problem).__name__}: {problem}.{advice}"
     else:
         return
     if json_wanted:

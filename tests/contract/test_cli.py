@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -18,7 +19,8 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
-from weldcal.tools.cli.app import app as cli
+from weldcal.tools.cli.app import app
+from weldcal.tools.cli.options import Call, Outcome, fresh_folder, report
 
 HEAVY = ("pydrake", "open3d", "cv2", "scipy", "matplotlib", "numpy")
 
@@ -38,7 +40,7 @@ def leaves(command: Any, name: str = "weldcal") -> Iterator[tuple[str, Any]]:
         yield name, command
 
 
-LEAVES = dict(leaves(typer.main.get_command(cli)))
+LEAVES = dict(leaves(typer.main.get_command(app)))
 
 
 @pytest.mark.parametrize("name", LEAVES)
@@ -60,7 +62,7 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
 
 def test_help_loads_no_heavy_library() -> None:
     script = (
-        "import sys\nfrom weldcal.tools import cli\nsys.argv = ['weldcal', '--help']\n"
+        "import sys\nfrom weldcal.tools.cli import app as cli\nsys.argv = ['weldcal', '--help']\n"
         f"try:\n    cli.main()\nexcept SystemExit as end:\n    assert end.code == 0\n"
         f"loaded = [name for name in {HEAVY!r} if name in sys.modules]\nassert not loaded, loaded\n"
     )
@@ -109,11 +111,11 @@ def test_view_finds_the_pages_of_a_result(tmp_path: Path) -> None:
 
 def test_an_earlier_result_is_never_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    first = cli.fresh_folder("demo", "s_groove", 7)
+    first = fresh_folder("demo", "s_groove", 7)
     assert first == Path("weldcal-out/demo-s_groove-seed7")
     first.mkdir(parents=True)
-    assert cli.fresh_folder("demo", "s_groove", 7) == Path("weldcal-out/demo-s_groove-seed7-2")
-    assert cli.fresh_folder("demo", "folder/mine.yaml", 0).name == "demo-mine-seed0"
+    assert fresh_folder("demo", "s_groove", 7) == Path("weldcal-out/demo-s_groove-seed7-2")
+    assert fresh_folder("demo", "folder/mine.yaml", 0).name == "demo-mine-seed0"
 
 
 @pytest.mark.parametrize(
@@ -121,7 +123,7 @@ def test_an_earlier_result_is_never_written_over(tmp_path: Path, monkeypatch: py
     [
         (InputError("Name a folder."), "weldcal: Name a folder.\n"),
         (FileNotFoundError(2, "No such file or directory", "x/y"), "weldcal: No such file or directory: x/y."),
-        (RuntimeError("bad luck"), "weldcal: Internal error, not a mistake of yours: RuntimeError: bad luck."),
+        (RuntimeError("bad luck"), "weldcal: Internal error of weldcal: RuntimeError: bad luck."),
     ],
 )
 def test_every_failure_is_a_sentence(failure: Exception, words: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,8 +143,10 @@ def test_debug_shows_where_it_happened(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_job_that_is_held_ends_with_1_and_says_why(capsys: pytest.CaptureFixture[str]) -> None:
+    held = Outcome({"state": "held", "reason": "The tag was not seen."})
+    call = Call("demo", {"json": True}, ExitStack())
     with pytest.raises(typer.Exit) as end:
-        cli.finish("demo", {"state": "held", "reason": "The tag was not seen."}, Path("out"), json_wanted=True)
+        report("demo", held, call)
     assert end.value.exit_code == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["state"] == "held"

@@ -21,7 +21,8 @@ from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.commands.calibrate import CalibrationReport, calibrate_dataset
+from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.report.results import CalibrationReport
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"

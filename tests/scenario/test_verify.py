@@ -26,7 +26,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
-from weldcal.tools.commands.verify import VerifyReport, verify_dataset
+from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.report.results import VerifyReport
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
@@ -79,7 +80,7 @@ def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(veri
     assert d["position_error_mm"]["median"] < 0.2
     assert d["position_error_mm"]["max"] < 0.4
     assert d["tilt_deg"]["median"] < 0.12
-    assert not any("given to the calibration" in w for w in d["warnings"])
+    assert not any("used in the calibration" in w for w in d["warnings"])
     assert not any("calibrate again" in w for w in d["warnings"])
     assert any("orientations hardly vary" in w for w in d["warnings"])
 
@@ -153,10 +154,10 @@ def test_scans_that_made_the_calibration_are_named(halves: tuple[Path, Path], tm
     seen = _part(AUBO, tmp_path / "seen", slice(0, 3))  # the first and the third were given, the second was not
     report = verify_dataset(halves[0] / "calibration.yaml", seen, tmp_path / "out")
     assert [p.used_before for p in report.poses] == [True, False, True]
-    given = next(w for w in report.warnings if "given to the calibration" in w)
+    given = next(w for w in report.warnings if "used in the calibration" in w)
     assert report.poses[0].id in given
     assert report.poses[1].id not in given
-    assert any("Only 3 scans were judged" in w for w in report.warnings)
+    assert any("Only 3 scans were used" in w for w in report.warnings)
 
 
 def test_a_scan_without_a_flange_is_named_and_the_rest_is_judged(halves: tuple[Path, Path], tmp_path: Path) -> None:
@@ -169,10 +170,10 @@ def test_a_scan_without_a_flange_is_named_and_the_rest_is_judged(halves: tuple[P
     report = verify_dataset(halves[0], few, tmp_path / "out")
     assert [p.id for p in report.poses] == [second.stem]
     for missing in (first, third):
-        assert any(w.startswith(f"{missing.stem} was not judged: ") for w in report.warnings)
+        assert any(w.startswith(f"{missing.stem} was not used: ") for w in report.warnings)
     assert f"<td>{first.stem}</td>" in (tmp_path / "out/report.html").read_text()
     shutil.copyfile(first, second)
-    with pytest.raises(InputError, match=f"None of the 3 scans can be judged; for the first, {third.stem}: "):
+    with pytest.raises(InputError, match=f"None of the 3 scans can be used. Reason for the first, {third.stem}: "):
         verify_dataset(halves[0], few, tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
@@ -187,7 +188,7 @@ def test_another_robot_flange_or_scanner_is_named(halves: tuple[Path, Path], tmp
         ("flange", "iso9409-1-50-4-m6", "tool-ring-63"),
         ("scanner", "phoxi_s", "phoxi_m"),
     ):
-        assert any(f"{what} '{was}', these scans say '{now}'" in w for w in report.warnings)
+        assert any(f"{what} '{was}', these scans with '{now}'" in w for w in report.warnings)
 
 
 def test_pairs_are_judged_by_their_centres(tmp_path: Path) -> None:
@@ -210,7 +211,7 @@ def test_pairs_are_judged_by_their_centres(tmp_path: Path) -> None:
     rows[5] = ",".join([cells[0], str(float(cells[1]) + 0.08), *cells[2:]])
     (kept / "pairs.csv").write_text("\n".join(rows))
     warnings = verify_dataset(result, kept, tmp_path / "off").summary()["warnings"]
-    assert any(f"1 of the 23 scans is far off while the others are not: {cells[0]} by " in w for w in warnings)
+    assert any(f"1 of the 23 scans is a gross outlier: {cells[0]} by " in w for w in warnings)
 
 
 def _no_result(result: Path, _: Path) -> None:
@@ -282,4 +283,4 @@ def test_the_command_prints_one_json_object_last(halves: tuple[Path, Path], tmp_
     (tmp_path / "file").write_text("")
     refused = CliRunner().invoke(app, ["verify", str(halves[0]), str(few), "--out", str(tmp_path / "file"), "--json"])
     assert refused.exit_code == 1
-    assert "is a file; give a folder" in json.loads(refused.stdout.splitlines()[-1])["reason"]
+    assert "is a file. Give a folder" in json.loads(refused.stdout.splitlines()[-1])["reason"]

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from tests.browser import Browser
 from tests.places import ROOT
 from weldcal.models.errors import InputError
-from weldcal.tools.cli.tablet import tablet
+from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.page.serve import TabletServer, addresses, is_loopback, open_server, page
 
 PAGE = ROOT / "tools/commands/tablet/page/tablet.html"
@@ -224,10 +224,10 @@ def test_the_server_takes_nothing_but_touches(server: TabletServer) -> None:
 
 def test_a_taken_port_is_one_sentence(server: TabletServer, tmp_path: Path) -> None:
     port = str(server.server_address[1])
-    finished = CliRunner().invoke(tablet, ["serve", "--port", port, "--out", str(tmp_path)])
+    finished = CliRunner().invoke(app, ["tablet", "serve", "--port", port, "--out", str(tmp_path)])
     assert finished.exit_code == 1
-    assert f"Port {port} is taken on 127.0.0.1; choose another with --port." in finished.output
-    with pytest.raises(InputError, match="no address of this machine"):
+    assert f"Port {port} is in use on 127.0.0.1. Choose another with --port." in finished.output
+    with pytest.raises(InputError, match="not an address of this machine"):
         open_server("203.0.113.7", 0, tmp_path, lambda _: None)
     with pytest.raises(InputError, match="from 0 to 65535"):
         open_server("127.0.0.1", 70000, tmp_path, lambda _: None)

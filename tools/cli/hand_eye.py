@@ -1,184 +1,101 @@
-"""weldcal hand-eye and weldcal benchmark hand-eye: the command lines, heavy imports inside."""
+"""weldcal hand-eye: cameras calibrated from files of robot and camera poses."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from weldcal.tools import console
-
-hand_eye = typer.Typer(help="Where is the camera? From pairs of robot and camera poses.", no_args_is_help=True)
+from weldcal.tools.cli.options import Call, Outcome, command
 
 FileArgument = Annotated[
     Path, typer.Argument(help="npz, CSV, JSON, or a sample file of easy_handeye2 or MoveIt.", show_default=False)
 ]
 MountingOption = Annotated[
     str | None,
-    typer.Option("--mounting", metavar="NAME", help="eye_in_hand, eye_on_base ..., where the file does not say it."),
+    typer.Option("--mounting", metavar="NAME", help="eye_in_hand, eye_on_base ..., if the file does not name it."),
 ]
 UnitOption = Annotated[
     str | None, typer.Option("--unit", metavar="UNIT", help="Unit of the positions: m, mm or cm.", show_default="m")
 ]
-OutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
-]
-SeedOption = Annotated[
-    int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
-]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")]
-MotionsOption = Annotated[
-    bool, typer.Option("--motions", help="The file holds motions (A X = X B as they stand), not poses.")
-]
-CornersOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--corners/--no-corners",
-        help="Use the board's corners: reproject, and look for a shifted principal point.",
-        show_default="where the file holds them",
-    ),
-]
 RobotOption = Annotated[
     str | None,
-    typer.Option("--robot", metavar="NAME", help="The arm, ur10e for example: the next pose is then one it reaches."),
+    typer.Option("--robot", metavar="NAME", help="The arm, for example ur10e: the next pose is then within its reach."),
 ]
 ScannerOption = Annotated[
     str | None,
-    typer.Option("--camera", metavar="NAME", help="The scanner, phoxi_s for example: the next pose is in its view."),
-]
-RefineOption = Annotated[
-    str | None,
     typer.Option(
-        "--refine", metavar="KIND", help="joints or links: look for errors of the robot (--robot, joint angles q)."
+        "--camera", metavar="NAME", help="The scanner, for example phoxi_s: the next pose is then in its view."
     ),
 ]
 
 
-@hand_eye.callback()
-def _group() -> None:
-    """Where is the camera? From pairs of robot and camera poses, in every mounting."""
-
-
-@hand_eye.command("ax-xb")
+@command("hand-eye ax-xb")
 def ax_xb(
+    call: Call,
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
-    motions: MotionsOption = False,
-    out: OutOption = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """AX = XB: the camera's pose alone. Poses are solved with the target's pose beside it, so that each counts once."""
-    _run("ax-xb", file, mounting, unit, motions, out, seed, json, debug)
-
-
-@hand_eye.command("ax-yb")
-def ax_yb(
-    file: FileArgument,
-    mounting: MountingOption = None,
-    unit: UnitOption = None,
-    corners: CornersOption = None,
-    robot: RobotOption = None,
-    camera: ScannerOption = None,
-    refine: RefineOption = None,
-    out: OutOption = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """AX = YB: the poses of camera and target together, with the next pose to add."""
-    _run("ax-yb", file, mounting, unit, False, out, seed, json, debug, corners, robot, camera, refine)
-
-
-@hand_eye.command("axb-ycz")
-def axb_ycz(
-    file: FileArgument,
-    mounting: MountingOption = None,
-    unit: UnitOption = None,
-    robot: RobotOption = None,
-    camera: ScannerOption = None,
-    out: OutOption = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """AXB = YCZ: two robots, one with the camera and one with the target; camera, second base and target."""
-    _run("axb-ycz", file, mounting, unit, False, out, seed, json, debug, False, robot, camera)
-
-
-def benchmark(
-    data: Annotated[
-        Path | None,
-        typer.Option("--data", metavar="FOLDER", help="A folder of sets, each a folder with pairs.npz."),
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few trials of each kind: seconds instead of minutes.")
+    motions: Annotated[
+        bool, typer.Option("--motions", help="The file holds motions (A and B of A X = X B), not poses.")
     ] = False,
-    out: OutOption = None,
-    seed: SeedOption = 0,
-    json: JsonOption = False,
-    debug: DebugOption = False,
-) -> None:
-    """Hand-eye solvers on others' data beside OpenCV's, and on simulations: outliers, invariance, uncertainty, speed."""
-    from weldcal.tools.cli.options import fresh_folder
-
-    folder = out or fresh_folder("benchmark", "hand-eye", seed)
-    with console.boundary(json_wanted=json, debug=debug), console.progress_bar("benchmark hand-eye") as progress:
-        from weldcal.tools.studies.hand_eye.comparison import run_hand_eye_benchmark, write_table
-
-        report = run_hand_eye_benchmark(data, quick=quick, seed=seed, progress=progress)
-        text = write_table(report, folder)
-    if json:
-        console.emit_json(report.summary())
-    else:
-        typer.echo(text)
+) -> Outcome:
+    """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
+    return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions)
 
 
-def _run(
-    equation: str,
-    file: Path,
-    mounting: str | None,
-    unit: str | None,
-    motions: bool,
-    out: Path | None,
-    seed: int,
-    json: bool,
-    debug: bool,
-    corners: bool | None = False,
-    robot: str | None = None,
-    camera: str | None = None,
-    refine: str | None = None,
-) -> None:
-    from weldcal.tools.cli.options import fresh_folder
+@command("hand-eye ax-yb")
+def ax_yb(
+    call: Call,
+    file: FileArgument,
+    mounting: MountingOption = None,
+    unit: UnitOption = None,
+    corners: Annotated[
+        bool | None,
+        typer.Option(
+            "--corners/--no-corners",
+            help="Use the board's corners: minimise the reprojection error, and test for a shifted principal point.",
+            show_default="if the file holds them",
+        ),
+    ] = None,
+    robot: RobotOption = None,
+    camera: ScannerOption = None,
+    refine: Annotated[
+        str | None,
+        typer.Option(
+            "--refine",
+            metavar="KIND",
+            help="joints or links: estimate errors of the robot (needs --robot and joint angles q).",
+        ),
+    ] = None,
+) -> Outcome:
+    """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
+    return _solve(
+        "ax-yb", call, file, mounting=mounting, unit=unit, corners=corners, robot=robot, camera=camera, refine=refine
+    )
 
-    folder = out or fresh_folder("hand-eye", file.resolve().stem, seed)
-    with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.tools.commands.hand_eye import run_hand_eye
 
-        def say(sentence: str) -> None:
-            if not json:
-                typer.echo(sentence)
+@command("hand-eye axb-ycz")
+def axb_ycz(
+    call: Call,
+    file: FileArgument,
+    mounting: MountingOption = None,
+    unit: UnitOption = None,
+    robot: RobotOption = None,
+    camera: ScannerOption = None,
+) -> Outcome:
+    """Solve AXB = YCZ for camera, second base and target: one robot carries the camera, another the target."""
+    return _solve("axb-ycz", call, file, mounting=mounting, unit=unit, robot=robot, camera=camera)
 
-        report = run_hand_eye(
-            equation,
-            file,
-            folder,
-            mounting=mounting,
-            unit=unit,
-            motions=motions,
-            corners=corners,
-            robot=robot,
-            camera=camera,
-            refine=refine,
-            seed=seed,
-            say=say,
-        )
-    if json:
-        console.emit_json(report.summary())
-    else:
-        typer.echo(report.text())
-        typer.echo(f"\nwritten      {folder}")
+
+def _solve(equation: str, call: Call, file: Path, **options: Any) -> Outcome:
+    from weldcal.tools.commands.hand_eye import run_hand_eye
+
+    def say(sentence: str) -> None:
+        if not call.json:
+            typer.echo(sentence)
+
+    folder = call.folder("hand-eye", file.resolve().stem)
+    report = run_hand_eye(equation, file, folder, seed=call.seed, say=say, **options)
+    return Outcome(report.summary(), text=f"{report.text()}\n\nwritten      {folder}")

@@ -1,74 +1,175 @@
-"""What commands share: their options, the folder that each run gets, and how its outcome is told."""
+"""What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from weldcal.tools import console
 
-OutOption = Annotated[
-    Path | None, typer.Option("--out", metavar="FOLDER", help="Where to write; default: a new one in weldcal-out.")
+ScenarioOption = Annotated[
+    str, typer.Option("--scenario", metavar="NAME", help="Name of a scenario, or path of a scenario YAML file.")
 ]
-SeedOption = Annotated[
-    int, typer.Option("--seed", metavar="N", min=0, help="Everything random follows from this number.")
+ScenarioArgument = Annotated[
+    str | None, typer.Argument(metavar="SCENARIO", help="The same as --scenario.", show_default=False)
 ]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")]
-DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")]
-BrowserOption = Annotated[
-    bool,
-    typer.Option(
-        "--browser/--no-browser", help="Open the live 3D view in the web browser, or not.", show_default="open it"
-    ),
-]
-RobotOption = Annotated[
-    str | None,
-    typer.Option(
-        "--robot",
-        metavar="ROBOT",
-        help="simulated, emulated (a controller on loopback), or the address of a controller.",
-        show_default="the scenario's",
-    ),
-]
-DryRunOption = Annotated[
-    bool,
-    typer.Option(
-        "--dry-run", help="Only look at the robot, then run on a simulated arm like it: nothing is sent to it."
-    ),
-]
-PaceOption = Annotated[
-    float | None,
-    typer.Option(
-        "--pace", metavar="P", help="Emulated controller only: its seconds per second of the clock, 0.05 to 1."
-    ),
-]
-SpeedFactorOption = Annotated[
-    float | None,
-    typer.Option(
-        "--speed-factor", metavar="X", help="Make the arm's moves slower: 0.05 to 1. The weld keeps its speed."
-    ),
-]
-AddressOption = Annotated[
-    str, typer.Option("--address", metavar="ADDRESS", help="Loopback address 127.x.y.z of the emulated controller.")
-]
+RecordOption = Annotated[bool, typer.Option("--record", help="Also write recording.html, the run in 3D.")]
 CorrectionOption = Annotated[
     bool,
     typer.Option(
         "--scanner-correction/--no-scanner-correction",
-        help="Of a dataset: look for the scanner's own scale error, or take its scans as they are.",
+        help="For a dataset: estimate and correct the scanner's scale error, or use the scans uncorrected.",
     ),
 ]
-RealtimeOption = Annotated[bool, typer.Option("--realtime", help="Never run faster than the real robot would.")]
-ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME", help="A scenario's name, or the path of a scenario YAML file.")
+FlangeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--flange", metavar="NAME", help="Flange standard, if the dataset does not name it: iso9409-1-50-4-m6."
+    ),
 ]
+
+
+def _option(kind: Any, preset: object, name: str, **settings: Any) -> tuple[Any, object]:
+    return Annotated[kind, typer.Option(name, **settings)], preset
+
+
+_ROBOT = "simulated, emulated (a controller on loopback), or the address of a controller."
+_ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
+_PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
+_SLOWER = "Slow the arm's moves down: 0.05 to 1. The welding speed does not change."
+_OUT = "Output folder; default: a new one in weldcal-out."
+COMMON = {
+    "browser": _option(
+        bool, True, "--browser/--no-browser", help="Open the live 3D view in the web browser, or do not."
+    ),
+    "realtime": _option(bool, False, "--realtime", help="Do not run faster than real time."),
+    "robot": _option(str | None, None, "--robot", metavar="ROBOT", help=_ROBOT, show_default="as in the scenario"),
+    "dry_run": _option(bool, False, "--dry-run", help="Only read the robot, then run on a simulated arm."),
+    "pace": _option(float | None, None, "--pace", metavar="P", help=_PACE),
+    "speed_factor": _option(float | None, None, "--speed-factor", metavar="X", help=_SLOWER),
+    "address": _option(str, "127.0.0.1", "--address", metavar="ADDRESS", help=_ADDRESS),
+    "out": _option(Path | None, None, "--out", metavar="FOLDER", help=_OUT),
+    "seed": _option(int, 0, "--seed", metavar="N", min=0, help="Seed of all random numbers; the first of several."),
+    "json": _option(bool, False, "--json", help="Print the result as one JSON object, the last line of stdout."),
+    "debug": _option(bool, False, "--debug", help="Show the traceback of an internal error."),
+}
+"""Every common option with its default, by the name of its parameter."""
+
+MOTION = ("dry_run", "pace", "speed_factor")
+LIVE = ("browser", "realtime", "robot", *MOTION)
+RESULT = ("out", "seed", "json", "debug")
+LOOK = ("json", "debug")
+"""Groups of common options: of arm motion, of a live run, of a command that writes a result, of one that only reads."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The result of a command as it is printed.
+
+    Attributes:
+        summary: the JSON object; its `state`, if not "done", ends the command with exit code 1.
+        values: printed as rows instead of the summary; {} for none.
+        rows: printed below them.
+        text: printed, or called to print, instead of all rows.
+        problem: a sentence for stderr, with exit code 1; None: taken from the summary, "": none.
+    """
+
+    summary: Mapping[str, object]
+    values: Mapping[str, object] | None = None
+    rows: Mapping[str, str] = field(default_factory=dict)
+    text: str | Callable[[], object] | None = None
+    problem: str | None = None
+
+
+class Call:
+    """One call of a command: the common options that were given, the result folder and the progress bar."""
+
+    def __init__(self, title: str, given: Mapping[str, Any], stack: ExitStack) -> None:
+        self.out: Path | None = given.get("out")
+        self.seed: int = given.get("seed", 0)
+        self.json: bool = given.get("json", False)
+        self.given = given
+        self.written: Path | None = None
+        self._title, self._stack = title, stack
+        self._report: console.Progress | None = None
+
+    @property
+    def live(self) -> dict[str, Any]:
+        """The options of a live run; with --json no browser is opened."""
+        found = {name: self.given[name] for name in LIVE if name in self.given}
+        return found | ({"browser": found["browser"] and not self.json} if "browser" in found else {})
+
+    def folder(self, command: str, name: str) -> Path:
+        """Where the result is written: --out, or a new folder named after the command and what it works on."""
+        self.written = self.out or fresh_folder(command, name, self.seed)
+        return self.written
+
+    def progress(self, stage: str, fraction: float) -> None:
+        """Shows the stage and the completed fraction (0 to 1); the first call opens the progress bar."""
+        if self._report is None:
+            self._report = self._stack.enter_context(console.progress_bar(self._title))
+        self._report(stage, fraction)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A function as Typer takes it, with its full name ("benchmark cell") and its line in the list of commands."""
+
+    title: str
+    function: Callable[..., None]
+    short_help: str | None
+
+
+Body = Callable[..., Outcome | Mapping[str, object] | None]
+
+
+def command(
+    title: str,
+    *,
+    options: tuple[str, ...] = (),
+    common: tuple[str, ...] = RESULT,
+    short_help: str | None = None,
+    defaults: Mapping[str, object] | None = None,
+) -> Callable[[Body], Command]:
+    """Makes a command of a function body(call, own parameters ...) that returns an Outcome, a summary or None.
+
+    The body gets the common options ``options`` and ``common`` through its Call. It runs inside console.boundary, with a
+    progress bar where it reports progress; its outcome is printed, as JSON if --json is given.
+    """
+    names = (*options, *common)
+    preset = {name: (defaults or {}).get(name, COMMON[name][1]) for name in names}
+
+    def decorate(body: Body) -> Command:
+        def run(**given: Any) -> None:
+            shared = {name: given.pop(name) for name in names}
+            json, debug = shared.get("json", False), shared["debug"]
+            with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:
+                call = Call(title, shared, stack)
+                outcome = body(call, **given)
+            if outcome is not None:
+                report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)
+
+        own = list(inspect.signature(body, eval_str=True).parameters.values())[1:]
+        shared = [
+            inspect.Parameter(n, inspect.Parameter.KEYWORD_ONLY, default=preset[n], annotation=COMMON[n][0])
+            for n in names
+        ]
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own] + shared
+        run.__doc__ = body.__doc__
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        return Command(title, run, short_help)
+
+    return decorate
 
 
 def fresh_folder(command: str, name: str, seed: int) -> Path:
-    """The first unused weldcal-out/<command>-<name>-seed<N>[-2, -3 ...]: an earlier result is never written over."""
+    """The first unused weldcal-out/<command>-<name>-seed<N>[-2, -3 ...]: an earlier result is never overwritten."""
     first = Path("weldcal-out") / f"{command}-{Path(name).stem}-seed{seed}"
     folder, number = first, 1
     while folder.exists():
@@ -77,22 +178,27 @@ def fresh_folder(command: str, name: str, seed: int) -> Path:
     return folder
 
 
-def finish(
-    command: str,
-    summary: Mapping[str, object],
-    folder: Path,
-    *,
-    json_wanted: bool,
-    rows: Mapping[str, str] | None = None,
-) -> None:
-    """Reports the outcome (with --json as JSON, else in rows) and ends with exit code 1 unless its `state` is done."""
+def report(title: str, outcome: Outcome, call: Call) -> None:
+    """Prints the outcome (with --json as JSON) and ends with exit code 1 where there is a problem.
+
+    Raises:
+        typer.Exit: with code 1.
+    """
+    summary = outcome.summary
     state = str(summary.get("state", "done"))
-    if json_wanted:
+    if call.json:
         console.emit_json(summary)
+    elif callable(outcome.text):
+        outcome.text()
+    elif outcome.text is not None:
+        typer.echo(outcome.text)
     else:
-        console.emit_summary(
-            f"{command}: {state}", {**console.rows(summary), **(rows or {}), "written to": str(folder)}
-        )
-    if state != "done":
-        console.emit_warning(str(summary.get("reason") or f"The {command} ended {state}; the report says why."))
+        rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
+        rows |= {} if call.written is None else {"written to": str(call.written)}
+        console.emit_summary(f"{title}: {state}", rows)
+    problem = outcome.problem
+    if problem is None and state != "done":
+        problem = str(summary.get("reason") or f"The {title} ended {state}; see the report for the reason.")
+    if problem:
+        console.emit_warning(problem)
         raise typer.Exit(1)

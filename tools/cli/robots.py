@@ -1,57 +1,96 @@
-"""weldcal robots: the robots that are known by name, their flanges, limits and kinematics."""
+"""weldcal robots, check-robot and emulate-ur: the known robots, the state of a real one, and an emulated controller."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from weldcal.tools import console
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command
 
-
-def robots(
-    name: Annotated[
-        str, typer.Argument(metavar="[NAME]", help="Only this robot, joint by joint.", show_default=False)
-    ] = "",
-    json: Annotated[bool, typer.Option("--json", help="Print one JSON object as the last line of stdout.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an internal error.")] = False,
-) -> None:
-    """List the known robots: flange by ISO 9409-1, payload, reach, joint limits, and where the numbers are from."""
-    with console.boundary(json_wanted=json, debug=debug):
-        from weldcal.models.robots import ROBOTS, get_robot
-
-        chosen = [get_robot(name)] if name else list(ROBOTS.values())
-        found = [_row(robot) for robot in chosen]
-    if json:
-        console.emit_json({"state": "done", "robots": found})
-    elif name:
-        _print_one(found[0])
-    else:
-        _print_all(found)
-
-
-def _row(robot: object) -> dict[str, object]:
-    """A robot for JSON: metres, kilograms, radians, and degrees where the key says so."""
-    import numpy as np
-
+if TYPE_CHECKING:
     from weldcal.models.robots import Robot
 
-    assert isinstance(robot, Robot)
+
+@command("robots", common=LOOK, short_help="List the known robots and their data.")
+def robots(
+    call: Call,
+    name: Annotated[
+        str, typer.Argument(metavar="[NAME]", help="Show only this robot, joint by joint.", show_default=False)
+    ] = "",
+) -> Outcome:
+    """List the known robots: flange by ISO 9409-1, payload, reach, joint limits and the sources of the data."""
+    from weldcal.models.robots import ROBOTS, get_robot
+
+    chosen = [get_robot(name)] if name else list(ROBOTS.values())
+    summary = {"state": "done", "robots": [_row(robot) for robot in chosen]}
+    return Outcome(summary, text=partial(_print_one, chosen[0]) if name else partial(_print_all, chosen))
+
+
+@command("check-robot", common=LOOK, short_help="Check whether a robot is ready. Nothing moves.")
+def check_robot(
+    call: Call, host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")]
+) -> Outcome:
+    """Check whether a robot is ready: a table of what is right and what to change. Nothing moves or is written."""
+    from weldcal.systems.drivers.ur.readiness.preflight import preflight
+    from weldcal.tools.commands.check_robot import as_json, emit_table
+
+    report = preflight(host)
+    problem = "" if report.first_problem is None else report.first_problem.remedy
+    return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
+
+
+@command("emulate-ur", common=("seed", "debug"), short_help="Run an emulated UR controller on loopback.")
+def emulate_ur(
+    call: Call,
+    polyscope: Annotated[
+        str, typer.Option("--polyscope", metavar="VERSION", help="Controller version: 5.12, 5.21, 10.7 ...")
+    ] = "5.21",
+    kinematics: Annotated[
+        Path | None, typer.Option("--kinematics", metavar="FILE", help="A robot's factory calibration.")
+    ] = None,
+    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="Loopback address 127.x.y.z.")] = "127.0.0.1",
+    control_port: Annotated[
+        int, typer.Option("--control-port", metavar="PORT", help="Port that takes injected faults, as JSON lines.")
+    ] = 30090,
+    pace: Annotated[float, typer.Option("--pace", metavar="P", help="Speed relative to real time, 0.05 to 1.")] = 1.0,
+) -> None:
+    """Run a UR controller on loopback that executes the URScript it is sent, until it is interrupted."""
+    from weldcal.tools.emulators.ur.main import run_emulator
+
+    run_emulator(
+        host=host,
+        control_port=control_port,
+        polyscope=polyscope,
+        kinematics=kinematics,
+        pace=pace,
+        seed=call.seed,
+        ready=typer.echo,
+    )
+
+
+def _row(robot: Robot) -> Mapping[str, object]:
+    """A robot for JSON: metres, kilograms, radians, and degrees where the key says so."""
     chain = robot.chain
     return {
         "name": robot.name,
         "title": robot.title,
         "flange": robot.flange,
-        "dowel_deg": float(np.degrees(robot.pin_angle_rad)),
+        "dowel_deg": math.degrees(robot.pin_angle_rad),
         "payload_kg": robot.payload_kg,
         "reach_m": robot.reach_m,
         "repeatability_mm": 1e3 * robot.repeatability_m,
         "joints": [
             {
                 "name": joint,
-                "lower_deg": float(np.degrees(chain.position_lower[k])),
-                "upper_deg": float(np.degrees(chain.position_upper[k])),
-                "speed_deg_s": float(np.degrees(chain.velocity_limit[k])),
+                "lower_deg": math.degrees(chain.position_lower[k]),
+                "upper_deg": math.degrees(chain.position_upper[k]),
+                "speed_deg_s": math.degrees(chain.velocity_limit[k]),
             }
             for k, joint in enumerate(chain.joint_names)
         ],
@@ -62,51 +101,41 @@ def _row(robot: object) -> dict[str, object]:
     }
 
 
-def _print_all(rows: list[dict[str, object]]) -> None:
+def _print_all(robots: list[Robot]) -> None:
     from rich.console import Console
     from rich.table import Table
 
     table = Table(box=None, padding=(0, 1, 0, 0))
     for k, heading in enumerate(("name", "flange", "dowel", "kg", "reach m", "± mm", "axes", "inverse")):
         table.add_column(heading, justify="right" if 2 <= k <= 6 else "left", no_wrap=True)
-    for r in rows:
-        joints = r["joints"]
-        assert isinstance(joints, list)
-        open_ = r["unconfirmed"]
-        assert isinstance(open_, list)
-        doubt = {what: "?" if what in open_ else "" for what in ("flange", "payload", "reach", "repeatability")}
-        cells = (
-            *(r["name"], f"{r['flange']}{doubt['flange']}", f"{r['dowel_deg']:.0f}"),
-            *(f"{r['payload_kg']:g}{doubt['payload']}", f"{r['reach_m']:g}{doubt['reach']}"),
-            *(f"{r['repeatability_mm']:g}{doubt['repeatability']}", str(len(joints)), r["inverse_kinematics"]),
+    for r in robots:
+        mark = {what: "?" if what in r.unconfirmed else "" for what in ("flange", "payload", "reach", "repeatability")}
+        table.add_row(
+            *(r.name, f"{r.flange}{mark['flange']}", f"{math.degrees(r.pin_angle_rad):.0f}"),
+            *(f"{r.payload_kg:g}{mark['payload']}", f"{r.reach_m:g}{mark['reach']}"),
+            *(f"{1e3 * r.repeatability_m:g}{mark['repeatability']}", str(len(r.chain.joint_names)), str(r.inverse)),
         )
-        table.add_row(*map(str, cells))
-    console = Console()
-    console.print(table)
-    console.print(
-        "? unconfirmed: as the maker's data sheet is remembered, no public source was found.", highlight=False
-    )
-    console.print("weldcal robots NAME shows one, joint by joint, with its sources.", highlight=False)
+    screen = Console()
+    screen.print(table)
+    screen.print("? unconfirmed: from memory of the maker's data sheet; no public source was found.", highlight=False)
+    screen.print("weldcal robots NAME shows one robot, joint by joint, with its sources.", highlight=False)
 
 
-def _print_one(row: dict[str, object]) -> None:
-    joints = row["joints"]
-    assert isinstance(joints, list)
+def _print_one(robot: Robot) -> None:
     rows = {
-        "flange": f"{row['flange']}, dowel at {row['dowel_deg']:.0f} degrees",
-        "payload": f"{row['payload_kg']:g} kg",
-        "reach": f"{row['reach_m']:g} m",
-        "repeatability": f"± {row['repeatability_mm']:g} mm",
-        "inverse kinematics": str(row["inverse_kinematics"]),
-        "source": str(row["source"]),
+        "flange": f"{robot.flange}, dowel at {math.degrees(robot.pin_angle_rad):.0f} degrees",
+        "payload": f"{robot.payload_kg:g} kg",
+        "reach": f"{robot.reach_m:g} m",
+        "repeatability": f"± {1e3 * robot.repeatability_m:g} mm",
+        "inverse kinematics": str(robot.inverse),
+        "source": robot.source,
+        **{f"{what}, confirmed by": str(where) for what, where in robot.confirmed},
+        "unconfirmed": ", ".join(robot.unconfirmed),
     }
-    confirmed, unconfirmed = row["confirmed"], row["unconfirmed"]
-    assert isinstance(confirmed, dict)
-    assert isinstance(unconfirmed, list)
-    rows |= {f"{what}, confirmed by": str(where) for what, where in confirmed.items()}
-    rows["unconfirmed"] = ", ".join(unconfirmed)
-    for joint in joints:
-        rows[joint["name"]] = (
-            f"{joint['lower_deg']:.1f} to {joint['upper_deg']:.1f} degrees, {joint['speed_deg_s']:.0f} degrees/s"
+    chain = robot.chain
+    limits = zip(chain.joint_names, chain.position_lower, chain.position_upper, chain.velocity_limit, strict=True)
+    for joint, lower, upper, speed in limits:
+        rows[joint] = (
+            f"{math.degrees(lower):.1f} to {math.degrees(upper):.1f} degrees, {math.degrees(speed):.0f} degrees/s"
         )
-    console.emit_summary(str(row["title"]), rows)
+    console.emit_summary(robot.title, rows)

@@ -1,19 +1,16 @@
-"""Algorithm 1 on the scans of a calibration: its own figure, the truth on poses outside its pool, and its blind spots."""
+"""Runs Algorithm 1 on the scans of a calibration and compares its reported figure with its error at unused poses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.results import (
-    IcpRecord,
-)
+from weldcal.calibration.data.results import IcpRecord
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import (
-    Algorithm1Run,
     position_errors,
     run_algorithm1,
 )
@@ -29,37 +26,9 @@ from weldcal.calibration.published.icp import (
     sight,
 )
 from weldcal.models.flanges import FlangeStandard
+from weldcal.tools.report.results import Algorithm1Outcome, error_summary
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Algorithm1Outcome:
-    """Algorithm 1 on the same data: its own figure beside the truth on poses outside its pool, and the figure's blind
-    spots.
-
-    ``verification``: id of the pose held out for it. ``figure_mm`` is what Algorithm 1 reports; ``true_mm`` the errors
-    at the flange on poses it did not use; ``unseen`` the components of a true error of which less than half enters the
-    figure.
-    """
-
-    verification: str
-    metric: str
-    figure_mm: float
-    true_mm: dict[str, float]
-    at_verification_mm: float
-    unseen: tuple[str, ...]
-    shares: tuple[float, ...]
-    run: Algorithm1Run
-
-    @property
-    def sentence(self) -> str:
-        """One sentence for the terminal."""
-        blind = f" ({self.metric}); it cannot see: {'; '.join(self.unseen)}" if self.unseen else f" ({self.metric})"
-        return (
-            f"Algorithm 1 reports {self.figure_mm:.3f} mm at its verification pose {self.verification}{blind}. "
-            f"Its true error on poses it did not use: {self.true_mm['median']:.3f} mm median."
-        )
 
 
 def compare_algorithm1(
@@ -70,8 +39,7 @@ def compare_algorithm1(
     standard: FlangeStandard,
     seed: int,
 ) -> tuple[Algorithm1Outcome | None, Verifier | None, tuple[IcpRecord, ...]]:
-    """Algorithm 1 with one pose held out for verification: the one nearest the middle, where the arm will
-    mostly work."""
+    """Algorithm 1 with the pose nearest the middle held out for verification; None for fewer than six inliers."""
     if len(inliers) < 6:
         return None, None, ()
     middle = np.median([o.p_BR for o in inliers], axis=0)
@@ -92,7 +60,7 @@ def compare_algorithm1(
         unseen = shares.unseen
     else:
         verifier = CentreVerification(held)
-        metric = "distance of the verification pair's centre, in place of the ICP, as there are no clouds"
+        metric = "distance of the verification pair's centre instead of the ICP, as there are no clouds"
         unseen = ("every rotation (one centre has none)", "the error at any other pose")
     run = run_algorithm1(pool, verifier)
     if run is None:
@@ -102,7 +70,7 @@ def compare_algorithm1(
         held.id,
         metric,
         1e3 * run.cost,
-        summary_of(1e3 * true),
+        error_summary(1e3 * true),
         1e3 * float(position_errors(run.X_BC, [held])[0]),
         unseen,
         tuple(float(s) for s in shares.share) if shares is not None else (),
@@ -123,16 +91,3 @@ def _icp_record(held: Observation, X_BC: RigidTransform, verification: Verificat
         unseen=sight(X_BC, verification).unseen,
         true_error_mm=float(1e3 * position_errors(X_BC, [held])[0]),
     )
-
-
-def summary_of(values: Array) -> dict[str, float]:
-    v = np.asarray(values, dtype=float)
-    v = v[np.isfinite(v)]
-    if len(v) == 0:
-        return {"median": float("nan"), "mean": float("nan"), "p95": float("nan"), "max": float("nan")}
-    return {
-        "median": float(np.median(v)),
-        "mean": float(v.mean()),
-        "p95": float(np.percentile(v, 95)),
-        "max": float(v.max()),
-    }

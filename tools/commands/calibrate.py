@@ -1,5 +1,4 @@
-"""`weldcal calibrate DATASET`: from a folder of scans to X_BC, its uncertainty, and a report; written whole or not at
-all."""
+"""`weldcal calibrate DATASET`: estimates X_BC and its uncertainty from a folder of scans and writes exports and a report."""
 
 from __future__ import annotations
 
@@ -7,9 +6,8 @@ import csv
 import io
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +18,6 @@ from weldcal.calibration.data.results import (
     CalibrationResult,
     PoseRecord,
     export_all,
-    matrix4,
     save_result,
     software_version,
 )
@@ -29,85 +26,28 @@ from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.self_calibration import (
-    SelfCalibration,
     apply_self_calibration,
     calibrate_corrected,
 )
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import (
-    Convergence,
     convergence,
     k_fold,
 )
-from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.commands.algorithm1_comparison import Algorithm1Outcome, compare_algorithm1, summary_of
-from weldcal.tools.report.flange_features import feature_residuals
-from weldcal.tools.report.plots_calibration import calibration_report
+from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
+from weldcal.tools.report.calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.results import CalibrationReport, error_summary
 
 Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 Progress = Callable[[str, float], None]
-"""Told what is being done and which fraction of the whole is behind us (0 to 1)."""
-
-
-@dataclass(frozen=True)
-class CalibrationReport:
-    """What a run of the job leaves: the estimate, the records written, and where. ``observations`` carry the scanner
-    correction where one was accepted."""
-
-    result: CalibrationResult
-    estimate: CalibrationEstimate
-    observations: tuple[Observation, ...]
-    scanner: SelfCalibration | None
-    fits: dict[str, FlangeFit]
-    refused: tuple[tuple[str, str], ...]
-    outliers: tuple[str, ...]
-    algorithm1: Algorithm1Outcome | None
-    convergence: Convergence
-    k_fold_mm: dict[str, float]
-    seconds: float
-    out: Path
-    advice: tuple[str, ...] = ()
-    patterns: dict[str, HolePattern] = field(default_factory=dict)
-
-    def summary(self) -> dict[str, Any]:
-        """The JSON object of `--json` (keys of the design's "calibrate" line, and Algorithm 1's figure beside them)."""
-        r = self.result
-        a = self.algorithm1
-        return {
-            "state": "done",
-            "n_used": int(self.estimate.inliers.sum()),
-            "refused": [{"id": i, "reason": t} for i, t in self.refused],
-            "X_BC": matrix4(r.X_BC),
-            "covariance": r.covariance.tolist(),
-            "scanner_correction": r.scanner_correction,
-            "held_out_mm": {k: r.held_out_mm[k] for k in ("median", "mean", "p95")},
-            "tilt_deg": r.tilt_deg,
-            "outliers": list(self.outliers),
-            "warnings": list(r.warnings),
-            "unobservable": list(r.unobservable),
-            "seconds": self.seconds,
-            "k_fold_mm": self.k_fold_mm,
-            "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
-            "advice": list(self.advice),
-            "features": feature_residuals(self.fits, self.patterns),
-            "algorithm1": None
-            if a is None
-            else {
-                "verification": a.verification,
-                "metric": a.metric,
-                "figure_mm": a.figure_mm,
-                "true_mm": a.true_mm,
-                "at_verification_mm": a.at_verification_mm,
-                "unseen": list(a.unseen),
-            },
-        }
+"""Called with the stage and the completed fraction (0 to 1)."""
 
 
 def calibrate_dataset(
@@ -124,16 +64,18 @@ def calibrate_dataset(
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
-    ``robot`` and ``flange`` override dataset.yaml. ``progress`` is told (stage, fraction). ``centres`` also writes
-    centres.csv (camera frame, metres, uncorrected). Without ``correct_scanner`` the scanner is taken as it is. Nothing
-    is written unless the calibration succeeded. ``axis_turn_deg``, how far the hole pattern is turned about the flange's axis, makes one
-    to three scans enough that show the holes; from four on it is not needed. Raises InputError (one sentence) for bad data; a cloud that cannot be
-    used is refused by name and reported, as long as enough remain.
+    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, uncorrected).
+    ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole pattern about the
+    flange axis; with it, one to three scans that show the holes are enough. A cloud that cannot be used is refused and
+    reported, as long as enough remain. Nothing is written unless the calibration succeeded.
+
+    Raises:
+        InputError: the data cannot be used; TooFewPoses: too few scans can be used.
     """
     started = time.monotonic()
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
-        raise InputError(f"'{out}' is a file; give a folder for the result.")
+        raise InputError(f"'{out}' is a file. Give a folder for the result.")
     data = load_dataset(Path(folder))
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
@@ -148,7 +90,7 @@ def calibrate_dataset(
         if few
         else estimate_eye_on_base(observations, SolveConfig(seed=seed, allow_coplanar=bool(fits)))
     )
-    tell("judging the scanner", 0.72)
+    tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
         observations, rigid, seen.patterns, seed=seed, wanted=correct_scanner and not few
@@ -156,8 +98,7 @@ def calibrate_dataset(
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
     errors = dict(zip((o.id for o in observations), estimate.position_residuals_m, strict=True))
     refused += [
-        (i, f"Its centre disagrees by {1e3 * errors[i]:.1f} mm with the other poses; it was left out.")
-        for i in outliers
+        (i, f"Its centre disagrees by {1e3 * errors[i]:.1f} mm with the other poses; it is not used.") for i in outliers
     ]
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     accepted = None if scanner is None else scanner.accepted
@@ -183,12 +124,11 @@ def calibrate_dataset(
     warnings = list(estimate.warnings)
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(
-            "The pairs have no orientations: whether a constant error of the flange centre hides in the figures cannot be told."
+            "The pairs have no orientations. A constant error of the flange centre would not show in these figures."
         )
     elif turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
-            "The poses hardly differ in orientation: a constant error of the flange centre would not show in these "
-            "figures."
+            "The poses hardly differ in orientation. A constant error of the flange centre would not show in these figures."
         )
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
@@ -196,7 +136,7 @@ def calibrate_dataset(
     result = CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
-        held_out_mm=summary_of(1e3 * estimate.held_out.position_m[estimate.inliers]),
+        held_out_mm=error_summary(1e3 * estimate.held_out.position_m[estimate.inliers]),
         tilt_deg=_tilts(estimate),
         poses=_pose_records(observations, estimate, refused),
         icp=icp,
@@ -224,7 +164,7 @@ def calibrate_dataset(
         outliers,
         algorithm1,
         curve,
-        summary_of(1e3 * folds[np.isfinite(folds)]),
+        error_summary(1e3 * folds[np.isfinite(folds)]),
         time.monotonic() - started,
         Path(out),
         sampling_advice(estimate, corrected),
@@ -244,24 +184,28 @@ def calibrate_dataset(
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:
-    """At least one usable scan, and four where some of more were refused: then more can be taken, and should be."""
+    """Requires one usable scan, and four where others were refused (then more can be taken).
+
+    Raises:
+        InputError, TooFewPoses: there are fewer.
+    """
     n = len(observations)
     if n == 0:
         same = len({r for _, r in refused}) == 1 and len(refused) > 1
         which = "every cloud" if same else f"the first, {refused[0][0]}"
-        raise InputError(f"None of the {len(refused)} clouds can be used; for {which}: {refused[0][1]}")
+        raise InputError(f"None of the {len(refused)} clouds can be used. Reason for {which}: {refused[0][1]}")
     if n < ENOUGH and refused:
         names = "; ".join(f"{i}: {t}" for i, t in refused[:3])
         raise TooFewPoses(
-            f"Only {n} usable poses remain of {n + len(refused)}, at least {ENOUGH} are needed; refused were {names}"
+            f"Only {n} usable poses remain of {n + len(refused)}; at least {ENOUGH} are needed. Refused: {names}"
         )
 
 
 def _axis_turn(
     inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float] | None:
-    """How far the hole pattern is turned about the flange's axis, and the spread of that over the scans (deg); None where fewer
-    than four show it. With it, one scan is enough the next time; it is that of scans as they are, which one scan is taken for, too."""
+    """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as axis_turn_deg;
+    None where fewer than four scans show the holes. From uncorrected scans, as in a calibration from one scan."""
     seen = [o for o in inliers if o.id in patterns]
     if len(seen) < ENOUGH:
         return None
@@ -270,7 +214,7 @@ def _axis_turn(
 
 
 def _tilts(estimate: CalibrationEstimate) -> dict[str, float | None]:
-    s = summary_of(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
+    s = error_summary(np.degrees(estimate.held_out.tilt_rad[estimate.inliers]))
     return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
 
 
@@ -303,6 +247,3 @@ def _centres_csv(observations: list[Observation]) -> str:
         normal = ["", "", ""] if o.n_C is None else [f"{v:.9f}" for v in o.n_C]
         writer.writerow([o.id, *(f"{v:.9f}" for v in o.p_CR), *normal])
     return stream.getvalue()
-
-
-__all__ = ["Algorithm1Outcome", "CalibrationReport", "calibrate_dataset"]

@@ -1,4 +1,4 @@
-"""`weldcal check-robot`: the pre-flight as a table that a person at the pendant works through, or as JSON."""
+"""`weldcal check-robot`: prints the pre-flight checks as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def as_json(report: Preflight) -> Mapping[str, object]:
 
 
 def emit_table(report: Preflight) -> None:
-    """Writes one row a check on stdout, and under each that is not right what to do about it."""
+    """Writes one row per check on stdout, and below each failed check the operator's action."""
     width = min(shutil.get_terminal_size((80, 24)).columns, WIDEST)
     marks = max(map(len, MARKS))
     names = max(len(check.name) for check in report.checks)
@@ -59,7 +59,7 @@ def emit_table(report: Preflight) -> None:
         if check.remedy:
             typer.echo(_wrapped(check.remedy, width, indent))
     if waiting := len(report.checks) - len(shown):
-        typer.secho(f"  not checked  {waiting} more that need an answer", fg=MARKS["not checked"])
+        typer.secho(f"  not checked  {waiting} more that need an answer of the robot", fg=MARKS["not checked"])
 
 
 def _wrapped(text: str, width: int, first: str) -> str:

@@ -1,4 +1,4 @@
-"""weldcal hand-eye: a file of pose pairs in, the unknown poses out, with a comparison of all methods and exports."""
+"""weldcal hand-eye: solves for the unknown poses from a file of pose pairs, compares all methods and writes exports."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class MethodRow:
 
 @dataclass(frozen=True)
 class HandEyeReport:
-    """A finished calibration: the result, how it compares, which pose to add (``advice`` says it), where the files are;
-    ``corners``: what corners and robot errors added, in sentences."""
+    """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
+    ``corners``: sentences on corners and robot errors."""
 
     result: HandEyeResult
     mounting: Mounting
@@ -80,7 +80,7 @@ class HandEyeReport:
         }
 
     def text(self) -> str:
-        """What a person reads: directions, sketch, numbers with their uncertainty, comparison, advice."""
+        """The printed result: directions, sketch, numbers with their uncertainty, comparison, next pose."""
         r, m = self.result, self.mounting
         lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
         lines += [f"poses        {r.diversity.sentence()}"]
@@ -103,7 +103,7 @@ class HandEyeReport:
         lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():
             kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
-            lines += [f"             {_held_out(kept, 'without those left out, ')}"]
+            lines += [f"             {_held_out(kept, 'without outliers, ')}"]
         lines += [f"weighting    {r.method}"]
         lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
         if self.corners:
@@ -140,21 +140,23 @@ def run_hand_eye(
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the scanner, for
     the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and robot errors is applied:
     the robot's errors are sought in the poses that the corners left).
-    Raises InputError and WeldcalError with one sentence; where the poses contradict each other, the sentence names the
-    one mistake (unit, inverse, mounting) whose correction makes them agree, if there is one.
+
+    Raises:
+        InputError, WeldcalError: the file or the options cannot be used. Where the poses contradict each other, the
+            sentence names the mistake (unit, inverse, mounting) whose correction makes them agree, if there is one.
     """
     begin = time.perf_counter()
     if equation not in EQUATIONS:
-        raise InputError(f"There is no equation '{equation}'; choose one of {', '.join(EQUATIONS)}.")
+        raise InputError(f"There is no equation '{equation}'. Choose one of {', '.join(EQUATIONS)}.")
     arm = None if robot is None else load_chain(robot)
     scanner = None if camera is None else get_scanner(camera)
     if refine is not None and arm is None:
-        raise InputError("Robot errors (--refine) need the robot's name: add --robot, ur10e for example.")
+        raise InputError("Robot errors (--refine) need the robot's name. Add --robot, for example ur10e.")
     pairs = read_pairs(file, mounting=mounting, length=unit)
     found = get_mounting(pairs.mode)
     if (equation == "axb-ycz") != (found.name == "co_manipulation"):
         right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
-        raise InputError(f"'{file.name}' is {found.name}: solve it with 'weldcal hand-eye {right}'.")
+        raise InputError(f"'{file.name}' is {found.name}. Solve it with 'weldcal hand-eye {right}'.")
     config = HandEyeConfig(seed=seed)
     if motions:
         if equation != "ax-xb":
@@ -187,25 +189,25 @@ def run_hand_eye(
         result = _only_camera(result)
     # with corners or robot errors applied the poses are others, so that a comparison would be of two data
     comparison = () if motions or adopted else _compare(problem, result)
-    advice, told = None, ""
+    advice, sentence = None, ""
     if not motions and equation != "ax-xb":
         view = view_of(problem.G, pairs.K if pairs.has_corners else None, scanner)
         advice = next_pose(problem, result, found, (IDENTITY,) * 3, arm=arm, view=view)
-        told = advice.sentence() if advice is not None else _no_advice(view, arm)
+        sentence = advice.sentence() if advice is not None else _no_advice(view, arm)
     provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
-    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), told)
+    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), sentence)
 
 
 def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:
-    """What the corners add, told in ``said``; where nobody asked for them, corners that are of no use leave the poses as given."""
+    """The refinement by corners, with a sentence added to ``said``; None where ``optional`` corners cannot be used."""
     try:
         refined = refine_with_corners(pairs, config)
     except WeldcalError as problem:
         if not optional:
             raise
-        said.append(f"Corners: not used, and the poses are as given. {problem}")
+        said.append(f"Corners: not used. {problem}")
         return None
     said.append(refined.sentence)
     return refined
@@ -213,7 +215,7 @@ def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, option
 
 def _no_advice(view: View, arm: Chain | None) -> str:
     reach = "" if arm is None else f" and within reach of {arm.name}"
-    return f"None of the poses like those so far is visible{reach} (seen within {view.source}): move where more can be seen."
+    return f"No further pose near those so far is visible{reach} (view: {view.source}). Move to a region with a better view."
 
 
 def _file(path: Path) -> Path:
@@ -230,8 +232,11 @@ def _only_camera(result: HandEyeResult) -> HandEyeResult:
 
 
 def solve_pairs(pairs: PosePairs, config: HandEyeConfig | None = None) -> HandEyeResult:
-    """The poses of a file's mounting, with a look at the usual mistakes: where one of them makes the poses agree far better,
-    InconsistentPoses names it. Raises as solve_problem."""
+    """The poses of a file's mounting, with a test for the usual mistakes in files.
+
+    Raises:
+        InconsistentPoses: the correction of one mistake makes the poses agree far better; others as solve_problem.
+    """
     config, mounting = config or HandEyeConfig(), get_mounting(pairs.mode)
     problem = problem_of_pairs(pairs)
     try:
@@ -256,8 +261,8 @@ def _repeated(pairs: PosePairs) -> str | None:
     if not again:
         return None
     return (
-        f"{again} of {len(seen)} samples repeat others to the last digit: they make the uncertainty and the held-out errors look smaller "
-        "than they are; take them out."
+        f"{again} of {len(seen)} samples are exact copies of others. They make uncertainty and held-out errors too small: "
+        "remove them."
     )
 
 
@@ -282,7 +287,7 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
 
 def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
     if not np.isfinite(held_out.rms_translation):
-        return "nothing: too few poses to leave some out"
+        return "none: too few poses for cross-validation"
     return f"{held_out.rms_deg:.4f} deg   {1e3 * held_out.rms_translation:.3f} mm ({of}rms, 5 folds)"
 
 

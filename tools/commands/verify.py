@@ -1,98 +1,41 @@
-"""`weldcal verify RESULT DATASET`: how good is a calibration on scans it never saw, pose by pose, at the flange."""
+"""`weldcal verify RESULT DATASET`: measures the errors of a calibration at the flange on scans that it did not use."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
-from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
-from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
-from weldcal.tools.report.plots_verify import verify_report
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.report.results import PoseError, VerifyReport
+from weldcal.tools.report.verify import verify_report
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 _FEW = 4
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a verification
-_GROSS = 10.0  # times the usual error: a scan of something else
+_GROSS = 10.0  # times the usual error: a gross outlier
 _WORST_TILT_DEG = 10.0
 _SAME_MM = 1e-6  # a scan of the same name whose error repeats the recorded residual to a nanometre is the same scan
 _EVIDENT = 4.0  # standard errors of a scale error that is worth naming
 
 
-@dataclass(frozen=True)
-class PoseError:
-    """One scan: distance (mm) between where the calibration puts the flange centre and where the robot says it is, angle
-    (deg) between the face normals (None where none was seen), and whether the calibration was made with this scan."""
-
-    id: str
-    error_mm: float
-    tilt_deg: float | None
-    used_before: bool
-
-
-@dataclass(frozen=True)
-class VerifyReport:
-    """What a verification found. ``observations`` carry the scanner correction where the result has one."""
-
-    result: CalibrationResult
-    correction: ScannerCorrection | None
-    observations: tuple[Observation, ...]
-    fits: dict[str, FlangeFit]
-    poses: tuple[PoseError, ...]
-    refused: tuple[tuple[str, str], ...]
-    warnings: tuple[str, ...]
-    hashes: dict[str, str]
-    out: Path
-
-    @property
-    def position_error_mm(self) -> dict[str, float]:
-        """Median, mean, 95th percentile and largest position error, mm."""
-        e = np.array([p.error_mm for p in self.poses])
-        return {
-            "median": float(np.median(e)),
-            "mean": float(e.mean()),
-            "p95": float(np.percentile(e, 95)),
-            "max": float(e.max()),
-        }
-
-    @property
-    def tilt_deg(self) -> dict[str, float | None]:
-        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
-        t = [p.tilt_deg for p in self.poses if p.tilt_deg is not None]
-        if not t:
-            return {"median": None, "p95": None}
-        return {"median": float(np.median(t)), "p95": float(np.percentile(t, 95))}
-
-    def summary(self) -> dict[str, Any]:
-        """The JSON object of `--json` (keys of the design's "verify" line). A refused scan is named in the warnings."""
-        return {
-            "state": "done",
-            "position_error_mm": self.position_error_mm,
-            "tilt_deg": self.tilt_deg,
-            "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
-            "warnings": list(self.warnings),
-        }
-
-
 _UNCORRECTED = (
-    "The result's scanner correction was left out, as asked: its X_BC belongs to corrected points, so these errors are those "
-    "of a program that does not correct its scans."
+    "The result's scanner correction is not applied, as requested. Its X_BC belongs to corrected points, so these are the "
+    "errors of a program that does not correct its scans."
 )
 
 
@@ -106,18 +49,18 @@ def verify_dataset(
     progress: Progress | None = None,
     correct_scanner: bool = True,
 ) -> VerifyReport:
-    """Judge a calibration (its folder or calibration.yaml) on a dataset folder; write verification.json and report.html.
+    """Verify a calibration (its folder or calibration.yaml) on a dataset folder; write verification.json and report.html.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
-    is found is named and takes no part in the figures. Without ``correct_scanner`` the scans are taken as a program takes
-    them that does not know of the result's correction. ``flange`` overrides dataset.yaml; the fits follow ``seed``. Nothing
-    is written unless at least one
-    scan could be judged.
-    Raises InputError, one sentence, for everything a user may have mistaken.
+    is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
+    overrides dataset.yaml; the fits follow ``seed``. Nothing is written unless at least one scan can be used.
+
+    Raises:
+        InputError: the result, the dataset or the output folder cannot be used.
     """
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
-        raise InputError(f"'{out}' is a file; give a folder for the verification.")
+        raise InputError(f"'{out}' is a file. Give a folder for the verification.")
     calibration = load_result(Path(result))
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
     data = load_dataset(Path(dataset))
@@ -132,15 +75,15 @@ def verify_dataset(
     )
     if not seen.observations:
         first, reason = seen.refused[0]
-        raise InputError(f"None of the {len(seen.refused)} scans can be judged; for the first, {first}: {reason}")
+        raise InputError(f"None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}")
     observations = tuple(o if correction is None else corrected_observation(correction, o) for o in seen.observations)
     poses = _judge(calibration, data, observations)
     uncorrected = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
     warnings = (
         *uncorrected,
-        *(f"{id} was not judged: {reason}" for id, reason in seen.refused),
+        *(f"{id} was not used: {reason}" for id, reason in seen.refused),
         *_differences(calibration, data, standard.designation),
-        *_doubts(calibration, data, observations, poses),
+        *_diagnostics(calibration, data, observations, poses),
     )
     report = VerifyReport(
         calibration, correction, observations, seen.fits, poses, seen.refused, warnings, data.hashes, Path(out)
@@ -170,7 +113,7 @@ def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observa
 
 
 def _differences(result: CalibrationResult, data: Dataset, flange: str) -> list[str]:
-    """What the calibration and these scans say differently of the cell."""
+    """Names that differ between the calibration and these scans."""
     h = data.header
     pairs = (
         ("robot", result.robot, h.robot),
@@ -178,54 +121,53 @@ def _differences(result: CalibrationResult, data: Dataset, flange: str) -> list[
         ("scanner", result.scanner, h.scanner),
     )
     return [
-        f"The calibration was made with the {what} '{was}', these scans say '{now}': the figures hold only if both "
+        f"The calibration was made with the {what} '{was}', these scans with '{now}'. The figures are valid only if both "
         "names mean the same one."
         for what, was, now in pairs
         if was and now and was != now
     ]
 
 
-def _doubts(
+def _diagnostics(
     result: CalibrationResult, data: Dataset, observations: tuple[Observation, ...], poses: tuple[PoseError, ...]
 ) -> list[str]:
-    """Why the figures may flatter, or what they show of the cell."""
+    """Warnings about the figures: what makes them too small, and what they indicate about the cell."""
     out = []
     again = [p.id for p in poses if p.used_before]
     n = len(poses)
     if again:
         names = ", ".join(again[:5]) + (f" and {len(again) - 5} more" if len(again) > 5 else "")
         out.append(
-            f"{len(again)} of the {n} scans were given to the calibration itself ({names}): their errors flatter it; take "
+            f"{len(again)} of the {n} scans were used in the calibration ({names}), so their errors are too small. Take "
             "new scans."
         )
     if n < _FEW:
-        out.append(f"Only {n} scan{' was' if n == 1 else 's were'} judged: take {_FEW} or more across the work space.")
+        out.append(f"Only {n} scan{' was' if n == 1 else 's were'} used. Take {_FEW} or more across the work space.")
     turned = [o.X_BR for o in observations]
     if data.pairs and not all(p.has_orientation for p in data.pairs):
-        out.append("The pairs give no orientation of the flange: whether it varies is not known.")
+        out.append("The pairs have no orientations of the flange. Whether the orientation varies is not known.")
     elif n > 1 and turn_deg(turned) < _TURN_DEG:
         out.append(
-            f"The orientations hardly vary (by {turn_deg(turned):.1f} degrees): a constant error of the flange centre "
-            "need not show in these figures."
+            f"The orientations hardly vary (by {turn_deg(turned):.1f} degrees). A constant error of the flange centre "
+            "would not show in these figures."
         )
     stated = result.held_out_mm.get("p95")
     median = float(np.median([p.error_mm for p in poses]))
     if stated is not None and median > (stated if n >= _FEW else _GROSS * stated):
         out.append(
-            f"The median error, {median:.2f} mm, is larger than what the calibration stated for 95 % of its own held-out "
-            f"scans ({stated:.2f} mm): scanner, robot or flange has changed, or these scans lie elsewhere; calibrate "
-            "again."
+            f"The median error, {median:.2f} mm, is larger than the calibration's own held-out error at 95 % ({stated:.2f} mm). "
+            "Scanner, robot or flange has changed, or these scans are in another region: calibrate again."
         )
     gross = [p for p in poses if p.error_mm > _GROSS * max(median, stated or 0.0)]
     if gross:
         names = ", ".join(f"{p.id} by {p.error_mm:.1f} mm" for p in gross[:8]) + (" ..." if len(gross) > 8 else "")
         out.append(
-            f"{len(gross)} of the {n} scans {'is' if len(gross) == 1 else 'are'} far off while the others are not: {names}."
+            f"{len(gross)} of the {n} scans {'is a gross outlier' if len(gross) == 1 else 'are gross outliers'}: {names}."
         )
     tilts = [p.tilt_deg for p in poses if p.tilt_deg is not None]
     if tilts and float(np.median(tilts)) > _WORST_TILT_DEG:
         out.append(
-            f"The faces seen are turned by {np.median(tilts):.0f} degrees from where the poses have the flange's z axis: check the "
+            f"The scanned faces are turned by {np.median(tilts):.0f} degrees from the flange's z axis in the poses. Check the "
             "quaternion order (qw, qx, qy, qz), that the poses are the flange's, and the calibration."
         )
     if result.scanner_correction is None:
@@ -234,16 +176,16 @@ def _doubts(
 
 
 def _uncorrected(result: CalibrationResult, observations: tuple[Observation, ...]) -> str:
-    """The sentence on an absent scanner correction, with the scale error these scans show, where they do."""
-    text = "The result holds no scanner correction, so these errors contain the scanner's own error of scale"
+    """The warning about an absent scanner correction, with the scale error where these scans show one."""
+    text = "The result holds no scanner correction, so these errors include the scale error of the scanner"
     scale, sigma = _scale_error(result, observations)
     if np.isfinite(sigma) and abs(scale) > _EVIDENT * sigma:
-        return f"{text}; these scans ask for {1e2 * scale:+.2f} % (one sigma {1e2 * sigma:.2f} %)."
-    return f"{text}, if it has one."
+        return f"{text}: these scans show {1e2 * scale:+.2f} % (one sigma {1e2 * sigma:.2f} %)."
+    return f"{text}, if there is one."
 
 
 def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...]) -> tuple[float, float]:
-    """Change of scale that best explains the errors beside a shift, and its standard error; NaN for few scans."""
+    """Change of scale that best explains the errors together with a shift, and its standard error; NaN for few scans."""
     n = len(observations)
     if n < 6:
         return float("nan"), float("nan")
@@ -256,6 +198,3 @@ def _scale_error(result: CalibrationResult, observations: tuple[Observation, ...
     scale = float((c * e).sum()) / spread
     left = float(((e - scale * c) ** 2).sum()) / (3 * n - 4)
     return scale, float(np.sqrt(left / spread))
-
-
-__all__ = ["PoseError", "VerifyReport", "verify_dataset"]

@@ -1,4 +1,4 @@
-"""Shows a finished run again: the pages it left, opened in the web browser."""
+"""`weldcal view`: finds the pages of a finished run and opens them in the web browser."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ PAGES = ("report.html", "recording.html")
 
 
 def find_pages(result: Path) -> list[Path]:
-    """The absolute paths of the pages in a result folder (report first), or the one page that was named.
+    """The absolute paths of the pages in a result folder (report first), or the one page that was given.
 
     Raises:
         InputError: if there is no such folder or file, or it holds no page.
     """
     if not result.exists():
-        raise InputError(f"There is no {result}; name the folder that a weldcal command wrote its result to.")
+        raise InputError(f"There is no {result}. Give the result folder of a weldcal command.")
     candidates = [result] if result.is_file() else [result / name for name in PAGES]
     pages = [page.resolve() for page in candidates if page.is_file() and page.suffix == ".html"]
     if not pages:
         raise InputError(
-            f"{result} holds neither report.html nor recording.html; name the result folder of a finished run."
+            f"{result} holds neither report.html nor recording.html. Give the result folder of a finished run."
         )
     return pages
 

@@ -1,4 +1,4 @@
-"""How well each feature of the flange agrees with itself, scan by scan: face plane, outer edge, bore, drilled holes."""
+"""Table cells of the flange fits: residuals of face plane, outer edge, bore and holes, centre sigma and coverage."""
 
 from __future__ import annotations
 
@@ -38,13 +38,14 @@ def feature_residuals(
 def feature_table(fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]) -> list[tuple[str, ...]]:
     """The rows of ``feature_residuals`` as a report shows them, under ``HEADER``."""
     places = {"plane_mm": 3, "outer_mm": 3, "bore_mm": 3, "holes_mm": 3, "turn_sigma_deg": 2}
-    table = []
-    for row in feature_residuals(fits, patterns):
-        cells = []
-        for key, value in row.items():
-            if value is None:
-                cells.append("–")
-            else:
-                cells.append(fixed(float(value), places[key]) if key in places else str(value))
-        table.append(tuple(cells))
-    return table
+    return [
+        tuple(str(v) if k not in places else fixed(None if v is None else float(v), places[k]) for k, v in row.items())
+        for row in feature_residuals(fits, patterns)
+    ]
+
+
+def fit_cells(fit: FlangeFit | None) -> tuple[str, str]:
+    """One sigma of the centre (3-D, mm) and the share of the edge seen (%); dashes without a fit."""
+    if fit is None:
+        return "–", "–"
+    return fixed(1e3 * float(np.sqrt(np.trace(fit.center_covariance))), 3), fixed(100 * fit.coverage, 0)

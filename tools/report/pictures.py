@@ -1,4 +1,4 @@
-"""The pictures that more than one report shows: errors as bars, errors as arrows across the scanner's field of view."""
+"""Plots that several reports share: errors as bars, errors as arrows across the scanner's field of view."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from weldcal.calibration.flange.observation import Observation
 
 Array = NDArray[np.float64]
 
-OURS, REFUSED = "#1d5f8a", "#9aa3ab"
-_GROSS = 10.0  # times the median: a bar of something else
+OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
+_GROSS = 10.0  # times the median: a gross outlier
 _PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.0}  # keeps a label readable on a bar
 
 
@@ -32,17 +32,17 @@ def error_bars(
     stated: tuple[float, str] | None = None,
     median_of: str = "",
 ) -> bytes:
-    """One bar a pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` says of which), and ``stated``
-    (a height and its name) as another. Bars that would flatten all others end at the top, with their number."""
+    """One bar per pose (n,), grey where not ``keep``; the median of the others as a line (``median_of`` names them), and
+    ``stated`` (a height and its name) as another. Gross outliers end at the top edge, with their value."""
     x = np.arange(len(error))
     figure = Figure(figsize=(8.2, 3.2), layout="constrained")
     axes = figure.subplots()
     keep = keep & np.isfinite(error)
     if not np.isfinite(error).any():
-        axes.text(0.5, 0.5, "too few scans to hold one back", transform=axes.transAxes, ha="center", color="#555")
+        axes.text(0.5, 0.5, "too few scans for cross-validation", transform=axes.transAxes, ha="center", color="#555")
         axes.set_axis_off()
         return svg(figure, axes)
-    axes.bar(x, error, color=[OURS if k else REFUSED for k in keep], width=0.7)
+    axes.bar(x, error, color=[OURS if k else GREY for k in keep], width=0.7)
     median = float(np.median(error[keep])) if keep.any() else float(np.nanmedian(error))
     # gross outliers would flatten every other bar
     usual = np.isfinite(error) & (
@@ -51,23 +51,14 @@ def error_bars(
     shown = usual & keep if (usual & keep).any() else usual
     top = 1.25 * float(error[shown].max())
     if stated is not None:
-        axes.axhline(stated[0], color="#a8402f", linewidth=1, linestyle=":")
-        axes.annotate(
-            f"{stated[1]} {stated[0]:.2f}",
-            (x[0] - 0.5, stated[0]),
-            fontsize=9,
-            va="bottom",
-            color="#a8402f",
-            bbox=_PLATE,
-        )
+        axes.axhline(stated[0], color=TRUTH, linewidth=1, linestyle=":")
+        name = f"{stated[1]} {stated[0]:.2f}"
+        axes.annotate(name, (x[0] - 0.5, stated[0]), fontsize=9, va="bottom", color=TRUTH, bbox=_PLATE)
         top = max(top, 1.25 * stated[0])
     axes.axhline(median, color="#444", linewidth=1, linestyle="--")
     if median <= top:
-        said, beside = (
-            f"median\n{median_of}{median:.2f}",
-            ("axes fraction", "data"),
-        )  # right of the bars, which it would hide
-        axes.annotate(said, (1.01, median), xycoords=beside, fontsize=9, va="center", annotation_clip=False)
+        name, right = f"median\n{median_of}{median:.2f}", ("axes fraction", "data")  # right of the bars, not over them
+        axes.annotate(name, (1.01, median), xycoords=right, fontsize=9, va="center", annotation_clip=False)
     step = max(1, len(x) // 25)
     axes.set_xticks(x[::step], list(ids)[::step], rotation=60, ha="right", fontsize=8)
     axes.set_ylim(0.0, max(top, 1e-9))
@@ -78,7 +69,7 @@ def error_bars(
 
 
 def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> bytes:
-    """Errors in the camera frame, across the field of view and along the line of sight: a scanner's own error has a
+    """Errors in the camera frame, across the field of view and along the line of sight: errors of the scanner form a
     pattern."""
     R = X_BC.rotation().matrix()
     seen = np.array([o.p_CR for o in observations])
@@ -90,24 +81,15 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
     extent = max(float(np.ptp(seen[:, :2], axis=0).max()), 0.05)
     scale = 0.12 * extent / max(float(np.median(np.linalg.norm(error, axis=1))), 1e-9)
     for axes, (i, j), names in ((left, (0, 1), ("x", "y")), (right, (0, 2), ("x", "z"))):
-        axes.quiver(
-            1e3 * seen[:, i],
-            1e3 * seen[:, j],
-            error[:, i],
-            error[:, j],
-            angles="xy",
-            scale_units="xy",
-            scale=1e-3 / scale,
-            color=OURS,
-            width=0.004,
-        )
-        axes.plot(1e3 * seen[:, i], 1e3 * seen[:, j], ".", color="#555", markersize=4)
+        at, e = 1e3 * seen[:, (i, j)].T, error[:, (i, j)].T
+        axes.quiver(*at, *e, angles="xy", scale_units="xy", scale=1e-3 / scale, color=OURS, width=0.004)
+        axes.plot(*at, ".", color="#555", markersize=4)
         axes.set_xlabel(f"camera {names[0]}, mm")
         axes.set_ylabel(f"camera {names[1]}, mm")
         axes.set_aspect("equal", adjustable="datalim")
         axes.invert_yaxis()
         axes.margins(0.15)
-    left.set_title(f"errors, {scale:.0f} times enlarged", fontsize=9, loc="left")
+    left.set_title(f"errors, enlarged {scale:.0f} times", fontsize=9, loc="left")
     return svg(figure, left, right)
 
 

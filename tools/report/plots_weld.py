@@ -1,22 +1,34 @@
-"""The pictures of a weld: who went where (the paper's Fig. 13), and how it went along the seam."""
+"""Plots of a weld: the paths over the seam (the paper's Fig. 13) and the quantities along it."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-import matplotlib
-
-matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-OURS, THEIRS, TRUTH, PLANNED, TORCH, ROBOT = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab", "#d9700f", "#5b7d4e"
+from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, Array, svg
+
+__all__ = [
+    "OURS",
+    "PLANNED",
+    "ROBOT",
+    "THEIRS",
+    "TORCH",
+    "TRUTH",
+    "Array",
+    "WeldTrace",
+    "along_the_weld",
+    "paths",
+    "plain",
+    "svg",
+]
+
+PLANNED, TORCH, ROBOT = GREY, "#d9700f", "#5b7d4e"
 _SMALL = 8
 _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
 _DOTTED = (0, (1.2, 0.7))
@@ -24,16 +36,16 @@ _DOTTED = (0, (1.2, 0.7))
 
 @dataclass(frozen=True, eq=False)
 class WeldTrace:
-    """A weld as the pictures need it, SI units; N rows from the first contact on.
+    """A weld as it is plotted, SI units; N rows from the first contact on.
 
     Attributes:
         s: (N,) the torch along the seam, m, negative before it; torch_on, felt: (N,) arc burning, tip in contact.
         tip, torch, robot: (N,3) paths; planned, true: (M,3) lines, as far as they are known.
-        plan_error, torch_error: (arc length, lateral, height) off the true seam, m; None where there is no truth.
+        plan_error, torch_error: (arc length, lateral, height) from the true seam, m; None where there is no truth.
         delta_n, delta_axial, speed, omega, n_d_dot_n_t: (N,); speed is the torch's, m/s.
-        e_t: (N,) the servo's own estimate of the torch off the refined seam, m; drawn where there is no truth.
-        weld_speed, delta_d, axial_d, omega_max: what the weld was asked for.
-        work, travel: (N,) rad; foretold: (N,) travel angle that the seam foretells; windows: their (work, travel) limits.
+        e_t: (N,) the servo's estimate of the torch's distance from the refined seam, m; drawn where there is no truth.
+        weld_speed, delta_d, axial_d, omega_max: the set values.
+        work, travel: (N,) rad; predicted: (N,) travel angle predicted from the seam; windows: their (work, travel) limits.
         axes: which coordinates are drawn to the right and up, and their names.
     """
 
@@ -59,18 +71,10 @@ class WeldTrace:
     e_t: Array | None = None
     work: Array | None = None
     travel: Array | None = None
-    foretold: Array | None = None
+    predicted: Array | None = None
     windows: tuple[float, float] = (np.inf, np.inf)
     axes: tuple[int, int] = (0, 1)
     names: tuple[str, str] = field(default=("x, mm", "y, mm"))
-
-
-def svg(figure: Figure) -> bytes:
-    """The figure as SVG bytes, the same for the same figure."""
-    stream = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "weldcal"}):
-        figure.savefig(stream, format="svg", metadata={"Date": None})
-    return stream.getvalue()
 
 
 def plain(axes: Axes, x: str, y: str) -> None:
@@ -82,7 +86,7 @@ def plain(axes: Axes, x: str, y: str) -> None:
 
 
 def paths(trace: WeldTrace) -> bytes:
-    """Planned and true seam, tip, torch and robot from above, the piece where they differ most, and the lateral errors."""
+    """Planned and true seam, tip, torch and robot from above, a detail of the sharpest turn, and the lateral errors."""
     i, j = trace.axes
     drawn = [line for line in (trace.robot, trace.torch, trace.planned, trace.true) if line is not None]
     reach = np.ptp(np.vstack(drawn), axis=0)
@@ -99,10 +103,10 @@ def paths(trace: WeldTrace) -> bytes:
         _lines(axes, trace)
         axes.set_aspect("equal")
         plain(axes, *trace.names)
-    low, size = _closest_look(trace)
+    low, size = _detail(trace)
     zoom.set_xlim(1e3 * low[0], 1e3 * (low[0] + size))
     zoom.set_ylim(1e3 * low[1], 1e3 * (low[1] + size))
-    zoom.set_title("the framed piece", fontsize=_SMALL + 1)
+    zoom.set_title("detail", fontsize=_SMALL + 1)
     above.add_patch(
         Rectangle((1e3 * low[0], 1e3 * low[1]), 1e3 * size, 1e3 * size, fill=False, edgecolor="black", linewidth=0.8)
     )
@@ -113,7 +117,7 @@ def paths(trace: WeldTrace) -> bytes:
 
 
 def _lines(axes: Axes, trace: WeldTrace) -> None:
-    """Each told from the others by width and dash as well as by colour."""
+    """The paths, each with its own width and dash as well as its own colour."""
     i, j = trace.axes
     felt, on = trace.felt, trace.torch_on
     drawn: Iterable[tuple[Array | None, dict[str, object]]] = (
@@ -128,8 +132,8 @@ def _lines(axes: Axes, trace: WeldTrace) -> None:
             axes.plot(1e3 * line[:, i], 1e3 * line[:, j], **style)  # type: ignore[arg-type]
 
 
-def _closest_look(trace: WeldTrace) -> tuple[Array, float]:
-    """Lower left corner (2,) m and side of the square piece to look at: where the seam turns most beside the torch."""
+def _detail(trace: WeldTrace) -> tuple[Array, float]:
+    """Lower left corner (2,) m and side (m) of the detail: where the seam turns most at the torch."""
     i, j = trace.axes
     burning = np.flatnonzero(trace.torch_on & np.isfinite(trace.n_d_dot_n_t))
     at = burning[np.argmin(trace.n_d_dot_n_t[burning])] if len(burning) else len(trace.torch) // 2
@@ -147,18 +151,18 @@ def _lateral(axes: Axes, trace: WeldTrace) -> None:
         axes.plot(1e3 * s, 1e3 * lateral, color=TORCH, lw=1.6, label="torch")
         axes.plot(1e3 * s, 1e3 * height, color=OURS, lw=1.0, ls=":", label="torch, height")
     axes.axhline(0.0, color="black", lw=0.6)
-    plain(axes, "true seam, mm", "off the true seam, mm")
+    plain(axes, "true seam, mm", "distance from\nthe true seam, mm")
     axes.margins(y=0.25)
     if trace.plan_error is None and trace.torch_error is None:
         if trace.e_t is not None:
             axes.plot(1e3 * trace.s, 1e3 * np.where(trace.torch_on, trace.e_t, np.nan), color=TORCH, lw=1.6)
-        plain(axes, "planned seam, mm", "torch off the seam\nas it was felt, mm")
+        plain(axes, "planned seam, mm", "torch from the seam\nas felt, mm")
         return
     axes.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="upper center", columnspacing=1.0, handlelength=1.5)
 
 
 def along_the_weld(trace: WeldTrace) -> bytes:
-    """Deformation of the tip, torch speed, turning rate and n_d . n_t over the torch's place, each with what it is held to."""
+    """Tip deformation, torch speed, turning rate and n_d . n_t over the position of the torch, each with its limits."""
     angles = trace.work is not None and trace.travel is not None
     rows = 5 if angles else 4
     picture = Figure(figsize=(7.4, 1.95 * rows), layout="constrained")
@@ -170,14 +174,14 @@ def along_the_weld(trace: WeldTrace) -> bytes:
     if angles:
         _angles(panes[4], trace)
     for axes in panes:
-        _silences(axes, trace)
+        _not_steering(axes, trace)
     panes[-1].set_xlabel("torch along the seam, mm (negative: before it, arc off)")
     picture.align_ylabels(panes)
     return svg(picture)
 
 
 def _note(axes: Axes, text: str, height: float, hangs: str) -> None:
-    """A word at the left edge, where the arc is still off, for a line or band at that height."""
+    """A label at the left edge, where the arc is still off, for a line or band at that height."""
     place = {"xycoords": ("axes fraction", "data"), "fontsize": _SMALL, "in_layout": False}
     axes.annotate(text, (0.004, height), va=hangs, **place)  # type: ignore[arg-type]
 
@@ -189,7 +193,7 @@ def _deformation(axes: Axes, trace: WeldTrace) -> None:
         (trace.delta_n, trace.delta_d, OURS, "-", "lateral"),
     ):
         axes.axhspan(0.9e3 * wanted, 1.1e3 * wanted, color=colour, alpha=0.16, lw=0)
-        axes.plot(s, 1e3 * value, color=colour, lw=1.2, ls=style, label=f"{name}, wanted {1e3 * wanted:g} mm ±10 %")
+        axes.plot(s, 1e3 * value, color=colour, lw=1.2, ls=style, label=f"{name}, set {1e3 * wanted:g} mm ±10 %")
     top = 1.5e3 * max(trace.axial_d, trace.delta_d, 0.8 * float(np.nanmax(trace.delta_axial, initial=0.0)))
     axes.set_ylim(min(0.0, 1.1e3 * float(np.nanmin(trace.delta_n, initial=0.0))), top)
     axes.legend(frameon=False, fontsize=_SMALL, ncols=2, loc="upper right")
@@ -225,7 +229,7 @@ def _measure(axes: Axes, trace: WeldTrace) -> None:
     good = np.isfinite(n)
     low = min(0.0, float(np.nanmin(n))) if good.any() else 0.0
     axes.set_ylim(low - 0.12, 1.16)
-    _note(axes, "0: here the published law divides by zero", 0.02, "bottom")
+    _note(axes, "0: the published law divides by zero", 0.02, "bottom")
     through = zero_crossings(s, n)
     axes.plot(through, np.zeros(len(through)), "x", color="black", ms=7, mew=1.6)
     for k, at in enumerate(through[:3]):
@@ -241,7 +245,7 @@ def _measure(axes: Axes, trace: WeldTrace) -> None:
         at = int(np.nanargmin(n))
         axes.plot(s[at], n[at], "o", color="black", ms=4)
         text = {"xytext": (6, -4), "textcoords": "offset points", "fontsize": _SMALL, "in_layout": False, "va": "top"}
-        axes.annotate(f"least {n[at]:.2f}, at {s[at]:.0f} mm", (s[at], n[at]), **text)  # type: ignore[arg-type]
+        axes.annotate(f"minimum {n[at]:.2f} at {s[at]:.0f} mm", (s[at], n[at]), **text)  # type: ignore[arg-type]
     plain(axes, "", "n$_d$ · n$_t$")
 
 
@@ -261,23 +265,25 @@ def _angles(axes: Axes, trace: WeldTrace) -> None:
     values = [trace.work, trace.travel]
     axes.plot(s, np.degrees(trace.work), color=OURS, lw=1.2, label="work")
     axes.plot(s, np.degrees(trace.travel), color=TORCH, lw=1.6, ls="--", label="travel")
-    if trace.foretold is not None:
-        axes.plot(s, np.degrees(trace.foretold), color="black", lw=0.9, ls=":", label="travel, foretold by the seam")
-        values.append(trace.foretold)
+    if trace.predicted is not None:
+        axes.plot(
+            s, np.degrees(trace.predicted), color="black", lw=0.9, ls=":", label="travel, predicted from the seam"
+        )
+        values.append(trace.predicted)
     top = 1.6 * max(2.0, float(np.nanmax(np.abs(np.degrees(np.concatenate(values))), initial=0.0)))
     for limit, name, colour in zip(np.degrees(trace.windows), ("work", "travel"), (OURS, TORCH), strict=True):
         if limit < top:
             for sign in (-1.0, 1.0):
                 axes.axhline(sign * limit, color=colour, lw=0.8, ls="--")
-            _note(axes, f"window of the {name} angle", float(limit), "top")
+            _note(axes, f"limit of the {name} angle", float(limit), "top")
     axes.set_ylim(-top, top)
     axes.axhline(0.0, color="black", lw=0.6)
     axes.legend(frameon=False, fontsize=_SMALL, ncols=3, loc="upper left")
     plain(axes, "", "angle of\nthe torch, deg")
 
 
-def _silences(axes: Axes, trace: WeldTrace) -> None:
-    """Grey where the tip does not steer, and a line where the arc was lit and put out."""
+def _not_steering(axes: Axes, trace: WeldTrace) -> None:
+    """Grey where the tip does not steer; a line where the arc was switched on and off."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], ~trace.felt, [False]]).astype(int)))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         axes.axvspan(1e3 * trace.s[a], 1e3 * trace.s[min(b, len(trace.s) - 1)], color="black", alpha=0.07, lw=0)

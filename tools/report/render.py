@@ -1,4 +1,4 @@
-"""Renders a report template to one self-contained HTML text, and writes files so that they are whole or not there."""
+"""Renders report templates to self-contained HTML, formats numbers, and writes files atomically."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import math
 import os
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
@@ -45,7 +46,7 @@ def data_uri(picture: bytes) -> str:
 
 
 def fixed(value: float | None, digits: int = 2) -> str:
-    """The number with so many decimals; a dash where there is none (None, NaN) and the sign for an infinite one."""
+    """The number with that many decimals; a dash for None and NaN, the sign ∞ for an infinite one."""
     if value is None or math.isnan(value):
         return "–"
     if math.isinf(value):
@@ -54,8 +55,13 @@ def fixed(value: float | None, digits: int = 2) -> str:
     return text.replace("-", "−") if float(text) else f"{0:.{digits}f}"
 
 
+def fixed_row(values: Iterable[float], digits: int = 2) -> str:
+    """Numbers as ``fixed`` writes them, in one row."""
+    return "  ".join(fixed(float(value), digits) for value in values)
+
+
 def write_atomic(path: Path, content: str | bytes) -> None:
-    """Writes a file, making its folder first: another process sees the old content or the new, never a part of it."""
+    """Writes a file and creates its folder: another process sees the old content or the new, never a part of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:

@@ -1,4 +1,4 @@
-"""The report of a tablet calibration, from files or from a visit: what came out, what each landmark says, what the camera saw."""
+"""The report page of a tablet calibration, from files or from a simulated visit, with its plots and tables."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from weldcal.calibration.tablet.result import TabletResult
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Run
 from weldcal.tools.report.pictures import OURS, svg
-from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.render import fixed, fixed_row, render
 
 Array = NDArray[np.float64]
 Card = tuple[str, str, str, str, str]
 _MARK = (40, 60, 220)  # BGR
 _MODELS = {
-    "wrist": "full robot poses: touches fix tablet and pen, the picture fixes the camera",
+    "wrist": "full robot poses: touches determine tablet and pen, the image determines the camera",
     "pnp": "the tablet's true size (PnP), then a rigid motion and the pen",
-    "pnp_free_scale": "the tablet's size (PnP) with a scale of its own, then a rigid motion and the pen",
+    "pnp_free_scale": "the tablet's size (PnP) with a free scale, then a rigid motion and the pen",
     "closed_form": "one linear least squares of six unknowns",
 }
 _UNITS = {"phi": ("deg", 180.0 / np.pi), "scale": ("", 1.0), "roll": ("deg", 180.0 / np.pi)}
@@ -33,8 +33,8 @@ _UNITS |= {"pitch": _UNITS["roll"], "yaw": _UNITS["roll"]}
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the report draws: landmarks (n, 2) m of the page, in-plane misses (n, 2) m of their touches, the names of the
-    landmarks, and the camera's picture (PNG bytes) with what was found in it."""
+    """Data of the plots: landmarks (n, 2) m of the page, in-plane residuals (n, 2) m of their touches, the names of the
+    landmarks, and the camera's image (PNG bytes) with the detected landmarks."""
 
     landmark_m: Array
     miss_m: Array
@@ -44,7 +44,7 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """What tablet.html.j2 fills in."""
+    """The contents of tablet.html.j2."""
 
     title: str
     subtitle: str
@@ -64,7 +64,7 @@ class Page:
 
 
 def marked_picture(grey: NDArray[np.uint8], uv_px: Array) -> bytes:
-    """The picture (h, w) as PNG with a numbered mark at each landmark (n, 2) px."""
+    """The image (h, w) as PNG with a numbered mark at each landmark (n, 2) px."""
     image = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     size = max(grey.shape[1] / 640.0, 1.0)
     for k, (u, v) in enumerate(uv_px):
@@ -78,7 +78,7 @@ def marked_picture(grey: NDArray[np.uint8], uv_px: Array) -> bytes:
 
 
 def miss_arrows(shown: Shown) -> bytes:
-    """Misses as arrows at the landmarks, the page upright."""
+    """Residuals as arrows at the landmarks, the page upright."""
     p, miss = 1e3 * shown.landmark_m, 1e3 * shown.miss_m
     extent = max(float(np.ptp(p, axis=0).max()), 1.0)
     largest = max(float(np.linalg.norm(miss, axis=1).max()), 1e-9)
@@ -88,7 +88,7 @@ def miss_arrows(shown: Shown) -> bytes:
     figure = Figure(figsize=(6.4, float(np.clip(1.6 + 5.2 * ratio, 2.6, 7.0))), layout="constrained")
     axes = figure.subplots()
     axes.plot(p[:, 0], p[:, 1], "o", color="#555", markersize=4)
-    axes.plot(*(p + times * miss).T, ".", alpha=0.0)  # the arrows' tips belong to what is shown
+    axes.plot(*(p + times * miss).T, ".", alpha=0.0)  # includes the arrows' tips in the axes' limits
     axes.quiver(p[:, 0], p[:, 1], *(times * miss).T, angles="xy", scale_units="xy", scale=1, color=OURS, width=0.006)
     for name, (x, y) in zip(shown.names, p, strict=True):
         axes.annotate(name, (x, y), xytext=(6, 6), textcoords="offset points", fontsize=9, color="#333")
@@ -97,7 +97,7 @@ def miss_arrows(shown: Shown) -> bytes:
     axes.margins(0.2)
     axes.set_xlabel("page x, mm")
     axes.set_ylabel("page y, mm")
-    axes.set_title(f"misses, {times:g} times enlarged (largest {largest:.2f} mm)", fontsize=9, loc="left")
+    axes.set_title(f"residuals, enlarged {times:g} times (largest {largest:.2f} mm)", fontsize=9, loc="left")
     return svg(figure, axes)
 
 
@@ -107,7 +107,7 @@ def landmark_rows(result: TabletResult, names: Sequence[str]) -> tuple[tuple[str
     rows: list[tuple[str, ...]] = [
         (n, fixed(r, 3), fixed(lo, 3)) for n, r, lo in zip(names, result.residual_mm, left, strict=True)
     ]
-    return ("landmark", "fit, mm", "left out, mm"), rows
+    return ("landmark", "fit, mm", "held out, mm"), rows
 
 
 def calibration_report(
@@ -118,18 +118,18 @@ def calibration_report(
     mean = float(np.mean(left)) if left else float("nan")
     header, rows = landmark_rows(result, shown.names)
     cards: list[Card] = [
-        ("Left-out landmark, mean", fixed(mean, 3), "mm", "plain", "each predicted by a fit that never saw it"),
+        ("Held-out landmark, mean", fixed(mean, 3), "mm", "plain", "each predicted by a fit without it"),
         ("In the fit, mean", fixed(float(np.mean(result.residual_mm)), 3), "mm", "plain", "of the touches"),
         ("Landmarks", str(len(shown.names)), "", "plain", "touched and seen"),
     ]
     if held_out is not None:
-        worst = f"largest {fixed(held_out['max'], 3)}; never used"
+        worst = f"largest {fixed(held_out['max'], 3)}; not used in the fit"
         cards.insert(0, ("The file's queries, mean", fixed(held_out["mean"], 3), "mm", "good", worst))
-    sentence = f"Left-out landmarks are missed by {fixed(mean, 2)} mm." if left else "Nothing could be left out."
+    sentence = f"Mean error of held-out landmarks: {fixed(mean, 2)} mm." if left else "No landmark could be held out."
     return render(
         "tablet.html.j2",
         page=Page(
-            title="Camera and pen by a tablet",
+            title="Calibration of camera and pen by a tablet",
             subtitle=f"Model: {_MODELS.get(result.model, result.model)}.",
             verdict=_verdict(result, sentence),
             cards=cards,
@@ -149,7 +149,7 @@ def visit_report(
     run: Run[AddedVisit], found: Mapping[str, Any], result: TabletResult | None, shown: Shown | None,
     *, recording: bool,
 ) -> str:  # fmt: skip
-    """The page of a visit in a scenario; `result` and `shown` None where it was held before its end."""
+    """The page of a run in a scenario; `result` and `shown` are None if it was held before its end."""
     scenario, job, name = run.cell.scenario, run.cell.job, str(found["scenario"])
     subtitle = f"{scenario.description.rstrip('.')}. " if scenario.description else ""
     robot = "Simulation" if found["robot"] == "simulated" else f"Rendered sensors; robot: {found['robot']}"
@@ -158,28 +158,28 @@ def visit_report(
         ("real-time factor", fixed(float(found["real_time_factor"]), 2)),
     ]  # fmt: skip
     common: dict[str, Any] = {
-        "title": "A visit to the tablet",
+        "title": "Tablet calibration in simulation",
         "subtitle": f"{subtitle}{robot}, seed {found['seed']}.",
         "timing": _timing(run),
         "recording": recording,
     }
     touched = ("Landmarks touched", str(found["n_touches"]), f"of {len(job.plan.q_above)}", "plain", "by contact")
     if result is None or shown is None:
-        verdict = ("bad", "The visit was held", str(found.get("reason", "")))
+        verdict = ("bad", "The run was held", str(found.get("reason", "")))
         return render("tablet.html.j2", page=Page(verdict=verdict, cards=[touched], provenance=provenance, **common))
     unseen = found["unseen_touch_mm"]
     header, rows = landmark_rows(result, shown.names)
     cards: list[Card] = [
-        ("Points never touched", fixed(unseen["mean"], 3), "mm", "good", f"mean miss of 50; largest {fixed(unseen['max'], 3)}"),
-        ("Left-out landmark, mean", fixed(found["leave_one_out_mm"], 3), "mm", "plain", "by a fit that never saw it"),
-        ("Camera off the truth", fixed(found["X_FC_error_mm"], 2), "mm", "plain", f"{fixed(found['X_FC_error_deg'], 3)} deg"),
-        ("Pen off the truth", fixed(found["pen_error_mm"], 3), "mm", "plain", "its tip, on the flange"),
+        ("Error at untouched points", fixed(unseen["mean"], 3), "mm", "good", f"mean of 50; largest {fixed(unseen['max'], 3)}"),
+        ("Held-out landmark, mean", fixed(found["leave_one_out_mm"], 3), "mm", "plain", "by a fit without it"),
+        ("True error of the camera", fixed(found["X_FC_error_mm"], 2), "mm", "plain", f"{fixed(found['X_FC_error_deg'], 3)} deg"),
+        ("True error of the pen", fixed(found["pen_error_mm"], 3), "mm", "plain", "its tip, on the flange"),
         touched,
     ]  # fmt: skip
     return render(
         "tablet.html.j2",
         page=Page(
-            verdict=_verdict(result, f"Points nobody touched are met within {fixed(unseen['max'], 2)} mm."),
+            verdict=_verdict(result, f"Error at untouched points: at most {fixed(unseen['max'], 2)} mm."),
             cards=cards,
             notes=(*result.warnings, *result.unobservable),
             truth=_truth(job, found),
@@ -196,10 +196,10 @@ def visit_report(
 
 
 def _verdict(result: TabletResult, sentence: str) -> tuple[str, str, str]:
-    """Tone, headline and what is to be said with it."""
+    """Tone, headline and sentence."""
     if result.warnings or result.unobservable:
-        return ("warn", "Camera and pen are found, with reserve", sentence)
-    return ("good", "Camera and pen are found", sentence)
+        return ("warn", "Camera and pen are calibrated, with warnings", sentence)
+    return ("good", "Camera and pen are calibrated", sentence)
 
 
 def _truth(job: AddedVisit, found: Mapping[str, Any]) -> list[tuple[str, ...]]:
@@ -208,11 +208,11 @@ def _truth(job: AddedVisit, found: Mapping[str, Any]) -> list[tuple[str, ...]]:
     off = 1e3 * float(np.linalg.norm(drawn.translation() - truth.X_FC.translation()))
     pen = 1e3 * float(np.linalg.norm(np.array(job.tablet.pen.tip_m) - truth.p_FP))
     return [
-        ("camera, place, mm off", fixed(off, 2), fixed(found["X_FC_error_mm"], 2)),
-        ("camera, turn, deg off", fixed(float(turn), 3), fixed(found["X_FC_error_deg"], 3)),
-        ("pen tip, mm off", fixed(pen, 2), fixed(found["pen_error_mm"], 3)),
-        ("depth by the tablet's plane, mm rms", "", fixed(found["depth_by_plane_mm"], 3)),
-        ("depth by the landmark's own pixel, mm rms", "", fixed(found["depth_by_pixel_mm"], 3)),
+        ("camera position error, mm", fixed(off, 2), fixed(found["X_FC_error_mm"], 2)),
+        ("camera rotation error, deg", fixed(float(turn), 3), fixed(found["X_FC_error_deg"], 3)),
+        ("pen tip error, mm", fixed(pen, 2), fixed(found["pen_error_mm"], 3)),
+        ("depth error by the tablet's plane, mm rms", "", fixed(found["depth_by_plane_mm"], 3)),
+        ("depth error by the landmark's pixel, mm rms", "", fixed(found["depth_by_pixel_mm"], 3)),
     ]
 
 
@@ -223,18 +223,14 @@ def _pose(result: TabletResult) -> list[tuple[str, str]]:
     sigma = np.sqrt(np.diag(np.array(result.X_FC_covariance)))
     pen = np.sqrt(np.diag(np.array(result.p_FP_covariance)))
     return [
-        ("position on the flange, mm", _three(1e3 * result.X_FC.translation(), 3)),
-        ("one sigma, mm", _three(1e3 * sigma[3:], 3)),
-        ("one sigma of the rotation, deg", _three(np.degrees(sigma[:3]), 4)),
-        ("pen tip on the flange, mm", _three(1e3 * np.array(result.p_FP_m), 3)),
-        ("one sigma of it, mm", _three(1e3 * pen, 3)),
+        ("position on the flange, mm", fixed_row(1e3 * result.X_FC.translation(), 3)),
+        ("one sigma, mm", fixed_row(1e3 * sigma[3:], 3)),
+        ("one sigma of the rotation, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+        ("pen tip on the flange, mm", fixed_row(1e3 * np.array(result.p_FP_m), 3)),
+        ("one sigma of the tip, mm", fixed_row(1e3 * pen, 3)),
         ("ROS 2", export_ros2(result.X_FC, "flange", "camera_optical_frame").strip()),
         ("URScript", export_ur_pose(result.X_FC).strip()),
     ]
-
-
-def _three(values: Array, digits: int) -> str:
-    return "  ".join(fixed(float(v), digits) for v in values)
 
 
 def _files(result: TabletResult) -> list[tuple[str, str]]:
@@ -244,7 +240,7 @@ def _files(result: TabletResult) -> list[tuple[str, str]]:
 def _timing(run: Run[AddedVisit]) -> list[tuple[str, str]]:
     """Simulated seconds per kind of phase."""
     says = {"to_start": "moves", "to_look": "moves", "to_above": "moves", "lift": "moves", "to_home": "moves"}
-    says |= {"look": "look", "descend": "come down and touch"}
+    says |= {"look": "look", "descend": "descend and touch"}
     ends = [*(t for _, t, _ in run.phases[1:]), run.seconds]
     spent: dict[str, float] = {}
     for (name, since, _), until in zip(run.phases, ends, strict=True):

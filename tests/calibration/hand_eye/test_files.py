@@ -211,7 +211,7 @@ def test_samples_that_repeat_others_are_said(tmp_path: Path, poses: tuple[Array,
     F, G = poses
     path = write("npz", tmp_path, np.concatenate([F, F[:3]]), np.concatenate([G, G[:3]]))
     report = run_hand_eye("ax-yb", path, tmp_path / "out")
-    assert any(w.startswith("3 of 15 samples repeat") for w in report.result.warnings)
+    assert any(w.startswith("3 of 15 samples are exact copies") for w in report.result.warnings)
 
 
 def test_corners_that_are_of_no_use_leave_the_poses_as_given(tmp_path: Path, poses: tuple[Array, Array]) -> None:

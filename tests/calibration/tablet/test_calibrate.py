@@ -24,7 +24,7 @@ from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
-from weldcal.tools.cli.tablet import tablet
+from weldcal.tools.cli.app import app
 from weldcal.tools.studies.tablet.paper import published_touches
 
 X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
@@ -36,7 +36,7 @@ MM_PER_PX = 0.125
 
 
 def run(*arguments: object) -> tuple[int, dict[str, Any], str]:
-    finished = CliRunner().invoke(tablet, ["calibrate", *map(str, arguments), "--json"])
+    finished = CliRunner().invoke(app, ["tablet", "calibrate", *map(str, arguments), "--json"])
     return finished.exit_code, json.loads(finished.stdout.splitlines()[-1]) if finished.stdout else {}, finished.output
 
 
@@ -186,7 +186,7 @@ def _millimetres(path: Path) -> None:
 
 def test_options_that_do_not_belong_together_are_told(npz: Path, visit: Path, tmp_path: Path) -> None:
     for arguments, sentence in (
-        ((npz, "--poses", visit / "poses.csv"), "holds everything"),
+        ((npz, "--poses", visit / "poses.csv"), "is complete"),
         ((visit / "touches.csv",), "need the robot's poses"),
         ((visit / "nothing.csv",), "There is no file"),
         ((visit / "picture.png",), "neither .csv nor .npz"),

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.published.two_stage import Sign
-from weldcal.tools.cli.tablet import tablet
+from weldcal.tools.cli.app import app
 from weldcal.tools.commands.tablet.planar import VisitFits, best_model, fit_visit
 from weldcal.tools.studies.tablet.world import TabletTrial, simulate_trial
 
@@ -46,7 +46,7 @@ def run(path: Path, d: Fields, *options: str) -> dict[str, Any]:
     """What the command says of a file with these fields."""
     np.savez(path / "touches.npz", **d)
     command = ["calibrate", str(path / "touches.npz"), "--json", "--out", str(path / "out"), *options]
-    finished = CliRunner().invoke(tablet, command)
+    finished = CliRunner().invoke(app, ["tablet", *command])
     assert "Internal error" not in finished.output
     said: dict[str, Any] = json.loads(finished.stdout.splitlines()[-1])
     assert finished.exit_code == (0 if said["state"] == "done" else 1)
@@ -133,7 +133,7 @@ def test_four_landmarks_are_enough_and_leave_nothing_out(tmp_path: Path) -> None
         (lambda d: {**d, "tablet_px": d["tablet_px"] * [1, -1], "delta_px": d["delta_px"] * [1, -1]}, "up the page"),
         (lambda d: {**d, "hand": d["hand"] + np.outer(np.eye(9)[4], [12.0, 0.0])}, "Without landmark 4 the others fit"),
         (lambda d: {**d, "mm_per_px": 1.03 * d["mm_per_px"]}, "differ by -3.0 % in length|differ by -2.* % in length"),
-        (lambda d: {**d, "uv": np.where(np.arange(9)[:, None] == 2, np.nan, d["uv"])}, "Left out, .*: landmark 2"),
+        (lambda d: {**d, "uv": np.where(np.arange(9)[:, None] == 2, np.nan, d["uv"])}, "Not used, .*: landmark 2"),
     ],
 )
 def test_what_looks_wrong_is_told(tmp_path: Path, changed: Callable[[Fields], Fields], warning: str) -> None:
@@ -154,7 +154,7 @@ def test_what_looks_wrong_is_told(tmp_path: Path, changed: Callable[[Fields], Fi
         (lambda d: {**d, "theta_deg": np.full(9, 20.0)}, "rotation is nearly the same"),
         (lambda d: {**d, "theta_deg": np.radians(d["theta_deg"])}, "it must be in degrees"),
         (lambda d: {**d, "theta_q": np.degrees(d["theta_q"])}, "theta_q must be in radians"),
-        (lambda d: {**d, "hand": 1e-3 * d["hand"]}, "write hand and hand_capture in millimetres"),
+        (lambda d: {**d, "hand": 1e-3 * d["hand"]}, "Write hand and hand_capture in millimetres"),
         (lambda d: {**d, "mm_per_px": 1e-3 * d["mm_per_px"]}, "mm_per_px in millimetres per pixel"),
         (lambda d: {**d, "theta_deg": d["theta_deg"][:5]}, r"theta_deg must have the shape \(9,\), and it has \(5,\)"),
         (lambda d: {**d, "uv": d["uv"].T}, r"uv must have the shape \(n, 2\)"),
@@ -187,4 +187,4 @@ def test_numbers_that_belong_to_other_landmarks_or_axes_are_named(tmp_path: Path
         {key: value for key, value in d.items() if not key.endswith("_q")}
         | {"uv": d["uv"][:, ::-1], "c": d["c"][::-1]},
     )
-    assert any("as in a mirror" in w for w in said["warnings"])
+    assert any("mirrored page" in w for w in said["warnings"])

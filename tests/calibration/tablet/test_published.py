@@ -23,7 +23,7 @@ from weldcal.calibration.tablet.published.two_stage import (
     stage2_residuals,
 )
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.tools.cli.reproduce.group import reproduce
+from weldcal.tools.cli.app import app
 from weldcal.tools.studies.tablet.paper import STAGE_1, STAGE_2, published_touches
 from weldcal.tools.studies.tablet.study import compare_signs, dh_by_eq_20
 
@@ -49,7 +49,7 @@ def reproduction(tmp_path_factory: pytest.TempPathFactory) -> Reproduction:
     """The command itself, without the slow search and with few trials."""
     folder = tmp_path_factory.mktemp("tablet") / "out"
     options = ["tablet", "--evolution-seeds", "0", "--trials", "2", "--seed", "5", "--json", "--out", str(folder)]
-    finished = CliRunner().invoke(reproduce, options)
+    finished = CliRunner().invoke(app, ["reproduce", *options])
     # which code it ends with hangs on a time of this machine, so it is not asked
     assert finished.stdout, finished.output
     return Reproduction(json.loads(finished.stdout.splitlines()[-1]), (folder / "report.html").read_text())

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from weldcal.tools.cli.reproduce.group import reproduce
+from weldcal.tools.cli.app import app
 from weldcal.tools.studies.weld.budgets import HARD, NOMINAL, PERFECT, planned_seam, roughness
 from weldcal.tools.studies.weld.groove import DROP_M, SEAT_M, Groove, Tip, floor
 from weldcal.tools.studies.weld.metrics import RunMetrics
@@ -154,7 +154,9 @@ def test_the_tip_sits_in_the_groove_lags_by_friction_and_relaxes_beyond_the_end(
 
 def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
     out = tmp_path / "study"
-    answer = CliRunner().invoke(reproduce, ["weld", "--rows", "r1_convex", "--seeds", "1", "--out", str(out), "--json"])
+    answer = CliRunner().invoke(
+        app, ["reproduce", "weld", "--rows", "r1_convex", "--seeds", "1", "--out", str(out), "--json"]
+    )
     assert answer.exit_code == 0, answer.output
     told = json.loads(answer.stdout.strip().splitlines()[-1])
     written = json.loads((out / "table.json").read_text())
@@ -177,6 +179,6 @@ def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:
 
 
 def test_an_unknown_row_is_one_sentence_and_exit_code_one(tmp_path: Path) -> None:
-    answer = CliRunner().invoke(reproduce, ["weld", "--rows", "nonsense", "--out", str(tmp_path / "x")])
+    answer = CliRunner().invoke(app, ["reproduce", "weld", "--rows", "nonsense", "--out", str(tmp_path / "x")])
     assert answer.exit_code == 1
     assert "Unknown row 'nonsense'" in answer.stderr

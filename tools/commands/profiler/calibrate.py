@@ -1,4 +1,4 @@
-"""The work behind `weldcal profiler`: a file read, calibrated or mapped, the result written; each returns what it found."""
+"""`weldcal profiler`: calibrates from a file by an edge or a sphere, maps a seam and writes the result."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import matrix4
 from weldcal.calibration.profiler.arm_errors import DhArm
@@ -73,10 +74,7 @@ def calibrate_edge(
     poses = cast(FlangePoses, file.poses())
     points, lost = _edge_points(file, feature, side)
     keep = np.asarray(np.isfinite(points).all(axis=1), bool)
-    if points.shape != (len(poses), 2):
-        raise InputError(
-            f"{len(poses)} poses need {len(poses)} profile points [x, z], not an array of shape {points.shape}."
-        )
+    _check_number(poses, points.shape, "profile points [x, z]", (2,))
     poses, points = poses[keep], points[keep]
     found: dict[str, Any] = {"scans": len(keep), "without_feature": lost}
     if method == "paper":
@@ -85,11 +83,10 @@ def calibrate_edge(
         found |= {"mean_distance_mm": 1e3 * float(linear.distances_m.mean())}
         if found["mean_distance_mm"] > FAR_FROM_EDGE_MM:
             found["warnings"] = [
-                f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average: scan one edge only, and check unit and poses."
+                f"The points lie {found['mean_distance_mm']:.1f} mm from one edge on average. Scan one edge only, and check unit and poses."
             ]
-        return ProfilerRecord(
-            "edge, linear", linear.rotation, linear.translation, figures=found, data_sha256=file.digest
-        ), found
+        pose = linear.rotation, linear.translation
+        return ProfilerRecord("edge, linear", *pose, figures=found, data_sha256=file.digest), found
     if not sigmas.stated and "sigma" in file.arrays:
         robot, x, z = (float(v) for v in file.arrays["sigma"])
         sigmas = Sigmas(robot, x, z)
@@ -112,7 +109,7 @@ def calibrate_edge(
 
 
 def _edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
-    """Points (n, 2) m, not finite where a profile shows no edge; which those are."""
+    """Points (n, 2) m, not finite where a profile shows no edge, and the numbers of those."""
     if not feature:
         return file.needed(
             "points", "the edge's point [x, z] in each profile (with raw profiles, name --feature bar, step or apex)"
@@ -120,7 +117,7 @@ def _edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, l
     if feature not in FEATURES:
         raise InputError(f"The feature is bar, step or apex, not '{feature}'.")
     if file.profiles is None:
-        raise InputError("The file has no profiles to look for an edge in: leave --feature away.")
+        raise InputError("The file has no profiles to detect an edge in. Omit --feature.")
     points, lost = np.full((len(file.profiles), 2), np.nan), []
     for k, p in enumerate(file.profiles):
         try:
@@ -140,23 +137,22 @@ def sphere_data(
     lost: list[int] | None = None,
     seed: int = 0,
 ) -> SphereData:
-    """A file's measurements of a sphere: its arcs found among other points, touches and joints where there are any.
+    """A file's measurements of a sphere: the detected arcs, with touches and joints where there are any.
 
-    Scans that show no arc are left out and their numbers added to `lost`; without that list they are refused.
+    Scans without an arc are not used and their numbers added to `lost`; without that list they are refused.
     """
     if file.profiles is None:
-        raise InputError("The file has no 'profiles' of the sphere: give (n, m, 2), or 'xz' with the lengths 'n'.")
+        raise InputError("The file has no 'profiles' of the sphere. Give (n, m, 2), or 'xz' with the lengths 'n'.")
     radius = radius_m if radius_m is not None else float(file.needed("radius", "the sphere's (or give --radius in mm)"))
     if not 1e-3 <= radius <= 1.0:
-        raise InputError(f"A sphere of {1e3 * radius:.3g} mm radius is none to calibrate with: give --radius in mm.")
+        raise InputError(f"A sphere of {1e3 * radius:.3g} mm radius cannot be used. Give --radius in mm.")
     felt = touches.poses() if touches is not None else file.poses("touch_")
     tip = tip_m if tip_m is not None else file.arrays.get("tip")
     if felt is not None and tip is None:
-        raise InputError("There are touches but no tip: give its place in the flange frame as --tip x,y,z in mm.")
+        raise InputError("There are touches but no tip. Give its position in the flange frame as --tip x,y,z in mm.")
     table = DhArm.of(load_arm(arm)) if arm else file.arm()
     poses = cast(FlangePoses, file.poses())
-    if len(file.profiles) != len(poses):
-        raise InputError(f"{len(poses)} poses need {len(poses)} profiles, not {len(file.profiles)}.")
+    _check_number(poses, (len(file.profiles),), "profiles")
     profiles, kept = [], []
     for k, p in enumerate(file.profiles):
         try:
@@ -164,21 +160,42 @@ def sphere_data(
             kept.append(k)
         except ArcNotFound as e:
             if lost is None:
-                raise ArcNotFound(f"Scan {k} shows no arc of the sphere: leave it out of the file.") from e
+                raise ArcNotFound(f"Scan {k} shows no arc of the sphere. Remove it from the file.") from e
             lost.append(k)
     if not kept:
-        raise ArcNotFound("No scan shows an arc of the sphere: check the radius, the unit and which column is z.")
+        raise ArcNotFound("No scan shows an arc of the sphere. Check the radius, the unit and which column is z.")
     q = file.arrays.get("q")
-    if q is not None and len(q) != len(poses):
-        raise InputError(f"{len(poses)} scans need as many joints q, not {len(q)}.")
+    if q is not None:
+        _check_number(poses, (len(q),), "joint vectors q")
     return SphereData(
         poses[np.array(kept)], profiles, radius, felt, tip if felt is not None else None, table,
         None if q is None else q[kept], file.arrays.get("touch_q"),
     )  # fmt: skip
 
 
+def parse_tip(text: str) -> Floats | None:
+    """The tip (3,) m of the option --tip, "x,y,z" in mm; None where it is empty.
+
+    Raises:
+        InputError: not three numbers.
+    """
+    if not text:
+        return None
+    try:
+        x, y, z = (1e-3 * float(v) for v in text.split(","))
+    except ValueError as e:
+        raise InputError(f"The tip is three numbers in mm with commas between, as --tip 0,0,150, not '{text}'.") from e
+    return np.array([x, y, z])
+
+
+def _check_number(poses: FlangePoses, shape: tuple[int, ...], what: str, each: tuple[int, ...] = ()) -> None:
+    if shape != (len(poses), *each):
+        found = str(shape[0]) if len(shape) == 1 else f"an array of shape {shape}"
+        raise InputError(f"{len(poses)} poses need {len(poses)} {what}, not {found}.")
+
+
 def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
-    """The sphere's points of a profile: all of them where they are one arc, else those that are found to be."""
+    """The sphere's points of a profile: all of them where they form one arc, else those detected."""
     p = profile[np.isfinite(profile).all(axis=1)]
     if len(p) >= 5:
         circle, rms = fit_circle(p)
@@ -190,12 +207,12 @@ def _arc(profile: Floats, radius_m: float, seed: int) -> Floats:
 def calibrate_sphere(
     data: SphereData, digest: str, sigmas: Sigmas, *, model: str = "auto", plan: int = 0, seed: int = 0
 ) -> tuple[ProfilerRecord, dict[str, Any]]:
-    """X_FS from a sphere in any poses, by the model that foretells scans left out best (or the one named)."""
+    """X_FS from a sphere in any poses, by the model with the smallest held-out error (or the one named)."""
     if model not in MODELS:
         raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
     s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
     found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
-    _refuse_turned_round(data, s)
+    _refuse_inverse_poses(data, s)
     chosen = cast(Model, model)
     if model == "auto":
         full = data.arm is not None and data.q is not None and (data.touches is None or data.touch_q is not None)
@@ -209,7 +226,7 @@ def calibrate_sphere(
     if plan:
         if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
             raise InputError(
-                "Planning needs z growing away from the sensor: turn the sign of z, and of x to keep the frame right-handed, in the file."
+                "Planning needs z pointing away from the sensor. Change the sign of z, and of x to keep the frame right-handed, in the file."
             )
         seen = np.vstack(data.profiles)
         near, far = (float(v) for v in np.percentile(seen[:, 1], [1.0, 99.0]))
@@ -227,25 +244,25 @@ def _widened(e: Estimate) -> Estimate:
     return replace(e, covariance=believed_covariance(e))
 
 
-def _refuse_turned_round(data: SphereData, s: SphereSigmas) -> None:
-    """Poses of the base in the flange instead of the flange in the base are told by what they explain.
+def _refuse_inverse_poses(data: SphereData, s: SphereSigmas) -> None:
+    """Refuses poses of the base in the flange instead of the flange in the base.
 
     Raises:
-        InputError: turned round, they explain the profiles far better.
+        InputError: the inverse poses fit the profiles far better.
     """
     scans = SphereData(data.poses, data.profiles, data.radius_m)
-    chi2 = _explained(scans, s)
+    chi2 = _rigid_chi2(scans, s)
     if chi2 < POORLY:
         return
     R, p = data.poses.rotation, data.poses.translation
     inverse = FlangePoses(np.swapaxes(R, 1, 2), -np.einsum("nji,nj->ni", R, p))
-    if _explained(replace(scans, poses=inverse), s) < 0.4 * chi2:
+    if _rigid_chi2(replace(scans, poses=inverse), s) < 0.4 * chi2:
         raise InputError(
-            "The poses explain the profiles when they are turned round: give the flange in the base, not the base in the flange."
+            "The inverses of the poses fit the profiles. Give the flange in the base, not the base in the flange."
         )
 
 
-def _explained(data: SphereData, s: SphereSigmas) -> float:
+def _rigid_chi2(data: SphereData, s: SphereSigmas) -> float:
     """Reduced chi-square of the rigid model; infinite where it refuses."""
     try:
         return sphere_joint(data, "rigid", s).reduced_chi2
@@ -257,12 +274,12 @@ def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]
     said = []
     if abs(e.radius_change_m) > max(4.0 * e.radius_sigma_m, RADIUS_OFF_M):
         said.append(
-            f"The profiles make a sphere of {1e3 * (data.radius_m + e.radius_change_m):.2f} mm rather than of "
-            f"{1e3 * data.radius_m:.2f}: check the radius and the profiler's scale."
+            f"The profiles show a sphere of {1e3 * (data.radius_m + e.radius_change_m):.2f} mm instead of "
+            f"{1e3 * data.radius_m:.2f}. Check the radius and the profiler's scale."
         )
     if e.tip is not None and data.tip is not None and np.linalg.norm(e.tip - data.tip) > 3.0 * s.tip_m:
         said.append(
-            f"The touches put the tip {1e3 * float(np.linalg.norm(e.tip - data.tip)):.0f} mm from where it was said to be: check --tip."
+            f"The touches put the tip {1e3 * float(np.linalg.norm(e.tip - data.tip)):.0f} mm from its given position. Check --tip."
         )
     return said
 
@@ -274,16 +291,15 @@ def _without_arm(data: SphereData) -> SphereData:
 def calibrate_compensate(
     file: ProfilerFile, data: SphereData, *, solve_tip: bool = False
 ) -> tuple[ProfilerRecord, dict[str, Any]]:
-    """The sphere paper's own way: centres with the sides that the file says, two linear steps, compensation by touches."""
+    """The sphere paper's method: centres on the sides given in the file, two linear steps, compensation by touches."""
     sign = file.needed(
         "sign", "on which side (+1 or -1, along y) of the scan plane each scan has the centre; 'sphere' needs none"
     )
     if data.touches is None or data.tip is None:
         raise InputError(
-            "The compensation needs touches: give 'touch_T' and 'tip' in the file, or --touches and --tip."
+            "The compensation needs touches. Give 'touch_T' and 'tip' in the file, or --touches and --tip."
         )
-    if sign.shape != (len(data.poses),):
-        raise InputError(f"{len(data.poses)} scans need as many signs, not {sign.shape}.")
+    _check_number(data.poses, sign.shape, "signs")
     if "translated" in file.arrays:
         translated = file.arrays["translated"] > 0.5
     else:
@@ -311,25 +327,17 @@ def calibrate_compensate(
         "centre_after_mm": off(best.rotation, best.translation),
         "wrong_sides": list(wrong_sides(R, t, centers, translated)),
     }
-    record = ProfilerRecord(
-        "sphere, linear and compensated",
-        best.rotation,
-        best.translation,
-        tip=felt.tip,
-        figures=found,
-        data_sha256=file.digest,
-    )
-    return record, found
+    name, pose = "sphere, linear and compensated", (best.rotation, best.translation)
+    return ProfilerRecord(name, *pose, tip=felt.tip, figures=found, data_sha256=file.digest), found
 
 
 def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, Any]:
-    """A V-groove's three features of every profile in the base frame, written as seam.csv; what was found."""
+    """Writes a V-groove's three features of every profile in the base frame as seam.csv; returns the summary."""
     record = load_record(calibration)
     if file.profiles is None:
-        raise InputError("The file has no 'profiles' of the groove: give (n, m, 2), or 'xz' with the lengths 'n'.")
+        raise InputError("The file has no 'profiles' of the groove. Give (n, m, 2), or 'xz' with the lengths 'n'.")
     poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
-    if len(poses) != len(file.profiles):
-        raise InputError(f"{len(poses)} poses need {len(poses)} profiles, not {len(file.profiles)}.")
+    _check_number(poses, (len(file.profiles),), "profiles")
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"])
@@ -345,7 +353,7 @@ def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, A
         rms.append(f.rms_m)
     if not rms:
         raise FeatureNotFound(
-            "No profile of the file shows a V-groove with plate on both sides: check the file and its unit."
+            "No profile of the file shows a V-groove with plate on both sides. Check the file and its unit."
         )
     write_atomic(folder / "seam.csv", text.getvalue())
     return {
@@ -372,19 +380,15 @@ def _figures(e: ProfilerEstimate) -> dict[str, Any]:
 
 
 def _next(candidates: FlangePoses, chosen: tuple[int, ...], rms_m: Floats) -> dict[str, Any]:
-    from scipy.spatial.transform import Rotation
-
+    turns = Rotation.from_matrix(candidates.rotation).as_rotvec()
     return {
-        "poses": [
-            [float(v) for v in (*candidates.translation[k], *Rotation.from_matrix(candidates.rotation[k]).as_rotvec())]
-            for k in chosen
-        ],
+        "poses": [[float(v) for v in (*candidates.translation[k], *turns[k])] for k in chosen],
         "rms_before_and_after_each_mm": [1e3 * float(v) for v in rms_m],
     }
 
 
 def write_calibration(record: ProfilerRecord, folder: Path) -> dict[str, Any]:
-    """profiler.yaml and X_FS.json; the pose as the JSON object has it."""
+    """Writes profiler.yaml and X_FS.json; returns the pose for the JSON object."""
     save_record(record, folder)
     return {
         "X_FS": matrix4(RigidTransform(RotationMatrix.ProjectToRotationMatrix(record.rotation), record.translation))

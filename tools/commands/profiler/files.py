@@ -1,4 +1,4 @@
-"""Measurements of a profiler from NPZ or CSV, in SI and under one set of names; docs/profiler.md has the layouts."""
+"""Reads measurements of a profiler from NPZ or CSV into SI units and one set of names (layouts: docs/profiler.md)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NEAR_M = 0.02  # nor always this near
 LONGEST_TURN = 7.0  # rad: a whole turn and a little
 FAR_M = 20.0  # no robot's flange is this far from its base
 
-# other names of the same things: of files with one axis more, for trials or worlds
+# other names of the same arrays, in files with one more axis for trials or worlds
 ALIASES = {
     "scan_T": "T", "T_base_flange": "T", "Rb": "rotation", "Tb": "translation", "ps": "points", "prof": "profiles",
     "scan_prof": "profiles", "scan_sign": "sign", "scan_q": "q", "tip_nominal": "tip",
@@ -35,7 +35,7 @@ LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 @dataclass(frozen=True, eq=False)
 class ProfilerFile:
-    """What a file holds, in m and rad; `digest` is its SHA-256."""
+    """The contents of a file, in m and rad; `digest` is its SHA-256."""
 
     arrays: dict[str, Floats]
     profiles: tuple[Floats, ...] | None
@@ -49,7 +49,7 @@ class ProfilerFile:
                 raise InputError(f"{of}T holds poses (n, 4, 4), not {T.shape}.")
             if T.shape[1] == 4 and np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > 1e-6:
                 raise InputError(
-                    f"The last row of every {of}T is 0, 0, 0, 1: turn the matrices over if they are transposed."
+                    f"The last row of every {of}T is 0, 0, 0, 1. Check whether the matrices are transposed."
                 )
             return FlangePoses.checked(T[:, :3, :3], T[:, :3, 3])
         R, t = self.arrays.get(f"{of}rotation"), self.arrays.get(f"{of}translation")
@@ -63,7 +63,7 @@ class ProfilerFile:
         """
         if name not in self.arrays:
             have = ", ".join(sorted(self.arrays)) or "nothing known"
-            raise InputError(f"The file has no '{name}', {why}; it has {have}.")
+            raise InputError(f"The file has no '{name}', {why}. It has {have}.")
         return self.arrays[name]
 
     def arm(self) -> DhArm | None:
@@ -81,10 +81,10 @@ def read_profiler_file(
         dataset: of an NPZ with several sets, the one whose names begin so; trial: which of its trials or worlds.
 
     Raises:
-        InputError: not there, not readable, a unit missing or not believable, no such set or trial.
+        InputError: missing or unreadable file, missing or implausible unit, no such set or trial.
     """
     if not path.is_file():
-        raise InputError(f"There is no file '{path}': check its name.")
+        raise InputError(f"There is no file '{path}'. Check its name.")
     if unit is not None and unit not in UNITS:
         raise InputError(f"The unit is m or mm, not '{unit}'.")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -93,18 +93,18 @@ def read_profiler_file(
     elif path.suffix.lower() == ".npz":
         arrays, profiles = _from_npz(path, unit, dataset, trial)
     else:
-        raise InputError(f"'{path.name}' is neither .npz nor .csv: give one of these.")
+        raise InputError(f"'{path.name}' is neither .npz nor .csv. Give one of these.")
     file = ProfilerFile(arrays, profiles, digest)
     X = file.poses()
     if X is None:
-        raise InputError("The file has no flange poses: give 'T', or 'rotation' and 'translation'.")
+        raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")
     if len(X) and float(np.abs(X.translation).max()) > FAR_M:
         raise InputError(
-            f"The flange would be {np.abs(X.translation).max():.0f} m from the base: give --unit mm if the lengths are in mm."
+            f"The flange would be {np.abs(X.translation).max():.0f} m from the base. Give --unit mm if the lengths are in mm."
         )
     if len(X) and float(np.abs(X.translation).max()) < NEAR_M:
         raise InputError(
-            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base: give --unit m if the lengths are in m."
+            f"The flange would be within {1e3 * np.abs(X.translation).max():.1f} mm of the base. Give --unit m if the lengths are in m."
         )
     return file
 
@@ -116,20 +116,20 @@ def _from_npz(
         with np.load(path, allow_pickle=False) as z:
             raw = {name: z[name] for name in z.files}
     except (ValueError, OSError, zipfile.BadZipFile, EOFError) as e:
-        raise InputError(f"'{path.name}' cannot be read as NPZ: write it with numpy.savez.") from e
+        raise InputError(f"'{path.name}' cannot be read as NPZ. Write it with numpy.savez.") from e
     said = str(raw.pop("unit")) if "unit" in raw else unit
     if said is None:
-        raise InputError("The file does not say its unit of length: add --unit mm or --unit m, or an entry 'unit'.")
+        raise InputError("The file does not state its unit of length. Add --unit mm or --unit m, or an entry 'unit'.")
     if said not in UNITS:
-        raise InputError(f"The file's unit is '{said}': it may be m or mm.")
+        raise InputError(f"The file's unit is '{said}'. It must be m or mm.")
     if unit is not None and unit != said:
-        raise InputError(f"The file says that its unit is {said}: leave --unit {unit} away.")
+        raise InputError(f"The file states the unit {said}. Omit --unit {unit}.")
     scale = UNITS[said]
     sets = sorted({name[: -len("_Rb")] for name in raw if name.endswith("_Rb")})
     if sets and dataset not in sets:
-        raise InputError(f"The file has several sets: choose one with --set {' | '.join(sets)}.")
+        raise InputError(f"The file has several sets. Choose one with --set {' | '.join(sets)}.")
     if dataset and not sets:
-        raise InputError(f"The file has no sets: leave --set {dataset} away.")
+        raise InputError(f"The file has no sets. Omit --set {dataset}.")
     if dataset:
         level = raw.get(f"sigma_{dataset.rsplit('_', 1)[-1]}")  # of the noise that the set is named after
         raw = {
@@ -180,9 +180,9 @@ def _of_trial(value: Floats, trial: int | None) -> Floats:
     if trial is None:
         if len(value) == 1:
             return np.asarray(value[0])
-        raise InputError(f"The file has {len(value)} trials: choose one with --trial 0 to {len(value) - 1}.")
+        raise InputError(f"The file has {len(value)} trials. Choose one with --trial 0 to {len(value) - 1}.")
     if not 0 <= trial < len(value):
-        raise InputError(f"There is no trial {trial}: the file has 0 to {len(value) - 1}.")
+        raise InputError(f"There is no trial {trial}. The file has 0 to {len(value) - 1}.")
     return np.asarray(value[trial])
 
 
@@ -202,14 +202,14 @@ def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]
         try:
             return np.array([[float(row[name] or "nan") for name in names] for row in rows])
         except ValueError as e:
-            raise InputError(f"'{path.name}' has a cell that is no number in {', '.join(names)}: {e}.") from e
+            raise InputError(f"'{path.name}' has a cell that is not a number in {', '.join(names)}: {e}.") from e
 
     pose = columns(*wanted)
     turn = float(np.nanmax(np.linalg.norm(pose[:, 3:], axis=1), initial=0.0))
     if turn > LONGEST_TURN:
         raise InputError(
-            f"The rotation vectors rx_rad, ry_rad, rz_rad of '{path.name}' are up to {turn:.0f} long, more than a whole turn: they look "
-            "like degrees; write radians."
+            f"The rotation vectors rx_rad, ry_rad, rz_rad of '{path.name}' are up to {turn:.0f} long, more than a whole turn. They seem "
+            "to be degrees; write radians."
         )
     seen = [f"px_{unit}", f"pz_{unit}"]
     points: NDArray[np.float64] | None = None

@@ -1,4 +1,4 @@
-"""What robot and profiler scatter by at an edge: as stated, as the file says, or as large as the points themselves show."""
+"""The noise of robot and profiler at an edge: as stated, or estimated from the residuals of the points."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from weldcal.calibration.profiler.errors import InconsistentData
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError, WeldcalError
 
-STARTS = (1.0, 2.0, 4.0)  # times the usual sigmas, for sensors that are that much worse
+STARTS = (1.0, 2.0, 4.0)  # times the usual sigmas, for noisier sensors
 MOST = 6.0
-SETTLED = 1.15  # residuals this many times the sigmas are what the sigmas say
+SETTLED = 1.15  # residuals up to this many times the sigmas agree with them
 
 
 @dataclass(frozen=True)
 class Sigmas:
-    """What is known of sensor and robot, m; `stated`: by a person or the file, so that points beyond them are wrong points."""
+    """Standard deviations of sensor and robot, m; `stated`: given by the user or the file, so points beyond them are outliers."""
 
     robot_m: float = 0.03e-3
     x_m: float = 0.05e-3
@@ -30,19 +30,19 @@ class Sigmas:
             raise InputError("The sigmas of x and z must be positive, and the robot's not negative.")
 
     def times(self, factor: float) -> Sigmas:
-        """All of them, larger."""
+        """All of them multiplied by a factor."""
         return Sigmas(factor * self.robot_m, factor * self.x_m, factor * self.z_m, self.stated)
 
 
 def edge_by_noise(poses: FlangePoses, points: Floats, sigmas: Sigmas) -> tuple[EdgeEstimate, Sigmas]:
-    """The joint estimate, and the sigmas that it rests on.
+    """The joint estimate, and the sigmas that it uses.
 
-    Where none were stated the usual ones are enlarged together until the residuals are no larger than they say: good points of a
-    noisier sensor must not pass for outliers, which would bias the estimate and flatter its sigma. More points must then agree, or
-    as many.
+    Where none are stated, the usual ones are scaled up together until they agree with the residuals: otherwise good points
+    of a noisier sensor would be rejected as outliers, which biases the estimate and makes its sigma too small. A larger scale
+    is kept only if no inlier is lost.
 
     Raises:
-        What edge_joint raises; InconsistentData only where the points lie on no edge by the enlarged ones either.
+        InconsistentData: the points lie on no edge, with the enlarged sigmas either; others as edge_joint.
     """
 
     def fit(factor: float) -> EdgeEstimate:

@@ -1,4 +1,4 @@
-"""weldcal tablet calibrate: touches in, camera and pen out, with what is left out and what is left open."""
+"""`weldcal tablet calibrate`: calibrates camera and pen from the touches of one visit or of many."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from weldcal.tools.report.tablet import Shown, calibration_report, marked_pictur
 
 @dataclass(frozen=True)
 class TabletInputs:
-    """The files of one visit, and what is known besides."""
+    """The files of one visit, and the known quantities."""
 
     file: Path
     poses: Path | None = None
@@ -37,15 +37,15 @@ class TabletInputs:
     look: str = "rings"
     pen_length_m: float | None = None
     pen_radius_m: float = 0.0
-    hand_step_m: float | None = None  # None: found in the hands themselves
+    hand_step_m: float | None = None  # None: detected
     printed_sign: bool = False
     two_stages: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class TabletCalibration:
-    """The result, what its report draws, the fit with full poses where it is one, the step of the hand's readings and what the
-    file's queries miss by where it is none, and how long the work took."""
+    """The result, the data of its report, the fit with full poses where it is one; else the rounding step of the hand and the
+    errors at the file's queries; and the duration."""
 
     result: TabletResult
     shown: Shown
@@ -87,13 +87,14 @@ class TabletCalibration:
 def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | ManyVisits:
     """Calibrate from the files and write the result folder; a file of many visits gives each of them, and all together.
 
-    Raises InputError and its kin: one sentence that says what to change; nothing is written then.
+    Raises:
+        InputError and other WeldcalErrors: the files cannot be used; nothing is written.
     """
     if not inputs.file.is_file():
-        raise InputError(f"There is no file '{inputs.file}': give the page's CSV, or an npz of planar touches.")
+        raise InputError(f"There is no file '{inputs.file}'. Give the page's CSV, or an npz of planar touches.")
     if inputs.file.suffix.lower() not in (".npz", ".csv"):
         raise InputError(
-            f"'{inputs.file.name}' is neither .csv nor .npz: give the page's CSV, or an npz of planar touches."
+            f"'{inputs.file.name}' is neither .csv nor .npz. Give the page's CSV, or an npz of planar touches."
         )
     start = time.perf_counter()
     made = _planar(inputs) if inputs.file.suffix.lower() == ".npz" else _wrist(inputs)
@@ -104,9 +105,7 @@ def calibrate_tablet(inputs: TabletInputs, folder: Path) -> TabletCalibration | 
 
 def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
     if any(path is not None for path in (inputs.poses, inputs.camera, inputs.image, inputs.seen)):
-        raise InputError(
-            "An npz file holds everything: leave --poses, --camera, --image and --seen out, or give the CSV."
-        )
+        raise InputError("An npz file is complete. Omit --poses, --camera, --image and --seen, or give the CSV.")
     read = load_planar(inputs.file)
     visits = read.visits
     step_m = hand_step_m(visits) if inputs.hand_step_m is None else inputs.hand_step_m
@@ -114,7 +113,7 @@ def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
     if len(visits) + len(read.refused) > 1:
         if inputs.two_stages:
             raise InputError(
-                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits; --two-stages is for a file of one."
+                f"'{inputs.file.name}' holds {len(visits) + len(read.refused)} visits. --two-stages needs a file with one."
             )
         return fit_many(inputs.file, read, sign, step_m)
     found = fit_visit(visits[0], sign, step_m)
@@ -136,7 +135,7 @@ def _planar(inputs: TabletInputs) -> TabletCalibration | ManyVisits:
 
 
 def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
-    """The paper's scheme in the paper's search ranges (Table 5), which hold for a rig like the paper's."""
+    """The paper's scheme in its search ranges (Table 5), for a setup like the paper's."""
     first = tablet_stage1(touches, sign=sign)
     second = tablet_stage2(touches, first.parameters, sign=sign)
     return {
@@ -150,7 +149,7 @@ def _two_stages(touches: TabletTouches, sign: Sign) -> dict[str, object]:
 def _wrist(inputs: TabletInputs) -> TabletCalibration:
     if inputs.poses is None or inputs.camera is None:
         raise InputError(
-            "Touches in a CSV need the robot's poses (--poses FILE) and the camera's numbers (--camera FILE)."
+            "Touches in a CSV need the robot's poses (--poses FILE) and the camera's intrinsics (--camera FILE)."
         )
     if inputs.two_stages or inputs.printed_sign or inputs.hand_step_m:
         raise InputError("--two-stages, --printed-sign and --hand-step-mm belong to planar touches in an npz file.")
@@ -200,5 +199,5 @@ def _lengths_mm(errors_m: np.ndarray) -> list[float]:
 
 
 def _finite(values: list[float]) -> list[float | None]:
-    """The values, None where a landmark could not be left out; empty where none could."""
+    """The values, None where a landmark could not be held out; empty where none could."""
     return [v if np.isfinite(v) else None for v in values] if np.isfinite(values).any() else []

@@ -1,4 +1,4 @@
-"""Planar touches of one visit or of many: every model that fits them, the one that predicts best, and what looks wrong."""
+"""Fits every model to planar touches, selects the one with the smallest held-out error, and detects mistakes in the data."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Array = NDArray[np.float64]
 PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"
 NAMES = {PNP: PLANAR_NAMES, FREE: PLANAR_NAMES, LINEAR: LINEAR_NAMES}
 
-_SCALE_SIGMAS = 3.0  # a free scale farther from 1 than this, and than a quarter of a percent, is told
+_SCALE_SIGMAS = 3.0  # a scale is reported if it differs from 1 by more than this and by a quarter of a percent
 _SCALE_LEAST = 2.5e-3
 _OTHER_UNIT = 5.0  # lengths that differ by more than this factor are in different units
-_BETTER = 0.4  # what a changed sign must leave of the residuals to be told
-_BAD_M = 2e-3  # residuals above this are no noise
-_CONTRADICTION = 0.1  # residuals that are this share of the landmarks' spread are no calibration
-_LIKE_A_UNIT = 0.2  # of the logarithm: a factor this near one of units is one
+_BETTER = 0.4  # a changed sign is reported if the residuals fall below this share
+_BAD_M = 2e-3  # residuals above this are not noise
+_CONTRADICTION = 0.1  # residuals of this share of the landmarks' spread: refused
+_LIKE_A_UNIT = 0.2  # in the logarithm: a factor this near a ratio of units
 _ONE_ORDER = "check that uv, hand, theta_deg, delta_px and tablet_px hold the landmarks in one order"
-_LEAST_TO_DOUBT = 6  # landmarks, so that five still check each other when one is doubted
-_LEAST_DOUBTED_M = 0.5e-3  # residuals below this are nobody's mistake
+_LEAST_FOR_OUTLIER = 6  # landmarks, so that five remain without one
+_LEAST_OUTLIER_M = 0.5e-3  # residuals below this are noise
 
 
 @dc.dataclass(frozen=True, eq=False)
 class VisitFits:
-    """The fits of one visit by model, and the warnings about it; `step_m` of the hand's readings, 0 where it is fine."""
+    """The fits of one visit by model, and the warnings about it; `step_m`: rounding step of the hand, 0 for none."""
 
     visit: PlanarVisit
     fits: dict[str, PlanarFit | LinearFit]
@@ -41,16 +41,16 @@ class VisitFits:
     step_m: float
 
     def in_page(self, hand_m: Array) -> Array:
-        """Differences of hands (n, 2) m as they lie on the page."""
+        """Differences of hand positions (n, 2) m in the axes of the page."""
         phi = self.fits[PNP].parameters[0]
         return np.asarray(hand_m @ np.array([[np.cos(phi), np.sin(phi)], [np.sin(phi), -np.cos(phi)]]))
 
     def left_out_mm(self, model: str) -> Array:
-        """What each left-out landmark misses by, (n,) mm; NaN where it could not be left out."""
+        """Error of each held-out landmark, (n,) mm; NaN where it could not be held out."""
         return np.asarray(1e3 * np.linalg.norm(self.fits[model].leave_one_out_m, axis=1))
 
     def held_out_mm(self, model: str) -> Array:
-        """What the queries miss by, (q,) mm; empty where there are none."""
+        """Errors at the queries, (q,) mm; empty where there are none."""
         queries, touches = self.visit.queries, self.visit.touches
         if queries is None:
             return np.zeros(0)
@@ -60,9 +60,10 @@ class VisitFits:
 
 
 def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool = True) -> VisitFits:
-    """Fit every model; `thorough` leaves landmarks out of the interval fit too, else of least squares (twenty times faster).
+    """Fit every model; `thorough` cross-validates the interval fit too, else least squares only (twenty times faster).
 
-    Raises what check_touches and tablet_pose raise, and InputError where lengths are in different units.
+    Raises:
+        InputError: lengths are in different units; others as check_touches and tablet_pose.
     """
     touches = visit.touches
     fits: dict[str, PlanarFit | LinearFit] = {}
@@ -75,27 +76,27 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
     if abs(scale - 1.0) > max(_SCALE_SIGMAS * deviation, _SCALE_LEAST):
         fits[FREE] = _fit_planar(touches, dc.replace(config, free_scale=True), thorough)
         warnings.append(
-            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (deviation {100 * deviation:.1f} %): check the "
+            f"Tablet and robot differ by {100 * (scale - 1.0):+.1f} % in length (sigma {100 * deviation:.1f} %). Check the "
             "page's size with a card, or the tablet's pixels per inch."
         )
     if visit.excluded:
         rows = ", ".join(map(str, visit.excluded))
-        warnings.append(f"Left out, for want of finite numbers: landmark {rows}.")
+        warnings.append(f"Not used, because a number is not finite: landmark {rows}.")
     odd = _other_signs(touches, sign, planar.sigma_m) + _odd_landmarks(visit, planar, config)
     if not odd:
         _refuse_contradictions(fits, touches)
         odd = _mirrored(touches)
     if planar.sigma_m > _BAD_M and not odd:
-        odd = [f"The touches fit to {1e3 * planar.sigma_m:.1f} mm only: {_ONE_ORDER}."]
+        odd = [f"The touches fit to {1e3 * planar.sigma_m:.1f} mm only; {_ONE_ORDER}."]
     warnings += odd
     return VisitFits(visit, fits, tuple(warnings), step_m)
 
 
 def best_model(visits: Sequence[VisitFits]) -> tuple[str, dict[str, float]]:
-    """The model that misses left-out landmarks least, over all visits, and every model's mean miss (mm; NaN: nothing left out).
+    """The model with the smallest held-out error over all visits, and every model's mean held-out error (mm; NaN: none).
 
-    A scale is only freed where every visit asks for it. Only landmarks that every model could do without are compared; with
-    four there are none, and it is PnP then.
+    A free scale is a candidate only if every visit needs it. Only landmarks that every model could hold out are compared;
+    with four landmarks there are none, and PnP is chosen.
     """
     models = [m for m in (PNP, LINEAR, FREE) if all(m in v.fits for v in visits)]
     left = {m: np.concatenate([v.left_out_mm(m) for v in visits]) for m in models}
@@ -116,33 +117,33 @@ def _same_units(planar: PlanarFit) -> None:
     if not 1.0 / _OTHER_UNIT < scale < _OTHER_UNIT:
         unit = min(abs(np.log(scale * k)) for k in (1e3, 1e-3, 10.0, 0.1, 25.4, 1 / 25.4)) < _LIKE_A_UNIT
         raise InputError(
-            f"The hand moved {scale:.3g} times as far as the tablet's landmarks lie apart: write hand and hand_capture in "
+            f"The hand moved {scale:.3g} times as far as the distance of the tablet's landmarks. Write hand and hand_capture in "
             "millimetres, and mm_per_px in millimetres per pixel of tablet_px."
             if unit
-            else f"Hands and landmarks do not belong together (the hand moved {scale:.3g} times as far): {_ONE_ORDER}."
+            else f"Hands and landmarks do not fit (the hand moved {scale:.3g} times as far); {_ONE_ORDER}."
         )
 
 
 def _refuse_contradictions(fits: Mapping[str, PlanarFit | LinearFit], touches: TabletTouches) -> None:
-    """Touches that no model explains are no calibration.
+    """Refuses touches that no model fits.
 
     Raises:
-        InputError: what is left of them is a good part of where they are.
+        InputError: the residuals are a large share of the landmarks' spread.
     """
     left, spread = min(fit.sigma_m for fit in fits.values()), _spread_m(touches)
     if left > _CONTRADICTION * spread:
         raise InputError(
-            f"The touches contradict each other: they fit to {1e3 * left:.0f} mm only, on landmarks {1e3 * spread:.0f} mm from their "
-            f"middle: {_ONE_ORDER}, x before y."
+            f"The touches contradict each other: they fit to {1e3 * left:.0f} mm only, with landmarks {1e3 * spread:.0f} mm from their "
+            f"centre. Please {_ONE_ORDER}, x before y."
         )
 
 
 def _mirrored(touches: TabletTouches) -> list[str]:
-    """A camera sees a page from its front: what runs clockwise on the page does so in the picture."""
+    """Detects a mirrored image: a camera sees the page from its front, so orientations are preserved."""
     page = np.column_stack([touches.landmark_px, np.ones(len(touches.landmark_px))])
     turned = np.linalg.det(np.linalg.lstsq(page, touches.uv_px, rcond=None)[0][:2])
     return [
-        "uv shows the page as in a mirror: u and v are exchanged, or one of them is counted the other way. Check the file."
+        "uv shows a mirrored page: u and v are exchanged, or one of them has the wrong sign. Check the file."
     ] * bool(turned < 0.0)
 
 
@@ -151,7 +152,7 @@ def _spread_m(touches: TabletTouches) -> float:
 
 
 def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str]:
-    """What would fit far better if a sign were otherwise, in sentences."""
+    """Sentences on signs whose reversal fits far better."""
     flip = np.array([1.0, -1.0])
     extent = touches.landmark_px.max(axis=0) + touches.landmark_px.min(axis=0)
     turned = {
@@ -180,9 +181,9 @@ def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str
 
 
 def _odd_landmarks(visit: PlanarVisit, planar: PlanarFit, config: PlanarConfig) -> list[str]:
-    """A landmark without which all the others fit far better: touched, or read, wrongly."""
+    """A landmark without which all the others fit far better: touched or read wrongly."""
     touches, number = visit.touches, same_landmark(visit.touches.landmark_px)
-    if number.max() + 1 < _LEAST_TO_DOUBT:
+    if number.max() + 1 < _LEAST_FOR_OUTLIER:
         return []
     squares = dc.replace(config, step_m=0.0)
     left = []
@@ -192,10 +193,10 @@ def _odd_landmarks(visit: PlanarVisit, planar: PlanarFit, config: PlanarConfig) 
         except WeldcalError:  # it alone spans the plane, or turns the hand
             left.append(np.inf)
     worst = int(np.argmin(left))
-    if left[worst] > _BETTER * planar.sigma_m or planar.sigma_m < _LEAST_DOUBTED_M:
+    if left[worst] > _BETTER * planar.sigma_m or planar.sigma_m < _LEAST_OUTLIER_M:
         return []
     row = visit.rows[int(np.nonzero(number == worst)[0][0])]
     return [
         f"Without landmark {row} the others fit to {1e3 * left[worst]:.2f} mm instead of {1e3 * planar.sigma_m:.2f}: touch it again, "
-        "or leave it out."
+        "or remove it."
     ]

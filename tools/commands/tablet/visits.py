@@ -1,4 +1,4 @@
-"""Many visits of one file: each calibrated by itself, by the model that predicts best over all of them, and what they come to."""
+"""Calibrates each visit of a file by itself, with the model that has the smallest held-out error over all of them."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.report.render import fixed, render, write_atomic
+from weldcal.tools.report.results import error_summary
 from weldcal.tools.report.tablet import Page
 
 Array = NDArray[np.float64]
@@ -27,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ManyVisits:
-    """The fits of all visits that could be fitted, the ones that could not with the reason, and the model chosen for all."""
+    """The fits of all visits, the refused visits with the reason, and the model chosen for all."""
 
     file: Path
     visits: tuple[VisitFits, ...]
@@ -38,13 +39,13 @@ class ManyVisits:
     seconds: float = 0.0
 
     def held_out_mm(self, model: str) -> Array:
-        """What the queries of all visits miss by, mm; empty where there are none."""
+        """Errors at the queries of all visits, mm; empty where there are none."""
         return np.concatenate([v.held_out_mm(model) for v in self.visits])
 
     def summary(self) -> dict[str, object]:
         """The JSON object of `tablet calibrate` for such a file."""
         others = {m: error_figures(self.held_out_mm(m)) for m in self.errors_mm if m != self.model}
-        told = sorted({text for v in self.visits for text in v.warnings})
+        warnings = sorted({text for v in self.visits for text in v.warnings})
         return {
             "state": "done",
             "model": self.model,
@@ -55,7 +56,7 @@ class ManyVisits:
             "held_out_mm": error_figures(self.held_out_mm(self.model)),
             "held_out_of_other_models_mm": {m: f["mean"] for m, f in others.items() if f is not None},
             "hand_step_mm": 1e3 * self.step_m,
-            "n_warnings": len(told),
+            "n_warnings": len(warnings),
             "visits": [self._visit(v) for v in self.visits],
             "seconds": self.seconds,
         }
@@ -86,28 +87,26 @@ class ManyVisits:
 
     def _report(self) -> str:
         held, left = error_figures(self.held_out_mm(self.model)), self.errors_mm[self.model]
-        cards = [
-            ("Left-out landmark, mean", fixed(left, 3), "mm", "plain", "each predicted by a fit that never saw it")
-        ]
+        cards = [("Held-out landmark, mean", fixed(left, 3), "mm", "plain", "each predicted by a fit without it")]
         if held is not None:
-            worst = f"largest {fixed(held['max'], 3)}; never used"
+            worst = f"largest {fixed(held['max'], 3)}; not used in the fit"
             cards.insert(0, ("The file's queries, mean", fixed(held["mean"], 3), "mm", "good", worst))
         cards.append(("Visits", str(len(self.visits)), "", "plain", f"{len(self.refused)} refused"))
         rows = [
             (v["id"], fixed(v["held_out_mm"], 3), fixed(v["leave_one_out_mm"], 3), fixed(v["residual_mm"], 3), str(v["n_landmarks"]))
             for v in map(self._visit, self.visits)
         ]  # fmt: skip
-        told = [(f"Visit {v.visit.name}: {text}") for v in self.visits for text in v.warnings]
+        warnings = [f"Visit {v.visit.name}: {text}" for v in self.visits for text in v.warnings]
         models = ", ".join(f"{m} {fixed(e, 3)} mm" for m, e in self.errors_mm.items())
         return render(
             "tablet.html.j2",
             page=Page(
-                title="Camera and pen by a tablet, visit by visit",
-                subtitle=f"{self.file.name}: {len(self.visits)} visits; left-out landmarks by model: {models}.",
-                verdict=("warn" if self.refused else "good", f"{len(self.visits)} visits are calibrated", f"Model: {self.model}."),
+                title="Calibration of camera and pen by a tablet: all visits",
+                subtitle=f"{self.file.name}: {len(self.visits)} visits. Held-out landmarks by model: {models}.",
+                verdict=("warn" if self.refused else "good", f"{len(self.visits)} visits calibrated", f"Model: {self.model}."),
                 cards=cards,
-                notes=[*(f"Visit {name} is refused: {reason}" for name, reason in self.refused), *told],
-                header=("visit", "queries, mm", "left out, mm", "fit, mm", "landmarks"),
+                notes=[*(f"Visit {name} was refused: {reason}" for name, reason in self.refused), *warnings],
+                header=("visit", "queries, mm", "held out, mm", "fit, mm", "landmarks"),
                 rows=rows,
                 provenance=[
                     ("software", software_version()),
@@ -120,20 +119,14 @@ class ManyVisits:
 
 def error_figures(errors_mm: Array) -> dict[str, float] | None:
     """Median, mean, 95th percentile and maximum of errors (n,) mm; None where there are none."""
-    if errors_mm.size == 0:
-        return None
-    return {
-        "median": float(np.median(errors_mm)),
-        "mean": float(errors_mm.mean()),
-        "p95": float(np.percentile(errors_mm, 95)),
-        "max": float(errors_mm.max()),
-    }
+    return error_summary(errors_mm) if errors_mm.size else None
 
 
 def fit_many(file: Path, read: PlanarFile, sign: Sign, step_m: float) -> ManyVisits:
-    """Fit every visit by itself; one that cannot be is refused with its reason.
+    """Fit every visit by itself; a visit that cannot be fitted is refused with the reason.
 
-    Raises the first refusal where no visit can be fitted.
+    Raises:
+        WeldcalError: no visit can be fitted; the first refusal.
     """
     fitted, refused, first = [], list(read.refused), None
     for visit in read.visits:

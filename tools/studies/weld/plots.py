@@ -60,6 +60,6 @@ def weld_trace(run: StudyRun, config: ServoConfig) -> WeldTrace:
         omega_max=config.limits.omega_max_rad_s,
         work=work,
         travel=travel,
-        foretold=predicted,
+        predicted=predicted,
         windows=(config.windows.work_rad, config.windows.travel_rad),
     )

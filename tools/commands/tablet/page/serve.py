@@ -1,4 +1,4 @@
-"""Hands the page to a tablet, and takes its touches back as a CSV file; loopback unless told otherwise."""
+"""Serves the page to a tablet and receives its touches as a CSV file; on loopback by default."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def page() -> str:
 
 
 class TabletServer(ThreadingHTTPServer):
-    """One page to get, one kind of file to take: touches of a tablet, each into the next free name of a folder."""
+    """Serves one page and receives touches, each written to the next free file name of a folder."""
 
     daemon_threads = True
 
@@ -51,21 +51,21 @@ class _Handler(BaseHTTPRequestHandler):
         if self.path.split("?")[0] in ("/", "/tablet.html"):
             self._answer(HTTPStatus.OK, self.server.html, "text/html; charset=utf-8")
         else:
-            self._say(HTTPStatus.NOT_FOUND, "There is only one page here.")
+            self._say(HTTPStatus.NOT_FOUND, "There is only one page.")
 
     def do_POST(self) -> None:
-        # a page of somebody else cannot send this content type without asking first, and it is not answered
+        # a foreign page cannot send this content type without a preflight request, which is not answered
         if self.path != "/touches" or self.headers.get_content_type() != "text/csv":
-            return self._say(HTTPStatus.NOT_FOUND, "Only touches are taken here.")
+            return self._say(HTTPStatus.NOT_FOUND, "Only touches are accepted.")
         try:
             length = int(self.headers.get("Content-Length", ""))
         except ValueError:
             return self._say(HTTPStatus.LENGTH_REQUIRED, "The length is missing.")
         if not 0 < length <= LARGEST_CSV:
-            return self._say(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "That is no list of touches.")
+            return self._say(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "This is not a list of touches.")
         text = self.rfile.read(length).decode("utf-8", errors="replace")
         if not text.startswith(FIRST_COLUMNS):
-            return self._say(HTTPStatus.BAD_REQUEST, "That is no list of touches.")
+            return self._say(HTTPStatus.BAD_REQUEST, "This is not a list of touches.")
         path = self.server.take(text)
         return self._say(HTTPStatus.OK, f"Written to {path.name} on the computer.")
 
@@ -86,24 +86,25 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def open_server(host: str, port: int, folder: Path, said: Callable[[str], None]) -> TabletServer:
-    """A server that listens, not yet serving; port 0 takes any free one.
+    """A server that listens but does not serve yet; port 0 takes any free one.
 
-    Raises InputError: the port is taken or may not be used, or the host is no address of this machine.
+    Raises:
+        InputError: the port is in use or not allowed, or the host is not an address of this machine.
     """
     try:
         return TabletServer(host, port, folder, said)
     except OSError as error:
         if error.errno == errno.EADDRINUSE:
-            raise InputError(f"Port {port} is taken on {host}; choose another with --port.") from error
+            raise InputError(f"Port {port} is in use on {host}. Choose another with --port.") from error
         if error.errno in (errno.EACCES, errno.EPERM):
-            raise InputError(f"Port {port} may not be used; choose one above 1023 with --port.") from error
-        raise InputError(f"'{host}' is no address of this machine; give one with --host.") from error
+            raise InputError(f"Port {port} may not be used. Choose one above 1023 with --port.") from error
+        raise InputError(f"'{host}' is not an address of this machine. Give one with --host.") from error
     except OverflowError as error:
         raise InputError("The port must be from 0 to 65535.") from error
 
 
 def addresses(host: str, port: int) -> list[str]:
-    """What to type on the tablet."""
+    """The addresses to open on the tablet."""
     if not _unspecified(host):
         return [f"http://{f'[{host}]' if ':' in host else host}:{port}/"]
     # connecting a datagram socket sends nothing, and tells which of this machine's addresses would be used
@@ -132,12 +133,12 @@ def _unspecified(host: str) -> bool:
 
 
 def run_server(host: str, port: int, folder: Path, said: Callable[[str], None]) -> None:
-    """Serve until interrupted; says the address, and every file that comes back."""
+    """Serve until interrupted; reports the address and every received file."""
     with open_server(host, port, folder, said) as server:
         for address in addresses(host, server.server_address[1]):
-            said(f"Open {address} on the tablet; stop with Ctrl+C.")
+            said(f"Open {address} on the tablet. Stop with Ctrl+C.")
         if is_loopback(host):
-            said("Only this machine can reach it; for a tablet in the network give --host 0.0.0.0.")
+            said("Only this machine can reach it. For a tablet in the network give --host 0.0.0.0.")
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:

@@ -1,18 +1,14 @@
-"""The verification report: errors per scan against what the calibration stated, and where in the field of view they
-lie."""
+"""The report page of `weldcal verify`: errors per scan against the stated ones, and over the field of view."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
+from weldcal.tools.report.flange_features import fit_cells
 from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, render
-
-if TYPE_CHECKING:
-    from weldcal.tools.commands.verify import VerifyReport
+from weldcal.tools.report.results import VerifyReport
 
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:
@@ -26,15 +22,13 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
     stated_tilt = report.result.tilt_deg.get("median")
     rows = []
     for p in report.poses:
-        fit = report.fits.get(p.id)
         rows.append(
             (
                 p.id,
                 "in the calibration" if p.used_before else "new",
                 fixed(p.error_mm, 3),
                 fixed(p.tilt_deg, 3),
-                "–" if fit is None else fixed(1e3 * float(np.sqrt(np.trace(fit.center_covariance))), 3),
-                "–" if fit is None else fixed(100 * fit.coverage, 0),
+                *fit_cells(report.fits.get(p.id)),
             )
         )
     return render(

@@ -1,35 +1,28 @@
-"""The calibration report: its pictures and the page around them."""
+"""The report page of `weldcal calibrate`, with its plots and tables."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose
 from weldcal.calibration.eye_on_base.solve import point_error_covariance
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.tools.report.flange_features import HEADER, feature_table
-from weldcal.tools.report.pictures import OURS, error_bars, error_field, svg
-from weldcal.tools.report.plots_advice import knowledge_map
-from weldcal.tools.report.render import fixed, render
-
-if TYPE_CHECKING:
-    from weldcal.tools.commands.calibrate import CalibrationReport
-
-Array = NDArray[np.float64]
-
-_THEIRS, _TRUTH = "#b08a2e", "#a8402f"
+from weldcal.tools.report.calibration_map import knowledge_map
+from weldcal.tools.report.flange_features import HEADER, feature_table, fit_cells
+from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, Array, error_bars, error_field, svg
+from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.results import CalibrationReport
 
 
 def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
     """The whole report as one self-contained HTML text."""
     r = report.result
     used = report.estimate.inliers
-    middle = np.mean([o.p_BR for o, keep in zip(report.observations, used, strict=True) if keep], axis=0)
+    kept = [o for o, keep in zip(report.observations, used, strict=True) if keep]
+    p_B = np.array([o.p_BR for o in kept])
+    middle, held_out = p_B.mean(axis=0), 1e3 * report.estimate.held_out.position_m
     work_sigma = 1e3 * float(np.sqrt(np.trace(point_error_covariance(report.estimate, middle))))
     sigma = np.sqrt(np.diag(r.covariance))
     return render(
@@ -47,14 +40,11 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         refused=report.refused,
         matrix=[[fixed(float(v), 6) for v in row] for row in r.X_BC.GetAsMatrix4()],
         pose_facts=[
-            ("position, mm", "  ".join(fixed(float(1e3 * v), 3) for v in r.X_BC.translation())),
-            ("one sigma, mm", "  ".join(fixed(float(1e3 * v), 3) for v in sigma[3:])),
-            (
-                "rotation vector, deg",
-                "  ".join(fixed(float(np.degrees(v)), 4) for v in rotation_vector(r.X_BC.rotation())),
-            ),
-            ("one sigma, deg", "  ".join(fixed(float(np.degrees(v)), 4) for v in sigma[:3])),
-            ("spread of robot and scanner, per axis", f"{r.sigma_position_mm:.3f} mm"),
+            ("position, mm", fixed_row(1e3 * r.X_BC.translation(), 3)),
+            ("one sigma, mm", fixed_row(1e3 * sigma[3:], 3)),
+            ("rotation vector, deg", fixed_row(np.degrees(rotation_vector(r.X_BC.rotation())), 4)),
+            ("one sigma, deg", fixed_row(np.degrees(sigma[:3]), 4)),
+            ("noise per axis, one sigma", f"{r.sigma_position_mm:.3f} mm"),
             *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
             ("URScript", export_ur_pose(r.X_BC).strip()),
@@ -64,11 +54,11 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         algorithm1=report.algorithm1,
         k_fold=report.k_fold_mm,
         convergence=_convergence(report),
-        residuals=_residual_bars(report),
-        field=_residual_field(report),
+        residuals=error_bars([o.id for o in report.observations], held_out, used, "held-out error, mm"),
+        field=error_field(report.estimate.X_BC, kept),
         seconds=report.seconds,
         advice=report.advice,
-        knowledge=_knowledge(report),
+        knowledge=None if len(p_B) < 2 else knowledge_map(report.estimate, p_B),
     )
 
 
@@ -76,19 +66,13 @@ def _axis_turn(turn: tuple[float, float] | None) -> list[tuple[str, str]]:
     if turn is None:
         return []
     return [
-        ("holes turned about the flange's axis", f"{turn[0]:.2f} deg (spread {turn[1]:.2f}); --axis-turn next time")
+        ("rotation of the holes about the flange axis", f"{turn[0]:.2f} deg (spread {turn[1]:.2f}), for --axis-turn")
     ]
-
-
-def _knowledge(report: CalibrationReport) -> bytes | None:
-    p = np.array([o.p_BR for o, keep in zip(report.observations, report.estimate.inliers, strict=True) if keep])
-    return None if len(p) < 2 else knowledge_map(report.estimate, p)
 
 
 def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for p in report.result.poses:
-        fit = report.fits.get(p.id)
         rows.append(
             (
                 p.id,
@@ -96,8 +80,7 @@ def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
                 fixed(p.held_out_mm, 3),
                 fixed(p.residual_mm, 3),
                 fixed(p.held_out_tilt_deg, 3),
-                "–" if fit is None else fixed(1e3 * float(np.sqrt(np.trace(fit.center_covariance))), 3),
-                "–" if fit is None else fixed(100 * fit.coverage, 0),
+                *fit_cells(report.fits.get(p.id)),
                 p.reason,
             )
         )
@@ -105,7 +88,7 @@ def _pose_table(report: CalibrationReport) -> list[tuple[str, ...]]:
 
 
 def _scanner_rows(report: CalibrationReport) -> list[tuple[str, ...]]:
-    """What each source says of the scanner: scale error and gradient, per cent, with one sigma."""
+    """The scanner's scale error and gradient by each source, per cent, with one sigma."""
     if report.scanner is None:
         return []
     rows: list[tuple[str, ...]] = []
@@ -127,9 +110,9 @@ def _convergence(report: CalibrationReport) -> bytes:
     c = report.convergence
     figure = Figure(figsize=(8.2, 3.9), layout="constrained")
     axes = figure.subplots()
-    _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on scans not used yet")
-    _band(axes, c.counts, 1e3 * c.figure_true, _TRUTH, "Algorithm 1, on scans not used yet")
-    _band(axes, c.counts, 1e3 * c.figure, _THEIRS, "Algorithm 1's own figure")
+    _band(axes, c.counts, 1e3 * c.held_out, OURS, "this calibration, on unused scans")
+    _band(axes, c.counts, 1e3 * c.figure_true, TRUTH, "Algorithm 1, on unused scans")
+    _band(axes, c.counts, 1e3 * c.figure, THEIRS, "figure reported by Algorithm 1")
     axes.set_xlabel("number of scans")
     axes.set_ylabel("error at the flange, mm")
     axes.set_ylim(bottom=0.0)
@@ -147,15 +130,3 @@ def _band(axes: Axes, x: Array, y: Array, color: str, label: str) -> None:
     y = np.where(np.isfinite(y), y, np.nan)[:, good]
     axes.plot(x[good], np.nanmedian(y, axis=0), color=color, marker="o", markersize=3.5, linewidth=1.8, label=label)
     axes.fill_between(x[good], *np.nanpercentile(y, (25, 75), axis=0), color=color, alpha=0.13, linewidth=0)
-
-
-def _residual_bars(report: CalibrationReport) -> bytes:
-    e = report.estimate
-    ids = [o.id for o in report.observations]
-    return error_bars(ids, 1e3 * e.held_out.position_m, e.inliers, "held-out error, mm")
-
-
-def _residual_field(report: CalibrationReport) -> bytes:
-    """Residuals of the poses used, in the camera frame."""
-    kept = [o for o, keep in zip(report.observations, report.estimate.inliers, strict=True) if keep]
-    return error_field(report.estimate.X_BC, kept)

@@ -1,4 +1,4 @@
-"""Where a scanned point is known how well, the poses taken so far, and where the next one tells most."""
+"""The map of the uncertainty of a scanned point, with the poses taken and the most informative next place."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def knowledge_map(estimate: CalibrationEstimate, p_B: Array) -> bytes:
             color="#e0872f",
             markeredgecolor="#222",
             markersize=15,
-            label="tells most next",
+            label="best next pose",
         )
         axes.set_xlabel(f"base {'xyz'[i]}, mm")
         axes.set_ylabel(f"base {'xyz'[j]}, mm")

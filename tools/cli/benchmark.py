@@ -1,0 +1,159 @@
+"""weldcal benchmark: speed and accuracy of each part but the flange fit, in simulation and on recorded data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from weldcal.tools.cli.options import Call, Outcome, ScenarioOption, command
+
+
+@command("benchmark tablet")
+def tablet(call: Call) -> Mapping[str, object]:
+    """Time each tablet calibration and compare it with the published search."""
+    from weldcal.tools.studies.tablet.speed import run_tablet_benchmark
+
+    return run_tablet_benchmark(call.folder("benchmark", "tablet"), call.seed, call.progress)
+
+
+@command("benchmark seam-planning")
+def seam_planning(
+    call: Call,
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Random poses of each part.")] = 2,
+    preset: Annotated[
+        list[str] | None,
+        typer.Option("--preset", metavar="NAME", help="A scanner; repeat for more.", show_default="all"),
+    ] = None,
+    full: Annotated[
+        bool, typer.Option("--full-resolution", help="Images of the scanner's full width, not 824 pixels at most.")
+    ] = False,
+    troubles: Annotated[
+        bool, typer.Option("--troubles/--no-troubles", help="Also test occlusion, clutter and wrong workpieces.")
+    ] = True,
+) -> Outcome:
+    """Measure the error of a seam planned from one scan, with and without a drawing, for each scanner."""
+    from weldcal.models.scanners import get_scanner
+    from weldcal.tools.studies.seam_planning.benchmark import run_seam_planning_benchmark
+
+    folder = call.folder("benchmark", "seam-planning")
+    names = [get_scanner(name).name for name in preset] if preset else None
+    summary, rows = run_seam_planning_benchmark(
+        folder, runs, call.seed, names, call.progress, full=full, troubles=troubles
+    )
+    return Outcome(summary, rows=rows)
+
+
+@command("benchmark hand-eye")
+def hand_eye(
+    call: Call,
+    data: Annotated[
+        Path | None, typer.Option("--data", metavar="FOLDER", help="A folder of sets, each a folder with pairs.npz.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few trials of each kind: seconds instead of minutes.")
+    ] = False,
+) -> Outcome:
+    """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation: outliers, invariance,
+    uncertainty, speed."""
+    from weldcal.tools.studies.hand_eye.comparison import run_hand_eye_benchmark, write_table
+
+    folder = call.folder("benchmark", "hand-eye")
+    result = run_hand_eye_benchmark(data, quick=quick, seed=call.seed, progress=call.progress)
+    return Outcome(result.summary(), text=write_table(result, folder))
+
+
+@command("benchmark mountings")
+def mountings(
+    call: Call,
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Number of seeds of each.")] = 5,
+    names: Annotated[
+        list[str] | None, typer.Option("--scenario", metavar="NAME", help="Only this scenario; repeat for more.")
+    ] = None,
+) -> Outcome:
+    """Calibrate every mounting live over several seeds: errors against the truth, held-out errors, and errors in units of
+    the covariance."""
+    from weldcal.tools.studies.hand_eye.mountings import run_mountings
+
+    folder, seeds = call.folder("benchmark", "mountings"), range(call.seed, call.seed + runs)
+    summary, table = run_mountings(folder, seeds, tuple(names or ()), call.progress)
+    if not call.json:
+        typer.echo(table)
+    return Outcome(summary)
+
+
+@command("benchmark profiler")
+def profiler(
+    call: Call,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="FOLDER", help="The fixed files. Without them, sets generated from the seed."),
+    ] = None,
+) -> Outcome:
+    """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
+    from weldcal.tools.studies.profiler.speed import lines, run_profiler_benchmark
+
+    summary = run_profiler_benchmark(call.folder("benchmark", "profiler"), call.seed, data, call.progress)
+    return Outcome(summary, values={}, rows=lines(summary))
+
+
+@command("benchmark cell")
+def cell(call: Call) -> Mapping[str, object]:
+    """Measure the real-time factor of the whole cell while welding, finger camera included."""
+    from weldcal.tools.studies.cell.speed import run_cell_benchmark
+
+    return run_cell_benchmark(call.folder("benchmark", "cell"), call.seed, call.progress)
+
+
+@command("benchmark seeds")
+def seeds(
+    call: Call,
+    scenario: ScenarioOption = "s_groove",
+    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Number of seeds.")] = 11,
+) -> Mapping[str, object]:
+    """Run the demo over many seeds: completed runs, and the largest errors of calibration and torch."""
+    from weldcal.tools.studies.cell.seeds import run_seeds
+
+    folder = call.folder("benchmark", f"seeds-{scenario}")
+    return run_seeds(scenario, folder, range(call.seed, call.seed + runs), call.progress)
+
+
+@command("benchmark robot-faults", options=("address",))
+def robot_faults(
+    call: Call,
+    sequences: Annotated[
+        int, typer.Option("--sequences", metavar="N", min=0, help="Number of random fault sequences.")
+    ] = 20,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Length of each.")] = 60.0,
+) -> Outcome:
+    """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say why."""
+    from weldcal.tools.studies.robot.faults import run_fault_benchmark
+
+    result = run_fault_benchmark(
+        call.folder("benchmark", "robot-faults"),
+        address=call.given["address"],
+        sequences=sequences,
+        seconds=seconds,
+        seed=call.seed,
+        progress=call.progress,
+    )
+    return Outcome(result.summary(), rows={outcome.name: outcome.line for outcome in result.outcomes})
+
+
+@command("benchmark robot", options=("address",))
+def robot(
+    call: Call,
+    minutes: Annotated[float, typer.Option("--minutes", metavar="M", min=0.05, help="Length of the stream.")] = 10.0,
+) -> Mapping[str, object]:
+    """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or more."""
+    from weldcal.tools.studies.robot.stream import run_robot_benchmark
+
+    folder = call.folder("benchmark", "robot")
+    return run_robot_benchmark(
+        folder, address=call.given["address"], minutes=minutes, seed=call.seed, progress=call.progress
+    ).summary()
+
+
+COMMANDS = (tablet, seam_planning, hand_eye, mountings, profiler, cell, seeds, robot_faults, robot)

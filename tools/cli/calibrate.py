@@ -1,0 +1,65 @@
+"""weldcal calibrate: a scanner's pose from a dataset, or live in a scenario."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from weldcal.tools.cli.options import MOTION, Call, CorrectionOption, FlangeOption, Outcome, command
+from weldcal.tools.cli.runs import run_options
+
+
+@command("calibrate", options=MOTION, short_help="Calibrate a scanner from a folder of scans, or live in a scenario.")
+def calibrate(
+    call: Call,
+    dataset: Annotated[Path | None, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/.")] = None,
+    scenario: Annotated[
+        str | None, typer.Option("--scenario", metavar="NAME", help="Calibrate live in this scenario instead.")
+    ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="NAME",
+            help="For a dataset: the arm, if dataset.yaml does not name it. Live: simulated, emulated or a controller's address.",
+        ),
+    ] = None,
+    flange: FlangeOption = None,
+    centres: Annotated[
+        bool,
+        typer.Option("--centres", help="Also write centres.csv: the flange centre found in each scan of a dataset."),
+    ] = False,
+    scanner_correction: CorrectionOption = True,
+    axis_turn: Annotated[
+        float | None,
+        typer.Option(
+            "--axis-turn",
+            metavar="DEG",
+            help="Known rotation of the hole pattern about the flange axis; one to three scans are then enough.",
+        ),
+    ] = None,
+) -> Outcome:
+    """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
+    if dataset is not None and scenario is None:
+        from weldcal.tools.commands.calibrate import calibrate_dataset
+
+        report = calibrate_dataset(
+            dataset,
+            call.folder("calibrate", dataset.resolve().name),
+            robot=robot,
+            flange=flange,
+            seed=call.seed,
+            progress=call.progress,
+            centres=centres,
+            correct_scanner=scanner_correction,
+            axis_turn_deg=axis_turn,
+        )
+        algorithm1 = report.algorithm1
+        return Outcome(report.summary(), rows={} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence})
+    if scenario is None or dataset is not None:
+        raise typer.BadParameter("give either a dataset folder or --scenario NAME")
+    from weldcal.tools.commands.procedures import calibrate_live
+
+    return Outcome(calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress))

@@ -1,0 +1,178 @@
+"""weldcal reproduce: the published studies repeated, with every figure compared with its target."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Protocol
+
+import typer
+
+from weldcal.tools.cli.options import Call, Outcome, command
+
+MISSED = "Some targets were missed; see the table."
+
+
+class Study(Protocol):
+    """A study with targets."""
+
+    @property
+    def met(self) -> bool:
+        """Whether all targets are met."""
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object."""
+
+
+@command("reproduce tablet")
+def tablet(
+    call: Call,
+    evolution_seeds: Annotated[
+        int,
+        typer.Option(
+            "--evolution-seeds",
+            metavar="N",
+            min=0,
+            help="Seeds of differential evolution per table; each takes seconds.",
+        ),
+    ] = 1,
+    trials: Annotated[
+        int, typer.Option("--trials", metavar="N", min=1, help="Simulated trials for the error on unseen points.")
+    ] = 60,
+) -> Outcome:
+    """Repeat the tablet paper: Tables 7 to 12, the sign of Eq. 20, and models with smaller prediction errors."""
+    from weldcal.tools.studies.tablet.command import run_tablet_study
+    from weldcal.tools.studies.tablet.results import TabletOptions, limit_words
+
+    folder = call.folder("reproduce", "tablet")
+    study = run_tablet_study(TabletOptions(folder, call.seed, evolution_seeds, trials), call.progress)
+    rows = {t.what: f"{t.value:.4f}  ({limit_words(t)}: {t.verdict})" for t in study.targets}
+    rows["the paper's 1e8 evaluations"] = f"{study.cost.published / 60.0:.0f} min, extrapolated from one"
+    return _compared(study, rows=rows)
+
+
+@command("reproduce flange")
+def flange(
+    call: Call,
+    data: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[DATA]",
+            help="Folder of the recorded datasets. Without it only the simulated parts are run.",
+            show_default=False,
+        ),
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Fewer noise levels, realisations, shuffled orders and splits.")
+    ] = False,
+) -> Outcome:
+    """Repeat the flange paper: Table 1, Fig. 9, 10 and 11, the Kinect data, and the effect of Algorithm 1's cost."""
+    from weldcal.tools.studies.flange.published.command import run_study
+    from weldcal.tools.studies.flange.published.report import print_study
+    from weldcal.tools.studies.flange.published.results import StudyOptions
+
+    study = run_study(StudyOptions(call.folder("reproduce", "flange"), data, call.seed, quick), call.progress)
+    return Outcome(study.summary(), text=partial(print_study, study))
+
+
+@command("reproduce profiler-seeds")
+def profiler_seeds(
+    call: Call,
+    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=2, help="Number of seeds.")] = 12,
+    data: Annotated[
+        Path | None, typer.Option("--data", metavar="FOLDER", help="The fixed files, shown together with the seeds.")
+    ] = None,
+) -> Outcome:
+    """Run every target of 'reproduce profiler' over many seeds and compare with the Cramer-Rao bound. 20 s per seed."""
+    from weldcal.tools.studies.profiler.seeds import run_profiler_seeds
+
+    study = run_profiler_seeds(call.folder("reproduce", "profiler-seeds"), call.seed, seeds, data, call.progress)
+    rows = {}
+    for line in study.lines:
+        fixed = "" if line.fixed is None else f"; fixed files {line.fixed.value:.3f}"
+        rows[line.what] = (
+            f"{float(line.values.min()):.3f} to {float(line.values.max()):.3f} {line.unit}, {line.over_bound:.2f} of the bound, "
+            f"target {line.target:g} met in {line.met} of {len(line.seeds)}{fixed}"
+        )
+    rows["edge, squared error in units of the bound"] = f"{study.nees:.2f} of 6 expected, {study.trials} trials"
+    return Outcome(study.summary(), values={}, rows=rows)
+
+
+@command("reproduce weld")
+def weld(
+    call: Call,
+    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Number of seeds of each weld.")] = 10,
+    rows: Annotated[
+        str, typer.Option("--rows", metavar="NAMES", help="Only these rows, separated by commas.", show_default="all")
+    ] = "",
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Two seeds of each weld, and two for the comparison of the laws.")
+    ] = False,
+) -> Outcome:
+    """Run the weld law in a small kinematic world: every target, the published law for comparison, figures, a report."""
+    from weldcal.tools.studies.weld.command import run_study
+    from weldcal.tools.studies.weld.report import print_study
+    from weldcal.tools.studies.weld.results import StudyOptions
+
+    folder, number = call.folder("reproduce", "weld"), min(seeds, 2) if quick else seeds
+    study = run_study(StudyOptions(folder, _names(rows), number, call.seed, quick), call.progress)
+    return _compared(study, text=partial(print_study, study))
+
+
+@command("reproduce profiler")
+def profiler(
+    call: Call,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", metavar="FOLDER", help="The fixed files. Without them, worlds generated from the seed."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Two sets of edges and two or three worlds.")] = False,
+) -> Outcome:
+    """Repeat both papers on laser profilers: their tables with ours for comparison, figures, a report."""
+    from weldcal.tools.studies.profiler.command import run_profiler_study
+    from weldcal.tools.studies.profiler.fixed import figure_text
+    from weldcal.tools.studies.profiler.results import ProfilerStudyOptions
+
+    folder = call.folder("reproduce", "profiler")
+    study = run_profiler_study(ProfilerStudyOptions(folder, data, call.seed, quick), call.progress)
+    rows = {t.what: f"{figure_text(t.value, t.unit)}, target {t.limit:g}: {t.verdict}" for t in study.targets()}
+    return _compared(study, rows=rows, missed=f"{MISSED} They were set for the fixed files (--data).")
+
+
+@command("reproduce cell")
+def cell(
+    call: Call,
+    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Number of seeds of each scenario.")] = 3,
+    scenarios: Annotated[
+        str, typer.Option("--scenarios", metavar="NAMES", help="Scenarios, separated by commas.")
+    ] = "s_groove,l_groove",
+    seam_mm: Annotated[
+        float | None, typer.Option("--seam-mm", metavar="MM", min=10.0, help="Weld only this length; default: all.")
+    ] = None,
+    law: Annotated[str, typer.Option("--law", metavar="NAME", help="Steering law, for comparison.")] = "guarded",
+) -> Outcome:
+    """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
+    from weldcal.tools.studies.cell.study import CellStudyOptions, print_cell_study, run_cell_study
+
+    folder = call.folder("reproduce", "cell")
+    study = run_cell_study(CellStudyOptions(folder, _names(scenarios), seeds, call.seed, seam_mm, law), call.progress)
+    return _compared(study, text=partial(print_cell_study, study))
+
+
+COMMANDS = (tablet, flange, profiler_seeds, weld, profiler, cell)
+
+
+def _compared(
+    study: Study,
+    *,
+    rows: Mapping[str, str] | None = None,
+    text: Callable[[], object] | None = None,
+    missed: str = MISSED,
+) -> Outcome:
+    """The outcome of a study with targets: exit code 1 where one is missed."""
+    return Outcome(study.summary(), {}, rows or {}, text, problem="" if study.met else missed)
+
+
+def _names(listed: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in listed.split(",") if name.strip())

@@ -1,0 +1,164 @@
+"""The results that the reports of `calibrate` and `verify` show, and their JSON objects."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.data.results import CalibrationResult, matrix4
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
+from weldcal.tools.report.flange_features import feature_residuals
+
+Array = NDArray[np.float64]
+
+
+def error_summary(values: Array) -> dict[str, float]:
+    """Median, mean, 95th percentile and maximum of the finite values (n,), in their unit; NaN where there are none."""
+    v = np.asarray(values, dtype=float)
+    v = v[np.isfinite(v)]
+    if len(v) == 0:
+        return dict.fromkeys(("median", "mean", "p95", "max"), float("nan"))
+    return {
+        "median": float(np.median(v)),
+        "mean": float(v.mean()),
+        "p95": float(np.percentile(v, 95)),
+        "max": float(v.max()),
+    }
+
+
+@dataclass(frozen=True)
+class Algorithm1Outcome:
+    """Algorithm 1 on the same data: its reported figure, its errors at unused poses, and what the figure is insensitive to.
+
+    ``verification``: id of the pose held out for it. ``figure_mm``: reported by Algorithm 1; ``true_mm``: its errors at the
+    flange at unused poses; ``unseen``: components of a true error of which less than half appears in the figure.
+    """
+
+    verification: str
+    metric: str
+    figure_mm: float
+    true_mm: dict[str, float]
+    at_verification_mm: float
+    unseen: tuple[str, ...]
+    shares: tuple[float, ...]
+    run: Algorithm1Run
+
+    @property
+    def sentence(self) -> str:
+        """One sentence for the terminal."""
+        blind = f" ({self.metric}), insensitive to: {'; '.join(self.unseen)}" if self.unseen else f" ({self.metric})"
+        return (
+            f"Algorithm 1 reports {self.figure_mm:.3f} mm at its verification pose {self.verification}{blind}. "
+            f"Its error at unused poses: {self.true_mm['median']:.3f} mm median."
+        )
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
+    scanner correction where one was accepted."""
+
+    result: CalibrationResult
+    estimate: CalibrationEstimate
+    observations: tuple[Observation, ...]
+    scanner: SelfCalibration | None
+    fits: dict[str, FlangeFit]
+    refused: tuple[tuple[str, str], ...]
+    outliers: tuple[str, ...]
+    algorithm1: Algorithm1Outcome | None
+    convergence: Convergence
+    k_fold_mm: dict[str, float]
+    seconds: float
+    out: Path
+    advice: tuple[str, ...] = ()
+    patterns: dict[str, HolePattern] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `calibrate`."""
+        r = self.result
+        a = self.algorithm1
+        return {
+            "state": "done",
+            "n_used": int(self.estimate.inliers.sum()),
+            "refused": [{"id": i, "reason": t} for i, t in self.refused],
+            "X_BC": matrix4(r.X_BC),
+            "covariance": r.covariance.tolist(),
+            "scanner_correction": r.scanner_correction,
+            "held_out_mm": {k: r.held_out_mm[k] for k in ("median", "mean", "p95")},
+            "tilt_deg": r.tilt_deg,
+            "outliers": list(self.outliers),
+            "warnings": list(r.warnings),
+            "unobservable": list(r.unobservable),
+            "seconds": self.seconds,
+            "k_fold_mm": self.k_fold_mm,
+            "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
+            "advice": list(self.advice),
+            "features": feature_residuals(self.fits, self.patterns),
+            "algorithm1": None
+            if a is None
+            else {
+                "verification": a.verification,
+                "metric": a.metric,
+                "figure_mm": a.figure_mm,
+                "true_mm": a.true_mm,
+                "at_verification_mm": a.at_verification_mm,
+                "unseen": list(a.unseen),
+            },
+        }
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """One scan: distance (mm) between the flange centres by calibration and by robot, angle (deg) between the face normals
+    (None where none was seen), and whether the calibration used this scan."""
+
+    id: str
+    error_mm: float
+    tilt_deg: float | None
+    used_before: bool
+
+
+@dataclass(frozen=True)
+class VerifyReport:
+    """The result of a verification. ``observations`` include the scanner correction where the result has one."""
+
+    result: CalibrationResult
+    correction: ScannerCorrection | None
+    observations: tuple[Observation, ...]
+    fits: dict[str, FlangeFit]
+    poses: tuple[PoseError, ...]
+    refused: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
+    hashes: dict[str, str]
+    out: Path
+
+    @property
+    def position_error_mm(self) -> dict[str, float]:
+        """Median, mean, 95th percentile and largest position error, mm."""
+        return error_summary(np.array([p.error_mm for p in self.poses]))
+
+    @property
+    def tilt_deg(self) -> dict[str, float | None]:
+        """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
+        found = error_summary(np.array([p.tilt_deg for p in self.poses], dtype=float))
+        return {key: found[key] if np.isfinite(found[key]) else None for key in ("median", "p95")}
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `verify`. A refused scan is named in the warnings."""
+        return {
+            "state": "done",
+            "position_error_mm": self.position_error_mm,
+            "tilt_deg": self.tilt_deg,
+            "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
+            "warnings": list(self.warnings),
+        }
