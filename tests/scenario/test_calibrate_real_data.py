@@ -100,7 +100,7 @@ def test_ur10e_pairs_find_their_outlier_and_beat_the_paper(ur10e: CalibrationRep
     assert d["k_fold_mm"]["median"] < 0.625
     assert d["tilt_deg"]["median"] is None
     assert ur10e.algorithm1 is not None
-    assert "in place of the ICP" in ur10e.algorithm1.metric
+    assert "instead of the ICP" in ur10e.algorithm1.metric
 
 
 def test_result_folder_is_complete_and_reads_back(aubo: CalibrationReport) -> None:

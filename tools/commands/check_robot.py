@@ -59,7 +59,7 @@ def emit_table(report: Preflight) -> None:
         if check.remedy:
             typer.echo(_wrapped(check.remedy, width, indent))
     if waiting := len(report.checks) - len(shown):
-        typer.secho(f"  not checked  {waiting} more that need an answer of the robot", fg=MARKS["not checked"])
+        typer.secho(f"  not checked  {waiting} more that need an answer", fg=MARKS["not checked"])
 
 
 def _wrapped(text: str, width: int, first: str) -> str:
