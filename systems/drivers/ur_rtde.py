@@ -13,6 +13,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.messages import UrStatus
 
@@ -141,6 +142,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         InputError: the scenario names no host, or a pace that no real robot has.
         RobotRefused, RobotUnreachable: one sentence that says what to press.
     """
+    require_ur_rtde()
     if not config.host:
         raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
     if config.pace != FULL_PACE and not config.host.startswith("127."):
