@@ -7,6 +7,7 @@ import inspect
 import pkgutil
 from functools import cache
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
 from typing import get_type_hints
 
@@ -15,7 +16,6 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig, NoDevice
 
 ENTRY_POINTS = "weldcal.drivers"
-LEVELS = 2  # drivers/<backend>/<device>.py; deeper modules serve a driver and are none
 
 
 @cache
@@ -45,7 +45,7 @@ def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
     Raises:
         InputError: two drivers have the same name.
     """
-    found: dict[str, type[DriverConfig]] = {}
+    found: dict[str, type[DriverConfig]] = {NoDevice.__name__: NoDevice}
     for module in (*_own_modules(), *plugins()):
         for config in _configs_of(module):
             if device not in config.FOR:
@@ -66,11 +66,12 @@ def default_config(device: str) -> DriverConfig:
 
 @cache
 def _own_modules() -> tuple[ModuleType, ...]:
-    names = [
-        info.name
-        for info in pkgutil.walk_packages(drivers.__path__, drivers.__name__ + ".", onerror=lambda name: None)
-        if not info.ispkg and info.name.removeprefix(drivers.__name__).count(".") <= LEVELS
-    ]
+    """The modules of drivers/<backend>/ that have an ApplyDriverConfig; what only serves a driver is not imported."""
+    names = []
+    for finder, name, is_package in pkgutil.walk_packages(drivers.__path__, drivers.__name__ + "."):
+        spec = None if is_package else finder.find_spec(name, None)
+        if spec is not None and spec.origin is not None and "\ndef ApplyDriverConfig(" in Path(spec.origin).read_text():
+            names.append(name)
     return tuple(importlib.import_module(name) for name in sorted(names))
 
 

@@ -21,18 +21,26 @@ LIBRARIES = {
     "libusb-1.0.so.0": "libusb-1.0-0",
 }
 
-# Stands in for Python 3.11: logs how it is called; `-m venv` copies it; pip fails while a file `no-network` is there.
+# Stands in for a Python: logs how it is called; `-m venv` copies it; pip fails while a file `no-network` is there, and the
+# environment's own pip is missing while `no-ensurepip` is.
 FAKE_PYTHON = """#!/bin/sh
 case "$*" in
   *"-m venv"*)
     for last; do :; done
-    echo "venv $*" >>"$LOG"; rm -rf "$last"; mkdir -p "$last/bin"; cp "$0" "$last/bin/python" ;;
+    echo "venv VERSION $*" >>"$LOG"; rm -rf "$last"; mkdir -p "$last/bin"; cp "$0" "$last/bin/python" ;;
   *"-m pip --version"*) ;;
   *"-m pip"*) echo "pip $*" >>"$LOG"; [ ! -e "$LOG.no-network" ] ;;
-  *"-c "*) ;;
+  *"-c import ensurepip"*) [ ! -e "$LOG.no-ensurepip" ] ;;
+  *"-c import sys; print"*) echo pythonVERSION-venv ;;
+  *"-c import sys; raise"*) for a; do [ "$a" != VERSION ] || exit 0; done; exit 1 ;;
   *) echo "run $*" >>"$LOG"; echo "in $(pwd)"; for a; do echo "<$a>"; done ;;
 esac
 """
+
+
+def python(version: str) -> str:
+    """A program that says it is this Python."""
+    return FAKE_PYTHON.replace("VERSION", version)
 
 
 def listing(*libraries: str) -> str:
@@ -68,11 +76,19 @@ class Machine:
             timeout=60,
         )
 
+    def lines(self) -> list[str]:
+        """The logged calls since the last time, in order."""
+        lines = self.log.read_text().splitlines() if self.log.exists() else []
+        self.log.unlink(missing_ok=True)
+        return lines
+
     def calls(self) -> list[str]:
         """The first word of each logged call since the last time, in order."""
-        words = [line.split()[0] for line in self.log.read_text().splitlines()] if self.log.exists() else []
-        self.log.unlink(missing_ok=True)
-        return words
+        return [line.split()[0] for line in self.lines()]
+
+    def locks(self) -> list[str]:
+        """The locks installed since the last time, in order."""
+        return [line.rpartition("/")[2] for line in self.lines() if line.endswith(".lock")]
 
 
 @pytest.fixture
@@ -81,7 +97,7 @@ def machine(tmp_path: Path, repository: Path) -> Machine:
     tools, project = tmp_path / "bin", tmp_path / "a folder" / "weldcal"
     tools.mkdir()
     (project / "tools").mkdir(parents=True)
-    for name in ("pyproject.toml", "requirements.lock", "tools/run"):
+    for name in ("pyproject.toml", "requirements.lock", "requirements-dev.lock", "tools/run"):
         shutil.copy(repository / name, project / name)
     for name in COREUTILS:
         found = shutil.which(name)
@@ -90,7 +106,7 @@ def machine(tmp_path: Path, repository: Path) -> Machine:
     made = Machine(tools, project, tmp_path / "log")
     made.install("ldconfig", listing(*LIBRARIES))
     made.install("id", "#!/bin/sh\necho 1000\n")
-    made.install("python3.11", FAKE_PYTHON)
+    made.install("python3.11", python("3.11"))
     return made
 
 
@@ -134,6 +150,57 @@ def test_it_works_through_a_link(machine: Machine, tmp_path: Path) -> None:
     finished = subprocess.run([str(link), "x"], env={"PATH": str(linked.tools), "LOG": str(linked.log)}, check=False)
     assert finished.returncode == 0
     assert (machine.project / ".venv").is_dir()
+
+
+def test_a_user_gets_no_developers_tools_and_test_adds_them_to_the_same_environment(machine: Machine) -> None:
+    machine.run("demo")
+    assert machine.locks() == ["requirements.lock"]
+    added = machine.run("test", "-k", "x")
+    assert added.returncode == 0, added.stderr
+    assert machine.locks() == ["requirements-dev.lock"]
+    assert "developers' tools" in added.stderr
+    machine.run("test", "-k", "x")
+    machine.run("demo")
+    assert machine.calls() == ["run", "run"]
+
+
+def test_test_makes_both_parts(machine: Machine) -> None:
+    machine.run("test", "-k", "x")
+    assert machine.locks() == ["requirements.lock", "requirements-dev.lock"]
+
+
+def test_a_changed_developers_lock_is_of_no_matter_to_a_user(machine: Machine) -> None:
+    machine.run("test", "-k", "x")
+    machine.calls()
+    with (machine.project / "requirements-dev.lock").open("a") as file:
+        file.write("# changed\n")
+    machine.run("demo")
+    assert machine.calls() == ["run"]
+    machine.run("test", "-k", "x")
+    assert machine.locks() == ["requirements-dev.lock"]
+
+
+@pytest.mark.parametrize("name", ["pyproject.toml", "requirements.lock"])
+def test_what_both_parts_were_made_from_is_installed_again_for_both(machine: Machine, name: str) -> None:
+    machine.run("test", "-k", "x")
+    machine.calls()
+    with (machine.project / name).open("a") as file:
+        file.write("# changed\n")
+    machine.run("test", "-k", "x")
+    assert machine.locks() == ["requirements.lock", "requirements-dev.lock"]
+
+
+def test_developers_tools_broken_off_are_begun_afresh_and_the_user_goes_on(machine: Machine) -> None:
+    machine.run("demo")
+    no_network = machine.log.with_name("log.no-network")
+    no_network.touch()
+    assert machine.run("test", "-k", "x").returncode == 1
+    machine.calls()
+    assert machine.run("demo").returncode == 0
+    assert machine.calls() == ["run"]
+    no_network.unlink()
+    assert machine.run("test", "-k", "x").returncode == 0
+    assert machine.calls() == ["venv", "pip", "pip", "pip", "run"]
 
 
 @pytest.mark.parametrize("name", ["pyproject.toml", "requirements.lock"])
@@ -192,21 +259,72 @@ def test_without_a_browser_the_tests_still_run_and_the_line_to_type_is_shown(mac
     assert "sudo apt-get install -y chrom" in finished.stderr
 
 
-def test_without_python_311_the_line_to_type_is_shown(machine: Machine) -> None:
+def test_without_a_supported_python_the_line_to_type_is_shown(machine: Machine) -> None:
     (machine.tools / "python3.11").unlink()
-    machine.install("python3", "#!/bin/sh\nexit 1\n")  # another version
+    machine.install("python3", python("3.10"))
     finished = machine.run("demo")
     assert finished.returncode == 1
-    assert "Python 3.11 was not found" in finished.stderr
-    assert "sudo apt-get install -y python3.11 python3.11-venv" in finished.stderr
+    assert "Python 3.11, 3.12 or 3.13 was not found" in finished.stderr
+    assert "Debian 12, Debian 13 or Ubuntu 24.04" in finished.stderr
+    assert finished.stderr.strip().endswith("sudo apt-get install -y python3 python3-venv")
+    assert machine.calls() == []
     assert not (machine.project / ".venv").exists()
+
+
+def test_root_installs_the_distributions_python_where_there_is_none(machine: Machine) -> None:
+    (machine.tools / "python3.11").unlink()
+    (machine.tools / "hidden").write_text(python("3.13"))
+    machine.install("id", "#!/bin/sh\necho 0\n")
+    machine.install("apt-cache", "#!/bin/sh\n")
+    hidden, there = machine.tools / "hidden", machine.tools / "python3"
+    machine.install("apt-get", f'#!/bin/sh\necho "apt-get $*" >>"$LOG"\ncp {hidden} {there}; chmod +x {there}\n')
+    finished = machine.run("demo")
+    assert finished.returncode == 0, finished.stderr
+    assert machine.lines()[0] == "apt-get -q install -y --no-install-recommends python3 python3-venv"
+    assert "everything but the robot works with Python 3.13" in finished.stderr
+
+
+def test_the_newest_python_with_which_everything_works_is_taken(machine: Machine) -> None:
+    machine.install("python3.13", python("3.13"))
+    later = machine.tools.parent / "later"
+    later.mkdir()
+    Machine(later, machine.project, machine.log).install("python3", python("3.12"))
+    run = [str(machine.project / "tools" / "run")]
+    environment = {"PATH": f"{machine.tools}:{later}", "LOG": str(machine.log)}
+    finished = subprocess.run(run, env=environment, check=True, capture_output=True, text=True)
+    assert machine.lines()[0].startswith("venv 3.12 ")
+    assert "robot" not in finished.stderr
+
+
+def test_an_environment_stays_while_its_python_is_supported(machine: Machine) -> None:
+    machine.run("demo")
+    machine.install("python3.12", python("3.12"))
+    with (machine.project / "requirements.lock").open("a") as file:
+        file.write("# changed\n")
+    machine.calls()
+    machine.run("demo")
+    assert machine.calls() == ["pip", "pip", "run"]
+    (machine.project / ".venv" / "bin" / "python").write_text(python("3.10"))
+    with (machine.project / "requirements.lock").open("a") as file:
+        file.write("# changed again\n")
+    machine.run("demo")
+    assert machine.lines()[0].startswith("venv 3.12 ")
+
+
+def test_the_venv_package_is_that_of_the_python_found(machine: Machine) -> None:
+    machine.install("python3.12", python("3.12"))
+    machine.log.with_name("log.no-ensurepip").touch()
+    finished = machine.run("demo")
+    assert finished.returncode == 1
+    assert finished.stderr.strip().endswith("sudo apt-get install -y python3.12-venv")
 
 
 def test_a_python_that_refuses_to_run_does_not_hide_one_that_works(machine: Machine) -> None:
     shims = machine.tools.parent / "shims"
     shims.mkdir()
     before = Machine(shims, machine.project, machine.log)
-    before.install("python3.11", "#!/bin/sh\nexit 127\n")
+    for name in ("python3.12", "python3.11"):
+        before.install(name, "#!/bin/sh\nexit 127\n")
     both = f"{shims}:{machine.tools}"
     run = [str(machine.project / "tools" / "run")]
     assert subprocess.run(run, env={"PATH": both, "LOG": str(machine.log)}, check=False).returncode == 0
@@ -234,7 +352,7 @@ def test_root_installs_missing_libraries(machine: Machine) -> None:
 
 
 def test_two_runs_at_once_make_one_environment(machine: Machine) -> None:
-    slow = FAKE_PYTHON.replace('echo "pip $*" >>"$LOG";', 'echo "pip $*" >>"$LOG"; sleep 0.5;')
+    slow = python("3.11").replace('echo "pip $*" >>"$LOG";', 'echo "pip $*" >>"$LOG"; sleep 0.5;')
     machine.install("python3.11", slow)
     sleep = shutil.which("sleep")
     assert sleep is not None

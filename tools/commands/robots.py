@@ -14,6 +14,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.scenario.schema import Scenario
@@ -61,6 +62,8 @@ def chosen_robot(
             scenario.robot = SimulatedUr()
         yield ChosenRobot("simulated")
         return
+    if not dry_run:
+        require_ur_rtde()
     kind, _, address = word.partition("@")
     if kind == EMULATED:
         host, pace = address or EMULATOR_HOST, EMULATED_PACE if pace is None else pace

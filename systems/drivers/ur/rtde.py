@@ -15,6 +15,7 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
+from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import Limits
 from weldcal.systems.messages import UrStatus
 
@@ -145,6 +146,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         InputError: the scenario names no host, or a pace that no real robot has.
         RobotRefused, RobotUnreachable: one sentence that says what to press.
     """
+    require_ur_rtde()
     if not config.host:
         raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
     if config.pace != FULL_PACE and not config.host.startswith("127."):

@@ -55,11 +55,20 @@ def test_near_one_it_slows_but_keeps_its_direction() -> None:
 
 
 def test_at_one_it_stops() -> None:
-    for sigma in (0.03, 0.01, 0.0):
+    for sigma in (0.03 * (1.0 - 1e-12), 0.01, 0.0):
         answer = guarded_joint_velocity(jacobian(sigma), np.ones(6), 2.0)
         assert answer.stopped
         assert not answer.q_dot.any()
         assert answer.reason is not None
+
+
+def test_on_the_threshold_rounding_chooses_the_side_and_the_arm_stands_on_both() -> None:
+    sides = set()
+    for seed in range(20):
+        answer = guarded_joint_velocity(jacobian(0.03, seed), np.ones(6), 2.0)
+        assert np.abs(answer.q_dot).max() < 1e-12
+        sides.add(answer.stopped)
+    assert sides == {True, False}
 
 
 def test_joint_speeds_are_held_by_slowing_everything_alike() -> None:

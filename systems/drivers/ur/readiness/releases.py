@@ -1,6 +1,10 @@
-"""What the release of the controller's software means for us and for ur_rtde 1.6."""
+"""Which controller software is supported, what ur_rtde 1.6 can do with it, and whether ur_rtde is installed."""
 
 from __future__ import annotations
+
+import importlib.util
+
+from weldcal.systems.drivers.ur.errors import RobotRefused
 
 POLYSCOPE_X = 10
 OLDEST_5, OLDEST_X = (5, 12), (10, 10)
@@ -18,3 +22,16 @@ def upper_range_works(version: tuple[int, ...]) -> bool:
     register 24, which never comes (seen on the wire).
     """
     return version[:2] < ((10, 9) if version[0] >= POLYSCOPE_X else (5, 23))
+
+
+def require_ur_rtde() -> None:
+    """Refuses a job on a robot where ur_rtde is not installed; everything else works without it.
+
+    Raises:
+        RobotRefused: one sentence that says what to install.
+    """
+    if importlib.util.find_spec("rtde_control") is None:
+        raise RobotRefused(
+            "The package ur-rtde, which a robot needs, is not installed: install it with pip, or, as it has no wheel for "
+            "Python 3.13 yet, set weldcal up with Python 3.12."
+        )
