@@ -26,7 +26,7 @@ from weldcal.calibration.published.icp import (
     sight,
 )
 from weldcal.models.flanges import FlangeStandard
-from weldcal.tools.report.results import Algorithm1Outcome, error_summary
+from weldcal.tools.outcomes.calibration import Algorithm1Outcome, error_summary
 
 Array = NDArray[np.float64]
 

@@ -40,9 +40,9 @@ from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
+from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.report.calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.results import CalibrationReport, error_summary
 
 Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration

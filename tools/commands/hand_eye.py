@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -19,105 +19,20 @@ from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.joints import refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
-from weldcal.calibration.hand_eye.mountings import Mounting, get_mounting
+from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
-from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeHeldOut, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.planning.next_pose import NextPose, next_pose
+from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
+from weldcal.calibration.planning.next_pose import next_pose
 from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
+from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
 
 Array = NDArray[np.float64]
 
 EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
-
-
-@dataclass(frozen=True)
-class MethodRow:
-    """One line of the comparison: a method and its held-out errors; NaN where it gave no answer on some fold."""
-
-    method: str
-    deg: float
-    mm: float
-
-
-@dataclass(frozen=True)
-class HandEyeReport:
-    """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
-    ``corners``: sentences on corners and robot errors."""
-
-    result: HandEyeResult
-    mounting: Mounting
-    comparison: tuple[MethodRow, ...]
-    next_pose: NextPose | None
-    files: tuple[Path, ...]
-    seconds: float
-    corners: str = ""
-    advice: str = ""
-
-    def summary(self) -> dict[str, object]:
-        """The JSON object of the command."""
-        r = self.result
-        out: dict[str, object] = {"state": "done", "configuration": self.mounting.name}
-        for k, X in r.poses.items():
-            out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": r.covariance[k]}
-        return out | {
-            "held_out_deg": r.held_out.rms_deg,
-            "held_out_mm": 1e3 * r.held_out.rms_translation,
-            "residual_deg": np.degrees(r.rotation_rad),
-            "residual_mm": 1e3 * r.translation,
-            "inliers": r.inliers,
-            "unobservable": list(r.unobservable),
-            "warnings": list(r.warnings),
-            "condition": r.condition,
-            "method": r.method,
-            "comparison": [{"method": c.method, "held_out_deg": c.deg, "held_out_mm": c.mm} for c in self.comparison],
-            "next_pose": self.advice or None,
-            "corners": self.corners or None,
-            "seconds": self.seconds,
-        }
-
-    def text(self) -> str:
-        """The printed result: directions, sketch, numbers with their uncertainty, comparison, next pose."""
-        r, m = self.result, self.mounting
-        lines = [f"{m.name}: {m.words}   {m.equation}   ({m.source})", "", *m.sketch.splitlines(), ""]
-        lines += [f"poses        {r.diversity.sentence()}"]
-        for k, X in r.poses.items():
-            u = m.unknowns[k]
-            sigma = np.sqrt(np.diag(r.covariance[k]))
-            p, rpy = 1e3 * X.translation(), np.degrees(X.rotation().ToRollPitchYaw().vector())
-            lines += [
-                "",
-                u.sentence,
-                "  position     "
-                + "  ".join(f"{v:+.3f}" for v in p)
-                + "  mm   +- "
-                + _sigmas(1e3 * sigma[3:], 1e3 * r.extent),
-                "  roll pitch yaw "
-                + "  ".join(f"{v:+.4f}" for v in rpy)
-                + "  deg  +- "
-                + _sigmas(np.degrees(sigma[:3]), 57.3),
-            ]
-        lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
-        if not r.inliers.all():
-            kept = HandEyeHeldOut(r.held_out.rotation_rad[r.inliers], r.held_out.translation[r.inliers])
-            lines += [f"             {_held_out(kept, 'without outliers, ')}"]
-        lines += [f"weighting    {r.method}"]
-        lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
-        if self.corners:
-            lines += ["", self.corners]
-        if self.comparison:
-            lines += ["", "method        held-out deg   held-out mm"]
-            for c in self.comparison:
-                failed = not (np.isfinite(c.deg) and np.isfinite(c.mm))
-                lines += [
-                    f"{c.method:<12}  {'no answer':>12}" if failed else f"{c.method:<12}  {c.deg:12.4f}  {c.mm:12.3f}"
-                ]
-        if self.advice:
-            lines += ["", f"next pose    {self.advice}"]
-        return "\n".join(lines)
 
 
 def run_hand_eye(
@@ -283,13 +198,3 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
                 )
             )
     return tuple(rows)
-
-
-def _held_out(held_out: HandEyeHeldOut, of: str) -> str:
-    if not np.isfinite(held_out.rms_translation):
-        return "none: too few poses for cross-validation"
-    return f"{held_out.rms_deg:.4f} deg   {1e3 * held_out.rms_translation:.3f} mm ({of}rms, 5 folds)"
-
-
-def _sigmas(values: Array, certain: float) -> str:
-    return "  ".join("open" if v > certain else f"{v:.3f}" for v in values)

@@ -16,7 +16,7 @@ from weldcal.systems.jobs.weld.settings import feature_standard
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
-from weldcal.tools.outcomes.demo import error_summary
+from weldcal.tools.outcomes.demo import live_errors
 from weldcal.tools.outcomes.weld import WeldOutcome, columns
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.record.process import speed_along, torch_angles
@@ -37,8 +37,8 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
     return CalibrationResult(
         X_BC=estimate.X_BC,
         covariance=estimate.covariance,
-        held_out_mm=error_summary(1e3 * estimate.held_out.position_m),
-        tilt_deg={"median": error_summary(np.degrees(estimate.held_out.tilt_rad)).get("median")},
+        held_out_mm=live_errors(1e3 * estimate.held_out.position_m),
+        tilt_deg={"median": live_errors(np.degrees(estimate.held_out.tilt_rad)).get("median")},
         poses=tuple(records),
         unobservable=estimate.unobservable,
         warnings=estimate.warnings,

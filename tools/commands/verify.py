@@ -18,8 +18,8 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.tools.outcomes.calibration import PoseError, VerifyReport
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.report.results import PoseError, VerifyReport
 from weldcal.tools.report.verify import verify_report
 
 Array = NDArray[np.float64]

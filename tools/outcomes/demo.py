@@ -12,6 +12,7 @@ from weldcal.systems.jobs.weld.next_scan import next_scan
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
+from weldcal.tools.outcomes.calibration import error_summary
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
 
@@ -55,7 +56,7 @@ class DemoResult:
         if self.status.estimate is not None:
             found["X_BC"] = self.status.estimate.X_BC.GetAsMatrix4().tolist()
             found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
-            found["held_out_mm"] = error_summary(1e3 * self.status.estimate.held_out.position_m)
+            found["held_out_mm"] = live_errors(1e3 * self.status.estimate.held_out.position_m)
             found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
         found["n_scans"] = self.n_scans
         found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]
@@ -90,7 +91,7 @@ class DemoResult:
                 "n_used": int(estimate.inliers.sum()),
                 "covariance": estimate.covariance.tolist(),
                 "scanner_correction": None,
-                "tilt_deg": error_summary(np.degrees(estimate.held_out.tilt_rad)),
+                "tilt_deg": live_errors(np.degrees(estimate.held_out.tilt_rad)),
                 "outliers": [id for id, used in zip(ids, estimate.inliers, strict=True) if not used],
                 "warnings": list(estimate.warnings),
                 "unobservable": list(estimate.unobservable),
@@ -100,9 +101,7 @@ class DemoResult:
         return found
 
 
-def error_summary(values: np.ndarray) -> dict[str, float]:
-    """Median, mean and 95th percentile of the finite values, in their own unit."""
-    finite = values[np.isfinite(values)]
-    if finite.size == 0:
-        return {}
-    return {"median": float(np.median(finite)), "mean": float(finite.mean()), "p95": float(np.percentile(finite, 95))}
+def live_errors(values: np.ndarray) -> dict[str, float]:
+    """Median, mean and 95th percentile of the finite values, in their own unit; empty where there are none."""
+    found = error_summary(values)
+    return {name: found[name] for name in ("median", "mean", "p95") if np.isfinite(found[name])}

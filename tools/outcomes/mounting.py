@@ -13,7 +13,7 @@ from weldcal.calibration.planning.mounting_poses import work_point
 from weldcal.systems.jobs.mounting.job import FOOT, AddedMounting
 from weldcal.systems.jobs.mounting.messages import MountingStatus
 from weldcal.systems.runner import Run
-from weldcal.tools.commands.hand_eye import HandEyeReport
+from weldcal.tools.outcomes.hand_eye import HandEyeReport
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
+from weldcal.tools.outcomes.calibration import VerifyReport
 from weldcal.tools.report.flange_features import fit_cells
 from weldcal.tools.report.pictures import error_bars, error_field
 from weldcal.tools.report.render import fixed, render
-from weldcal.tools.report.results import VerifyReport
 
 
 def verify_report(report: VerifyReport, *, dataset: str) -> str:

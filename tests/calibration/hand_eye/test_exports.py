@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from tests.calibration.hand_eye.poses import co_manipulation, eye_in_hand
 from weldcal.calibration.hand_eye.files import read_pairs
-from weldcal.tools.commands.hand_eye import HandEyeReport, run_hand_eye
+from weldcal.tools.commands.hand_eye import run_hand_eye
+from weldcal.tools.outcomes.hand_eye import HandEyeReport
 
 LAST_DIGIT = 2e-9  # of the nine decimals written, rad and m
 

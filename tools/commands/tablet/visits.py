@@ -19,8 +19,8 @@ from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.wrist.files import file_hash
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
+from weldcal.tools.outcomes.calibration import error_summary
 from weldcal.tools.report.render import fixed, render, write_atomic
-from weldcal.tools.report.results import error_summary
 from weldcal.tools.report.tablet import Page
 
 Array = NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergenc
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-from weldcal.tools.report.flange_features import feature_residuals
 
 Array = NDArray[np.float64]
 
@@ -162,3 +162,25 @@ class VerifyReport:
             "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],
             "warnings": list(self.warnings),
         }
+
+
+def feature_residuals(
+    fits: Mapping[str, FlangeFit], patterns: Mapping[str, HolePattern]
+) -> list[dict[str, float | int | str | None]]:
+    """One row per scan: rms residual (mm) of plane, outer edge, bore (None where not seen) and of the hole centres from
+    their pattern (None where fewer than four show), and one sigma (deg) of the rotation about the flange's axis."""
+    rows: list[dict[str, float | int | str | None]] = []
+    for id, fit in fits.items():
+        holes = patterns.get(id)
+        rows.append(
+            {
+                "id": id,
+                "plane_mm": 1e3 * fit.plane_rms_m,
+                "outer_mm": 1e3 * fit.outer_rms_m,
+                "bore_mm": None if fit.bore_rms_m is None else 1e3 * fit.bore_rms_m,
+                "holes": 0 if holes is None else len(holes.holes_C),
+                "holes_mm": None if holes is None else 1e3 * holes.rms_m,
+                "turn_sigma_deg": None if holes is None else float(np.degrees(holes.turn_sigma)),
+            }
+        )
+    return rows
