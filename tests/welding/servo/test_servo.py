@@ -189,7 +189,9 @@ def test_the_groove_is_found_within_the_plans_error(across: float, high: float) 
     assert not run.torch_on[: i + 1].any()
 
 
-@pytest.mark.parametrize(("shift", "text"), [((0.0, 0.020, 0.0), "within 12 mm"), ((0.0, 0.0, 0.020), "found no surface")])
+@pytest.mark.parametrize(
+    ("shift", "text"), [((0.0, 0.020, 0.0), "within 12 mm"), ((0.0, 0.0, 0.020), "found no surface")]
+)
 def test_a_groove_that_is_not_there_is_said_not_to_be(shift: tuple[float, float, float], text: str) -> None:
     points = straight(0.1)
     run = weld(points, NOMINAL, ServoConfig(), 1, plan=SeamCurve.from_points(points + np.array(shift)), time_limit=20.0)
