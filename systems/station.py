@@ -200,7 +200,8 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
             _apply_second_robot(config, furnishing.second, build)
             continue
         placed = apply_driver_config(config, build)
-        X_LC = placed if name == "scanner" else X_LC
+        if name == "scanner" and world is not None:  # only a simulation knows the truth
+            X_LC = placed
     scanner = scenario.scanner_config()
     on_base = scanner is None or scanner.mounted_on == "base"
     truth = Truth(

@@ -51,6 +51,11 @@ def chosen_robot(
         InputError: options that do not go together.
         RobotRefused: the controller does not answer, or does not allow the job; nothing has moved.
     """
+    if word is None and not isinstance(scenario.robot, UrRtde) and not scenario.robot.SIMULATED:
+        if dry_run or pace is not None:
+            raise InputError("--dry-run and --pace need a controller: give --robot with its address.")
+        yield ChosenRobot(type(scenario.robot).__name__)
+        return
     if word is None:
         word = scenario.robot.host if isinstance(scenario.robot, UrRtde) else SIMULATED
     if word == SIMULATED:

@@ -39,6 +39,15 @@ class DemoResult:
         return "held" if self.run.held else "done"
 
     @property
+    def setting(self) -> str:
+        """What was real, for a person."""
+        scenario = self.run.cell.scenario
+        if self.robot == "simulated":
+            return "Simulation"
+        rendered = scenario.scanner.SIMULATED or scenario.finger_camera.SIMULATED
+        return f"{'Rendered sensors; robot' if rendered else 'Robot'}: {self.robot}"
+
+    @property
     def n_scans(self) -> int:
         """Scans of the feature that were taken, verification included."""
         return self.status.sequence
@@ -60,11 +69,12 @@ class DemoResult:
             found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
         found["n_scans"] = self.n_scans
         found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]
-        if self.weld is not None and self.weld.error is not None and self.weld.speed is not None:
+        if self.weld is not None and self.weld.error is not None:
             distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
             found["torch_mean_mm"], found["torch_max_mm"] = float(distance.mean()), float(distance.max())
             found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
+        if self.weld is not None and self.weld.speed is not None:
             found["torch_speed_cv"] = self.weld.speed.cv
             found["welded_mm"] = 1e3 * self.weld.speed.welded_m
             heat = heat_input_kJ_mm(self.weld, self.run.cell.scenario.welding.process.process())

@@ -48,7 +48,7 @@ class WeldOutcome:
     """The weld against the true seam (simulation only)."""
 
     log: WeldLog
-    true_seam: SeamCurve
+    true_seam: SeamCurve | None
     planned: SeamCurve | None
     error: PathError | None  # torch while it burned
     speed: SpeedStatistics | None
@@ -135,7 +135,7 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
         p_BTip=p_BRobot + np.einsum("nij,nj->ni", R_BT, deflection),
         p_BRobot=p_BRobot,
         R_BT=R_BT,
-        p_BTorch=np.array(series["torch"].data()[:, keep].T),
+        p_BTorch=np.array(series["torch"].data()[:, keep].T) if "torch" in series else p_BRobot + R_BT @ tool.p_TW,
         deflection_T=np.array(deflection),
         sigma_min=np.array(series["margin"].data()[0, keep]),
     )
@@ -156,13 +156,13 @@ def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
 
 
 def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
-    """Measure the weld against the truth; None where nothing was welded."""
+    """Measure the weld, against the truth where a simulation knows it; None where nothing was welded."""
     log, seam = weld_log(cell, root), true_seam(cell)
-    if log is None or seam is None:
+    if log is None:
         return None
     plan = cell.job.planned_seam(root).seam
     plan_error = None
-    if plan is not None:
+    if plan is not None and seam is not None:
         seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m) - cell.station.tool.seat_sink_m  # type: ignore[union-attr]
         lowered = plan.raised(TORCH_ABOVE_ROOT_M - seat)
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
@@ -170,7 +170,8 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     if log.torch_on.sum() < 30:
         return WeldOutcome(log, seam, plan, None, None, plan_error)
     speed = speed_statistics(log.time, log.p_BTorch, log.torch_on, cell.job.servo_config.weld_speed_m_s)
-    return WeldOutcome(log, seam, plan, path_error(log.p_BTorch[log.torch_on], seam), speed, plan_error)
+    error = None if seam is None else path_error(log.p_BTorch[log.torch_on], seam)
+    return WeldOutcome(log, seam, plan, error, speed, plan_error)
 
 
 def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:

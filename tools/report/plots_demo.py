@@ -76,4 +76,6 @@ def _line(seam: SeamCurve | None) -> Array | None:
 def tip_error(weld: WeldOutcome) -> float:
     """Mean distance (m) sideways between the felt tip line and the true seam while the servo tracked."""
     felt = weld.log.telemetry["phase"] == list(Phase).index(Phase.TRACK)
-    return path_error(weld.log.p_BTip[felt], weld.true_seam).mean_m if felt.any() else float("nan")
+    if weld.true_seam is None or not felt.any():
+        return float("nan")
+    return path_error(weld.log.p_BTip[felt], weld.true_seam).mean_m
