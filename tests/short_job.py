@@ -9,7 +9,8 @@ import pytest
 
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import DemoResult, run_scenario
+from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 
 SHORTER = "welding: {seam_length_mm: 30.0}\ncalibration: {minimum_scans: 4}"

@@ -13,9 +13,10 @@ from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.demo import DemoResult, run_scenario
+from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.emulators.ur.process import Emulator, emulator_process
+from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 
 # An address of its own: this module waits for no other.

@@ -138,7 +138,7 @@ def test_without_the_tag_there_is_a_reason_and_no_number(what: str) -> None:
     assert not answer.sample.valid
     assert answer.sample.capture_time == 0.3
     assert answer.sample.deflection_T.tolist() == [0.0, 0.0, 0.0]
-    assert "not in sight" in answer.reason
+    assert "not visible" in answer.reason
 
 
 class Bench:
@@ -262,7 +262,7 @@ def test_a_hidden_tag_takes_the_place_of_the_last_good_number() -> None:
     estimator.feed("image", Image(2, 0.06, np.full((CAMERA.height, CAMERA.width), 25, np.uint8)))
     deformation, vector = estimator.at(0.10)
     assert vector[:4].tolist() == [0.0, 0.0, 0.0, 0.0]
-    assert "not in sight" in deformation.reason
+    assert "not visible" in deformation.reason
 
 
 def test_a_frame_from_before_the_arms_memory_is_not_used() -> None:
