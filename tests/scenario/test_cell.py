@@ -25,7 +25,7 @@ from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
-from weldcal.tools.commands.run import FinishedRun
+from weldcal.tools.commands.run import JobRun
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.studies.cell.study import figures
@@ -308,7 +308,7 @@ def test_ctrl_c_ends_the_run_as_held_and_lets_go_of_the_robot(tmp_path: Path) ->
     assert found.held
     assert found.reason == "A person stopped the run with Ctrl-C, in the phase 'approach_above'."
     result = measure(found, RunOptions("a test's own", tmp_path / "run", recording=False))
-    write_result(result, FinishedRun(found, None, "simulated"))
+    write_result(result, JobRun(found, None, "simulated"))
     assert result.summary()["state"] == "held"
     assert (tmp_path / "run" / "report.html").exists()
 

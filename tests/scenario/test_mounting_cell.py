@@ -25,7 +25,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.procedures import kind_of
-from weldcal.tools.commands.run import FinishedRun
+from weldcal.tools.commands.run import JobRun
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
 
@@ -120,7 +120,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> MountingReport:
     folder = tmp_path_factory.mktemp("live")
     result = solve_mounting(run.job.scene, run.status.seen, folds=3)
     made = MountingReport(run.run, result, folder, 1.0)
-    mounting_live.write_mounting(made, FinishedRun(run.run, None, "simulated"))
+    mounting_live.write_mounting(made, JobRun(run.run, None, "simulated"))
     return made
 
 

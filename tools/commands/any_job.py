@@ -8,7 +8,7 @@ from pathlib import Path
 
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.run import FinishedRun, run_job
+from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
 
@@ -18,7 +18,7 @@ class AnyOutcome:
     """Done or held, and how long it took."""
 
     options: RunOptions
-    finished: FinishedRun
+    finished: JobRun
 
     @property
     def folder(self) -> Path:

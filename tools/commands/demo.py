@@ -9,7 +9,7 @@ from weldcal.systems.runner import Progress, Run, no_progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
-from weldcal.tools.commands.run import FinishedRun, run_job
+from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.commands.run_files import weld_record, write_calibration, write_scans, write_weld_log
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
@@ -77,7 +77,7 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
     return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
 
 
-def write_result(result: DemoResult, finished: FinishedRun) -> None:
+def write_result(result: DemoResult, finished: JobRun) -> None:
     """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, report.html; each whole or not at all."""
     folder, run = result.folder, result.run
     folder.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.systems.jobs.mounting.calibrator import solve_mounting
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.run import FinishedRun, run_job
+from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.mounting import mounting_report
@@ -41,7 +41,7 @@ def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progres
     return report
 
 
-def write_mounting(report: MountingReport, finished: FinishedRun) -> None:
+def write_mounting(report: MountingReport, finished: JobRun) -> None:
     """Write hand_eye.yaml with its exports, sightings.csv, summary.txt, station.png, report.html and recording.html."""
     folder = report.folder
     scenario = yaml_dump_typed(report.run.cell.scenario)

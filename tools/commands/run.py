@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class FinishedRun:
+class JobRun:
     """A run that ended, done or held; the viewer that recorded it, where there is one; what moved, for a person."""
 
     run: Run[Any]
@@ -45,7 +45,7 @@ class FinishedRun:
             write_atomic(folder / "recording.html", self.meshcat.StaticHtml())
 
 
-def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: str | None = None) -> FinishedRun:
+def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: str | None = None) -> JobRun:
     """Build the cell and run its job to the end; `key` is that of the job that the scenario must describe, None: any.
 
     Raises:
@@ -72,7 +72,7 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                     webbrowser.open(meshcat.web_url())
                     time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
             run = run_cell(cell, progress, meshcat, options.realtime)
-    return FinishedRun(run, meshcat, robot.title)
+    return JobRun(run, meshcat, robot.title)
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array) -> None:

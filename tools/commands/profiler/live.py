@@ -17,7 +17,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.commands.run import FinishedRun, run_job
+from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.profiler import WITHIN_MM, LiveOutcome, ProfilerLive, live_outcome
 from weldcal.tools.report.profiler_live import live_report, seeds_report
@@ -39,7 +39,7 @@ def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progres
     return live
 
 
-def write_live(live: ProfilerLive, finished: FinishedRun) -> None:
+def write_live(live: ProfilerLive, finished: JobRun) -> None:
     """Write edge.npz, sphere.npz, seam.npz (as weldcal profiler reads them), edge/ and sphere/ with profiler.yaml, seam.csv, report.html."""
     s, arm, folder = live.state, finished.cell.station.arm, live.folder
     folder.mkdir(parents=True, exist_ok=True)
