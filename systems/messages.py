@@ -162,4 +162,4 @@ class PlannedSeam(Message):
     points_B: NDArray[np.float64] | None = None
     reason: str | None = None
     sigma_m: float = np.nan  # of the planned root, sideways
-    words: str = ""  # what was found in the scan, in a sentence
+    summary: str = ""  # what was found in the scan, in a sentence

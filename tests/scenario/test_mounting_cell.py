@@ -74,8 +74,8 @@ def test_what_is_sought_is_found_where_it_truly_is(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(SHORT))
-def test_a_pose_kept_aside_is_where_the_calibration_expects_it(name: str) -> None:
-    (aside,) = finished(name).status.kept_aside
+def test_a_held_out_pose_is_where_the_calibration_expects_it(name: str) -> None:
+    (aside,) = finished(name).status.held_out
     assert aside.error_m < 3e-4
     assert np.degrees(aside.tilt_rad) < 0.1
 

@@ -49,7 +49,7 @@ def write_mounting(report: MountingReport, finished: FinishedRun) -> None:
     if report.result is not None:
         provenance = Provenance("scenario.yaml", sha256(scenario.encode()).hexdigest())
         export_hand_eye(report.result, report.mounting, folder, provenance)
-    write_atomic(folder / "sightings.csv", _sightings(report))
+    write_atomic(folder / "sightings.csv", _observations(report))
     write_atomic(folder / "summary.txt", report.text() + "\n")
     picture = station_picture(report)
     if picture is not None:
@@ -58,7 +58,7 @@ def write_mounting(report: MountingReport, finished: FinishedRun) -> None:
     write_atomic(folder / "report.html", mounting_report(report, picture))
 
 
-def _sightings(report: MountingReport) -> str:
+def _observations(report: MountingReport) -> str:
     """One row a scan: joints (deg), centre (mm) and normal in the camera frame, share of the edge that was seen."""
     two = report.job.scene.two
     text = io.StringIO()
@@ -67,7 +67,7 @@ def _sightings(report: MountingReport) -> str:
     writer.writerow(["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"])
     for s in report.status.seen:
         q = np.degrees(s.pose.q if s.pose.q_2 is None else np.concatenate([s.pose.q, s.pose.q_2]))
-        normal = np.zeros(3) if s.sighting.n_CM is None else s.sighting.n_CM
-        values = [*q, *(1e3 * s.sighting.p_CM), *normal, s.coverage]
+        normal = np.zeros(3) if s.observation.n_CM is None else s.observation.n_CM
+        values = [*q, *(1e3 * s.observation.p_CM), *normal, s.coverage]
         writer.writerow([s.label, *(json.dumps(round(float(v), 6)) for v in values)])
     return text.getvalue()

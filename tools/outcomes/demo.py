@@ -76,7 +76,7 @@ class DemoResult:
             plan = self.run.cell.job.planned_seam(self.run.root)
             if np.isfinite(plan.sigma_m):
                 found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
-            found["plan_words"] = plan.words
+            found["plan_words"] = plan.summary
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
         found |= self.run.timing()
         return found

@@ -104,8 +104,8 @@ class MountingReport:
             out |= {
                 "held_out_deg": result.held_out.rms_deg,
                 "held_out_mm": 1e3 * result.held_out.rms_translation,
-                "kept_aside_mm": [1e3 * k.error_m for k in status.kept_aside],
-                "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.kept_aside],
+                "kept_aside_mm": [1e3 * k.error_m for k in status.held_out],
+                "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.held_out],
                 "expected_error_mm": 1e3 * status.sigma_work_m,
                 "work_error_mm": self.work_error_mm(),
                 "truth": {s: vars(e) for s, e in self.truth_errors().items()},
@@ -138,7 +138,7 @@ class MountingReport:
             return f"{self.mounting.name}: {self.state}. {self.reason}"
         lines = [HandEyeReport(self.result, self.mounting, (), None, (), self.seconds).text(), ""]
         lines += [f"given        {sentence}" for sentence in self.given()]
-        aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.kept_aside)
+        aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.held_out)
         if aside:
             lines.append(f"kept aside   {aside} mm at poses the calibration never saw")
         lines.append(

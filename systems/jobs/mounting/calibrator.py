@@ -24,7 +24,7 @@ from weldcal.calibration.planning.mounting_poses import MountingPose, informatio
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.systems.jobs.mounting.messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
+from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
@@ -123,10 +123,10 @@ def digest(
     except FlangeNotFound as error:
         return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
     if job.purpose == "verify":
-        return dc.replace(status, kept_aside=(*status.kept_aside, compare(job.label, fit, belief, q, q_2)))
+        return dc.replace(status, held_out=(*status.held_out, compare(job.label, fit, belief, q, q_2)))
     X_CR = belief.seen(q, q_2)
-    sighting = scene.observation(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
-    seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), sighting, fit.coverage)
+    observation = scene.observation(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
+    seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), observation, fit.coverage)
     status = dc.replace(status, seen=(*status.seen, seen), message="")
     if len(status.seen) < fewest(scene):
         return status
@@ -173,7 +173,7 @@ def fewest(scene: MountingScene) -> int:
 
 def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: int = 0) -> HandEyeResult:
     """The unknown poses from all sightings, the belief as one start among the closed forms. Raises as solve_problem."""
-    mounting, problem = scene.mounting, scene.problem([s.sighting for s in seen])
+    mounting, problem = scene.mounting, scene.problem([s.observation for s in seen])
     result = solve_problem(
         problem,
         scene.state,
@@ -191,11 +191,11 @@ def sigma_of_work(scene: MountingScene, result: HandEyeResult) -> float:
     return float(np.sqrt(np.trace(J @ result.covariance["X"] @ J.T)))
 
 
-def compare(label: str, fit: FlangeFit, belief: MountingScene, q: Array, q_2: Array | None) -> KeptAside:
+def compare(label: str, fit: FlangeFit, belief: MountingScene, q: Array, q_2: Array | None) -> HeldOut:
     """Position and tilt of a circle that the calibration never saw, off what it expects."""
     X_CR = belief.seen(q, q_2)
     cosine = float(np.clip(X_CR.rotation().matrix()[:, 2] @ fit.normal_C, -1.0, 1.0))
-    return KeptAside(label, float(np.linalg.norm(X_CR.translation() - fit.center_C)), float(np.arccos(cosine)))
+    return HeldOut(label, float(np.linalg.norm(X_CR.translation() - fit.center_C)), float(np.arccos(cosine)))
 
 
 def next_best(
@@ -208,7 +208,7 @@ def next_best(
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None
-    problem = belief.problem([s.sighting for s in seen]).pick(result.inliers)
+    problem = belief.problem([s.observation for s in seen]).pick(result.inliers)
     taken = information_of(problem, belief.state)[0] + prior(belief)[:size, :size]
     more = information(belief, left, np.sqrt(own[3:]), float(np.sqrt(own[0])))[:, :size, :size]
     J = np.hstack([-skew(belief.X_LC.rotation().matrix() @ work_point(belief)), np.eye(3)])
@@ -223,5 +223,5 @@ def next_best(
 
 
 def _covariance_of(seen: SeenCircle) -> Array:
-    C = seen.sighting.covariance
+    C = seen.observation.covariance
     return np.zeros((6, 6)) if C is None else C

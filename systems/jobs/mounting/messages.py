@@ -39,12 +39,12 @@ class SeenCircle(Message):
 
     label: str
     pose: MountingPose
-    sighting: TargetObservation
+    observation: TargetObservation
     coverage: float
 
 
 @dataclass(frozen=True)
-class KeptAside:
+class HeldOut:
     """How far the circle was, in a scan that the calibration never saw, from where the calibration expects it."""
 
     label: str
@@ -84,7 +84,7 @@ class MountingStatus(Message):
     result: HandEyeResult | None = None
     sigma_work_m: float = np.inf  # predicted error (3-D, rms) of a point at the scanner's best distance
     history: tuple[tuple[int, float], ...] = ()
-    kept_aside: tuple[KeptAside, ...] = ()
+    held_out: tuple[HeldOut, ...] = ()
     next_best: NextBest | None = None
     done: bool = False
     message: str = ""

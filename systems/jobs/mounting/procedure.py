@@ -42,21 +42,21 @@ class MountingProcedure(LeafSystem):
 
     One arm moves at a time: towards a pose the second one first, homewards the first one first; the way home is thus the way
     from home backwards. An arm that stands elsewhere goes home first. `hold` (1) is a person's wish to stop. The first `scans`
-    poses of the plan are for the calibration (fewer where it is sure enough before), `kept_aside` more for its verification.
+    poses of the plan are for the calibration (fewer where it is sure enough before), `held_out` more for its verification.
     """
 
     def __init__(
         self,
         plan: Sequence[MountingPose],
         scans: int,
-        kept_aside: int,
+        held_out: int,
         home: tuple[Array, Array | None],
         timeout_s: float = 60.0,
         maximum_time_s: float = np.inf,
         period_s: float = 0.008,
     ) -> None:
         super().__init__()
-        self._plan, self._scans, self._kept_aside = tuple(plan), scans, kept_aside
+        self._plan, self._scans, self._held_out = tuple(plan), scans, held_out
         self.home, self._timeout_s, self._maximum_time_s = home, timeout_s, maximum_time_s
         self._settled = [self.DeclareVectorInputPort(n, 1) for n in ("settled_goal", "settled_goal_2")]
         self._robots = [
@@ -113,7 +113,7 @@ class MountingProcedure(LeafSystem):
         if s.purpose == "calibrate" and (status.done or s.visit + 1 >= self._scans):
             # the poses kept aside are reached from home, wherever the calibration ended
             return _go(replace(s, visit=self._scans - 1), self._homeward(), "", now)
-        if s.visit + 1 >= self._scans + self._kept_aside:
+        if s.visit + 1 >= self._scans + self._held_out:
             return _go(s, self._homeward(), "", now)
         return self._visit(s, s.visit + 1, now)
 
@@ -122,7 +122,7 @@ class MountingProcedure(LeafSystem):
             return _go(s, s.route, s.label, now)
         if s.label:
             return replace(s, phase="scan", since=now, trigger=s.trigger + 1)
-        if s.visit + 1 < self._scans + self._kept_aside:
+        if s.visit + 1 < self._scans + self._held_out:
             return self._visit(s, s.visit + 1, now)
         return replace(s, phase="done", since=now)
 

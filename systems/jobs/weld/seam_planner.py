@@ -108,7 +108,7 @@ class SeamPlanner(LeafSystem):
             q_retract,
             points_B,
             sigma_m=found.sigma_m,
-            words=found.summary,
+            summary=found.summary,
         )
 
     def _output(self, context: Context, output: Any) -> None:
@@ -210,5 +210,5 @@ class DrawnSeamPlanner(SeamPlanner):
             q_above,
             q_retract,
             points_B,
-            words="the fixture's drawing is believed: nothing in the scan was asked where the part lies",
+            summary="the fixture's drawing is believed: nothing in the scan was asked where the part lies",
         )

@@ -1,7 +1,7 @@
 """Is this robot ready? Every check before the first motion, in the order in which a person at the pendant mends them.
 
 Nothing moves, nothing is written, nothing is uploaded: outputs are read, and input registers are asked for and given
-back. The remedies use the words of PolyScope 5's menus.
+back. The operator actions use the words of PolyScope 5's menus.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.readiness import operator_actions as remedies
+from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KINEMATICS_TOLERANCE_M,
     KINEMATICS_TOLERANCE_RAD,
@@ -81,13 +81,13 @@ WAITS_FOR = {
 class Check:
     """One thing looked at: what was found, and what to press where it is not right.
 
-    checked is False where an earlier problem kept it from being made; then ok is False too and there is no remedy.
+    checked is False where an earlier problem kept it from being made; then ok is False too and there is no operator action.
     """
 
     name: str
     ok: bool
     found: str
-    remedy: str = ""
+    operator_action: str = ""
     checked: bool = True
 
 
@@ -146,11 +146,11 @@ def require_ready(report: Preflight) -> None:
 
     Raises:
         RobotUnreachable: nothing answers there.
-        RobotRefused: the first check that is not ok; the text is its remedy.
+        RobotRefused: the first check that is not ok; the text is its operator action.
     """
     problem = report.first_problem
     if problem is not None:
-        raise (RobotUnreachable if problem.name == "answer" else RobotRefused)(problem.remedy)
+        raise (RobotUnreachable if problem.name == "answer" else RobotRefused)(problem.operator_action)
 
 
 class _Look:
@@ -231,17 +231,17 @@ class _Look:
             claims = rtde.claim(_registers(self._offset))
             self._seen = rtde.read((*OUTPUTS, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
-            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", remedies.VERSION)
+            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
         return claims
 
     def _ok(self, name: str, found: str) -> None:
         self._done[name] = Check(name, True, found)
 
-    def _bad(self, name: str, found: str, remedy: str) -> None:
-        self._done[name] = Check(name, False, found, remedy)
+    def _bad(self, name: str, found: str, action: str) -> None:
+        self._done[name] = Check(name, False, found, action)
 
-    def _state(self, name: str, ok: bool, found: str, remedy: str) -> None:
-        self._done[name] = Check(name, ok, found, "" if ok else remedy)
+    def _state(self, name: str, ok: bool, found: str, action: str) -> None:
+        self._done[name] = Check(name, ok, found, "" if ok else action)
 
     def _number(self, name: str) -> float:
         return float(cast(float, self._seen[name]))
@@ -258,23 +258,23 @@ class _Look:
 
     def _check_version(self, version: tuple[int, ...]) -> bool:
         good = is_supported(version)
-        self._state("version", good, self._version_text, remedies.VERSION)
+        self._state("version", good, self._version_text, actions.VERSION)
         return good
 
     def _check_safety(self) -> None:
         mode = int(self._number("safety_mode"))
-        found = remedies.SAFETY_MODES.get(mode, f"mode {mode}")
+        found = actions.SAFETY_MODES.get(mode, f"mode {mode}")
         if mode == REDUCED:
             found += " (the robot itself limits speed and force)"
-        self._state("safety", mode in (NORMAL, REDUCED), found, remedies.safety(mode))
+        self._state("safety", mode in (NORMAL, REDUCED), found, actions.safety(mode))
 
     def _check_power(self) -> None:
         mode = int(self._number("robot_mode"))
-        self._state("power", mode == RUNNING, remedies.ROBOT_MODES.get(mode, f"mode {mode}"), remedies.power(mode))
+        self._state("power", mode == RUNNING, actions.ROBOT_MODES.get(mode, f"mode {mode}"), actions.power(mode))
 
     def _check_program(self) -> None:
         state = int(self._number("runtime_state"))
-        found = remedies.RUNTIME_STATES.get(state, f"state {state}")
+        found = actions.RUNTIME_STATES.get(state, f"state {state}")
         name = ""
         if not self._is_x():
             try:
@@ -286,16 +286,16 @@ class _Look:
             if told in ("PLAYING", "PAUSED", "STOPPED"):
                 found = told if state == STOPPED else found
             elif told != LOCAL:
-                self._bad("program", f"the dashboard says {told} {name}".strip(), remedies.DASHBOARD)
+                self._bad("program", f"the dashboard says {told} {name}".strip(), actions.DASHBOARD)
                 return
         ready = found == "STOPPED"
         label = f"{found} {name}".strip() if not ready else "none runs"
-        self._state("program", ready, label, remedies.program(found, name))
+        self._state("program", ready, label, actions.program(found, name))
 
     def _check_standstill(self) -> None:
         speed = float(np.abs(self._vector("actual_qd")).max())
         found = "at rest" if speed <= REST_RAD_S else f"a joint turns at {np.rad2deg(speed):.1f} deg/s"
-        self._state("standstill", speed <= REST_RAD_S, found, remedies.STANDSTILL)
+        self._state("standstill", speed <= REST_RAD_S, found, actions.STANDSTILL)
 
     def _check_limits(self) -> None:
         q, arm = self._vector("actual_q"), self._nominal
@@ -304,27 +304,27 @@ class _Look:
         joint = arm.joint_names[worst].removesuffix("_joint").replace("_", " ")
         degrees = np.rad2deg(room[worst])
         found = f"{degrees:.0f} deg of room ({joint})" if degrees >= 0.0 else f"{joint} {-degrees:.0f} deg beyond"
-        self._state("joint limits", bool(room[worst] >= LIMIT_MARGIN_RAD), found, remedies.limits(joint))
+        self._state("joint limits", bool(room[worst] >= LIMIT_MARGIN_RAD), found, actions.limits(joint))
 
     def _check_tcp(self) -> None:
         offset = self._vector("tcp_offset")
         zero = bool(np.abs(offset).max() <= TCP_ZERO)
         found = "zero" if zero else f"{_triple(1e3 * offset[:3])} mm, {_triple(np.rad2deg(offset[3:]))} deg"
-        self._state("TCP", zero, found, remedies.TCP)
+        self._state("TCP", zero, found, actions.TCP)
 
     def _check_speed(self) -> None:
         slider, scaling = self._number("target_speed_fraction"), self._number("speed_scaling")
         # what the trajectory limiter says while no program runs is not published: it is shown, and judged once we move
         found = f"{100 * slider:.0f} %" + (f" (scaling {100 * scaling:.0f} %)" if scaling < FULL_SPEED else "")
-        self._state("speed slider", slider >= FULL_SPEED, found, remedies.SLIDER)
+        self._state("speed slider", slider >= FULL_SPEED, found, actions.SLIDER)
 
     def _check_registers(self, claims: Mapping[str, str], command: Value | None) -> None:
-        for answer, word, remedy in (
-            (IN_USE, "in use", remedies.REGISTERS),
-            (NOT_FOUND, "unknown", remedies.NO_REGISTERS),
+        for answer, word, action in (
+            (IN_USE, "in use", actions.REGISTERS),
+            (NOT_FOUND, "unknown", actions.NO_REGISTERS),
         ):
             if names := [name for name, kind in claims.items() if kind == answer]:
-                self._bad("registers", f"{_ranges(names)} {word}", remedy)
+                self._bad("registers", f"{_ranges(names)} {word}", action)
                 return
         # A command register that still holds an old command is no reason to refuse: nobody can clear it at the pendant,
         # the driver does, and the guard script obeys nothing until it has read zero there.
@@ -348,7 +348,7 @@ class _Look:
         error_m, error_rad = self._error = cross_check(self._arm, self._vector("actual_q"), pose, offset)
         agrees = error_m <= KINEMATICS_TOLERANCE_M and error_rad <= KINEMATICS_TOLERANCE_RAD
         found = f"{1e3 * error_m:.3f} mm, {np.rad2deg(error_rad):.4f} deg from the controller's"
-        self._state("flange pose", agrees, found, remedies.POSE)
+        self._state("flange pose", agrees, found, actions.POSE)
 
     def _check_remote(self) -> None:
         if self._is_x():
@@ -364,9 +364,9 @@ class _Look:
             self._bad("remote control", "the dashboard does not answer", str(problem))
             return
         if told not in ("true", "false", LOCAL):
-            self._bad("remote control", f"the dashboard says {told}", remedies.DASHBOARD)
+            self._bad("remote control", f"the dashboard says {told}", actions.DASHBOARD)
             return
-        self._state("remote control", told == "true", "on" if told == "true" else "local control", remedies.LOCAL)
+        self._state("remote control", told == "true", "on" if told == "true" else "local control", actions.LOCAL)
 
     def _ask(self, command: str) -> str:
         """The dashboard's answer, or LOCAL where it refuses because the robot is in local control."""
