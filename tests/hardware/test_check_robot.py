@@ -286,7 +286,7 @@ def test_a_controller_that_stands_still_is_left_in_time(robot: Emulator) -> None
     problem = preflight(HOST, timeout_s=0.3).first_problem
     assert time.monotonic() - start < 1.4
     assert problem is not None
-    assert "says nothing" in problem.operator_action
+    assert "sends no data" in problem.operator_action
     time.sleep(max(0.0, start + 1.55 - time.monotonic()))  # until it goes on
 
 
@@ -330,7 +330,7 @@ def test_the_dashboard_answers_one_question_a_connection(robot: Emulator) -> Non
 
 @pytest.fixture
 def mute() -> Iterator[str]:
-    """A host that accepts and says nothing."""
+    """A host that accepts and sends no data."""
     host = "127.0.0.24"
     stop = threading.Event()
     with socket.create_server((host, 30004)) as server:
@@ -366,7 +366,7 @@ def refused(host: str, **limits: float) -> str:
 
 
 def test_a_host_that_says_nothing(mute: str) -> None:
-    assert "takes a connection on its RTDE port 30004 but says nothing" in refused(mute)
+    assert "accepts a connection on its RTDE port 30004 but sends no data" in refused(mute)
 
 
 def test_an_address_where_nothing_listens() -> None:
@@ -411,7 +411,7 @@ def test_polyscope_x_is_checked_without_a_dashboard() -> None:
         assert report.ok, report.checks
         assert report.version is not None
         assert report.version[0] == 10
-        assert "cannot be asked" in report.checks[CHECKS.index("remote control")].found
+        assert "not readable" in report.checks[CHECKS.index("remote control")].found
         new.fault("foreign_program")
         problem = preflight(HOST_X).first_problem
         assert problem is not None
