@@ -334,7 +334,7 @@ def test_an_error_in_the_run_lets_go_of_the_robot() -> None:
     [
         ({"dry_run": True}, "--dry-run and --pace need a controller"),
         ({"robot": "simulated", "pace": 0.5}, "--dry-run and --pace need a controller"),
-        ({"robot": "192.0.2.1", "pace": 0.5}, "keeps its own time"),
+        ({"robot": "192.0.2.1", "pace": 0.5}, "runs in real time"),
         ({"robot": "emulated", "pace": 3.0}, "--pace must be from 0.05 to 1, and it is 3"),
         ({"robot": "127.0.0.9"}, "127.0.0.9"),
         ({"speed_factor": 7.0}, "job.speed_factor"),

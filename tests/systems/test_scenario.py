@@ -244,8 +244,8 @@ def test_one_of_everything_survives_being_written_and_read_again(everything: Sce
     )
 
 
-def test_a_scenario_is_one_procedure(everything: Scenario) -> None:
-    with pytest.raises(InputError, match="one procedure"):
+def test_a_scenario_has_one_job(everything: Scenario) -> None:
+    with pytest.raises(InputError, match="one job"):
         check_scenario(everything)
 
 

@@ -1,4 +1,4 @@
-"""weldcal hand-eye live: a calibration in any mounting, from the first pose to the report, against the truth where it is known."""
+"""Runs `weldcal hand-eye live`: a calibration in any mounting, with files and report, compared with the ground truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from weldcal.tools.report.render import write_atomic
 
 
 def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MountingReport:
-    """Build, run, write.
+    """Build and run the cell and write the results.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
@@ -59,7 +59,7 @@ def write_mounting(report: MountingReport, finished: FinishedRun) -> None:
 
 
 def _observations(report: MountingReport) -> str:
-    """One row a scan: joints (deg), centre (mm) and normal in the camera frame, share of the edge that was seen."""
+    """The rows of sightings.csv, one per scan: joints (deg), centre (mm) and normal in the camera frame, visible share of the edge."""
     two = report.job.scene.two
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -34,7 +34,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         deg = "–" if result is None else fixed(float(np.degrees(result.rotation_rad[i])), 4)
         rows.append((s.label, "used" if used else "left out", mm, deg, fixed(100 * s.coverage, 0)))
     rows += [
-        (k.label, "kept aside", fixed(1e3 * k.error_m, 3), fixed(float(np.degrees(k.tilt_rad)), 4), "–")
+        (k.label, "held out", fixed(1e3 * k.error_m, 3), fixed(float(np.degrees(k.tilt_rad)), 4), "–")
         for k in status.held_out
     ]
     return render(
