@@ -1,1 +1,1 @@
-"""Thin Drake LeafSystems over calibration and welding, the station and the cell Diagram."""
+"""Drake LeafSystems around calibration and welding, the station and the cell Diagram."""

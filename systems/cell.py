@@ -1,4 +1,4 @@
-"""The ONE builder: the station that a scenario describes, the spine that every job shares, and the scenario's job."""
+"""Builds the cell Diagram of a scenario: the station, the spine shared by all jobs, and the scenario's job."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ JobOf = TypeVar("JobOf", bound=AddedJob, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Cell(Generic[JobOf]):
-    """The Diagram and its named parts, for whoever simulates, records or tests it. Whoever makes one closes its station."""
+    """The Diagram and its named parts. The caller that builds a cell must close its station."""
 
     diagram: Diagram
     station: Station
@@ -38,18 +38,18 @@ class Cell(Generic[JobOf]):
 def build_cell(
     scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None, robot: PreparedRobot | None = None
 ) -> Cell[Any]:
-    """Build the whole cell for a scenario; whoever makes one closes its station.
+    """Build the cell of a scenario. The caller must close its station.
 
-    The same systems run against simulated plants and against hardware: only the drivers inside `make_station` differ.
+    The same systems run with simulated plants and with hardware; only the drivers inside `make_station` differ.
 
     Args:
-        scenario: what the cell is, and through its parts which job it does.
-        seed: everything random follows from it.
-        meshcat: where the cell is shown, with the operator's controls; None: nobody watches.
+        scenario: describes the cell; its parts determine the job.
+        seed: seed of all random numbers.
+        meshcat: viewer of the cell, with the operator's controls; None: no viewer.
         robot: see make_station.
 
     Raises:
-        InputError, UnreachableScanner: the scenario cannot be done; nothing has been written or moved.
+        InputError, UnreachableScanner: the scenario cannot be run; nothing has been written or moved.
     """
     job = job_of(scenario)
     station = make_station(scenario, seed, robot, job.furnish)

@@ -1,4 +1,4 @@
-"""What travels on the abstract ports: immutable messages, each datum with the time it was taken."""
+"""Immutable messages of the abstract ports, each datum with its capture time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from weldcal.welding.seam.curve import SeamCurve
 
 
 class Message:
-    """An immutable value on a port: Drake deep-copies abstract state at each event, and a message need never be copied."""
+    """An immutable port value. Drake deep-copies abstract state at each event; a message returns itself as its copy."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Message:
         return self
@@ -26,7 +26,7 @@ class Message:
 
 @dataclass(frozen=True, eq=False)
 class Scan(Message):
-    """One frame of the scanner: organised cloud p_CS (H, W, 3) in metres, NaN where there is no return."""
+    """One frame of the scanner: organised cloud p_CS (H, W, 3), m, NaN where there is no return."""
 
     sequence: int = 0
     capture_time: float = -np.inf
@@ -37,7 +37,7 @@ class Scan(Message):
 class Image(Message):
     """One frame of the finger camera: grey (H, W) uint8.
 
-    `capture_time` is the time on the arm's clock whose pose the frame shows; `exposed_at` when the shutter opened.
+    `capture_time` is the time, on the arm's clock, of the pose that the frame shows; `exposed_at` the time of the exposure.
     """
 
     sequence: int = 0
@@ -48,7 +48,7 @@ class Image(Message):
 
 @dataclass(frozen=True, eq=False)
 class ProfileScan(Message):
-    """One profile: points (n, 2) [x, z] m in S, NaN where nothing returned; the time it was taken; 0 before the first."""
+    """One profile: points (n, 2) [x, z] m in S, NaN where there is no return; `sequence` is 0 before the first."""
 
     sequence: int = 0
     capture_time: float = -np.inf
@@ -57,7 +57,7 @@ class ProfileScan(Message):
 
 @dataclass(frozen=True, eq=False)
 class TorchTouch(Message):
-    """The newest touch: its number, when it began, and whether it lasts."""
+    """The newest touch: its number, its start time, and whether the contact persists."""
 
     sequence: int = 0
     time: float = -np.inf
@@ -66,7 +66,7 @@ class TorchTouch(Message):
 
 @dataclass(frozen=True)
 class UrStatus(Message):
-    """What the controller says of itself, in the words of the RTDE enumerations."""
+    """The state of the controller, named as in the RTDE enumerations."""
 
     robot_mode: str = "RUNNING"
     safety_mode: str = "NORMAL"
@@ -76,23 +76,23 @@ class UrStatus(Message):
 
     @property
     def ready(self) -> bool:
-        """True while velocity commands are obeyed."""
+        """True while the controller executes velocity commands."""
         return self.fault is None and self.program_running and self.safety_mode in ("NORMAL", "REDUCED")
 
 
 @dataclass(frozen=True, eq=False)
 class JobCommand(Message):
-    """What the JobSequencer asks of the other systems."""
+    """The JobSequencer's command to the other systems."""
 
     phase: str = "start"
     mode: str = "hold"  # hold: zero velocity; move: the FlangeMover drives; weld: the servo drives
     goal_id: int = 0
     q_goal: NDArray[np.float64] | None = None  # (6,) rad
-    scan_sequence: int = 0  # the newest scan that was asked for
+    scan_sequence: int = 0  # number of the newest requested scan
     scan_purpose: str = ""  # calibrate, verify or workpiece: whose scan_sequence it is
     scan_label: str = ""
-    streaming: bool = False  # the finger camera runs
-    process_on: bool = False  # the torch may burn
+    streaming: bool = False  # the finger camera streams
+    process_on: bool = False  # the process is enabled
     finished: bool = False
     held: bool = False
     reason: str | None = None
@@ -100,7 +100,7 @@ class JobCommand(Message):
 
 @dataclass(frozen=True, eq=False)
 class FlangeEstimate(Message):
-    """What the FlangeEstimator found in one scan."""
+    """The FlangeEstimator's result for one scan."""
 
     sequence: int = 0
     capture_time: float = -np.inf
@@ -113,7 +113,7 @@ class FlangeEstimate(Message):
 
 @dataclass(frozen=True, eq=False)
 class VerificationResult(Message):
-    """How the calibration did at one pose it never saw."""
+    """Errors of the calibration at one held-out pose."""
 
     label: str
     error_m: float
@@ -124,7 +124,7 @@ class VerificationResult(Message):
 class CalibrationStatus(Message):
     """The state of the IterativeCalibrator after its newest scan."""
 
-    sequence: int = 0  # of the newest scan it has digested
+    sequence: int = 0  # of the newest processed scan
     calibration_scans: int = 0
     observations: tuple[Observation, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
@@ -143,23 +143,23 @@ class CalibrationStatus(Message):
 
     @property
     def X_BC(self) -> RigidTransform | None:
-        """The pose of the scanner in the base, once there is one."""
+        """The pose of the scanner in the base; None before the first estimate."""
         return None if self.estimate is None else self.estimate.X_BC
 
 
 @dataclass(frozen=True, eq=False)
 class PlannedSeam(Message):
-    """What the SeamPlanner made of the workpiece scan."""
+    """The SeamPlanner's result for the workpiece scan."""
 
     sequence: int = 0
     seam: SeamCurve | None = None
     X_BP: RigidTransform | None = None
     rms_m: float = np.nan
     confidence: float = 0.0
-    q_start: NDArray[np.float64] | None = None  # (6,) rad, where the touch begins
+    q_start: NDArray[np.float64] | None = None  # (6,) rad, at the start of the touch
     q_above: NDArray[np.float64] | None = None
     q_retract: NDArray[np.float64] | None = None
     points_B: NDArray[np.float64] | None = None
     reason: str | None = None
-    sigma_m: float = np.nan  # of the planned root, sideways
-    words: str = ""  # what was found in the scan, in a sentence
+    sigma_m: float = np.nan  # lateral sigma of the planned root
+    summary: str = ""  # the result of the scan, in one sentence

@@ -1,4 +1,4 @@
-"""Keeping the Diagram to the wall clock: wait while it is ahead; where it is late, say so and never catch up in a rush."""
+"""Paces the Diagram by the wall clock: waits while it is ahead; reports lateness and does not catch up."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ LATE_S = 0.020  # of the Diagram's time
 
 
 class WallClock:
-    """Lets the Diagram's time pass at `pace` seconds per second of the wall clock.
+    """Advances the Diagram's time at `pace` seconds per second of the wall clock.
 
-    A robot obeys what it is told when it is told it: a Diagram that hurried after a delay would send the past. So a delay of
-    more than LATE_S moves the anchor, and the Diagram goes on from there at its pace. Lateness is in seconds of the Diagram's
-    time: `late_s` is the worst while the arm was commanded to move, `thinking_s` the worst while it stood still, where a cell
-    may compute as long as it likes; `reanchored` counts how often the anchor moved while the arm moved, `lost_s` is by how much in all.
+    A robot executes commands when they arrive, so a Diagram that caught up after a delay would send outdated commands. A
+    delay of more than LATE_S therefore moves the anchor, and the Diagram continues from there at its pace. Lateness is in
+    seconds of the Diagram's time: `late_s` is the maximum while the arm was commanded to move, `thinking_s` the maximum while
+    it was at rest, where computing time is not limited. `reanchored` counts the anchor's moves during motion, and `lost_s` is
+    their sum.
     """
 
     def __init__(
@@ -38,7 +39,7 @@ class WallClock:
         self.lost_s = 0.0
 
     def wait_for(self, diagram_time: float, moving: bool) -> None:
-        """Return when the wall clock has come to this time of the Diagram. `moving`: the arm is commanded to move."""
+        """Wait until the wall clock reaches this time of the Diagram. `moving`: the arm is commanded to move."""
         now = self._clock()
         if self._anchor is None:
             self._anchor = (now, diagram_time)
@@ -57,22 +58,22 @@ class WallClock:
             self.lost_s += late if moving else 0.0
 
     def sentence(self) -> str | None:
-        """What a person should know of a run that did not keep up with its robot; None where it did."""
+        """A warning where the run did not keep up with its robot; None where it did."""
         if not self.reanchored:
             return None
         times = "once" if self.reanchored == 1 else f"{self.reanchored} times"
         return (
-            f"The computer fell behind the robot {times} while the arm moved, by {1e3 * self.lost_s:.0f} ms in all: meanwhile the arm "
-            "went on as it was told last, and the times of the run are too short by that. Close other programs."
+            f"The computer fell behind the robot {times} while the arm moved, by {1e3 * self.lost_s:.0f} ms in all. During that time the arm "
+            "followed its last command, and the times of the run are too short by the same amount. Close other programs."
         )
 
 
 @contextmanager
 def no_long_garbage_collections() -> Iterator[None]:
-    """Take everything that exists now out of the garbage collector's sight for the duration of the block.
+    """Exclude all present objects from garbage collection for the duration of the block.
 
-    A full collection looks at every object of every imported library and stops the Diagram for a tenth of a second and more.
-    Frozen, those are not looked at; what the run itself makes is collected as always, so that nothing piles up.
+    A full collection visits every object of every imported library and stops the Diagram for 0.1 s and more. Frozen objects
+    are not visited. Objects that the run creates are collected as usual, so memory does not grow.
     """
     gc.collect()
     gc.freeze()
@@ -83,20 +84,20 @@ def no_long_garbage_collections() -> Iterator[None]:
 
 
 def draw_in_this_thread() -> None:
-    """Have pictures drawn by the thread that asks for them: the renderer's own threads would not share its priority.
+    """Make the renderer draw in the calling thread, because the renderer's own threads do not have its priority.
 
-    Must be called before the first picture of this process. Each picture takes a third longer on an idle computer, and no
-    longer than that on a busy one.
+    Must be called before the first picture of this process. Each picture takes a third longer on an idle computer, and the
+    same time on a busy one.
     """
-    os.environ.setdefault("LP_NUM_THREADS", "0")  # of Mesa's llvmpipe; a graphics card does not read it
+    os.environ.setdefault("LP_NUM_THREADS", "0")  # read by Mesa's llvmpipe; ignored by graphics cards
 
 
 @contextmanager
 def real_time_priority() -> Iterator[None]:
-    """Run this thread before ordinary programs for the duration of the block, where the system lets it (rtprio, or root).
+    """Give this thread real-time priority for the duration of the block, where the system allows it (rtprio, or root).
 
-    Below the link's worker and the emulated controller, so that neither waits for the cell. The threads that draw what this one
-    will wait for run beside it. Threads and processes that it starts meanwhile are ordinary ones.
+    The priority is below that of the link's worker and the emulated controller, so that neither waits for the cell. The
+    rendering threads get the same priority. Threads and processes started in the block have ordinary priority.
     """
     drawing = [t.native_id for t in threading.enumerate() if t.name.startswith(PICTURE_THREAD) and t.native_id]
     before = {thread: (os.sched_getscheduler(thread), os.sched_getparam(thread)) for thread in (0, *drawing)}
@@ -110,5 +111,5 @@ def real_time_priority() -> Iterator[None]:
         yield
     finally:
         for thread, (policy, parameter) in before.items():
-            with suppress(ProcessLookupError):  # a drawing thread may have ended
+            with suppress(ProcessLookupError):  # a rendering thread may have ended
                 os.sched_setscheduler(thread, policy, parameter)

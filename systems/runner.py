@@ -1,4 +1,4 @@
-"""The one run loop: advance a cell's Diagram until its job ends, keep to the wall clock where the robot is real, keep every scan."""
+"""Runs a cell: advances its Diagram until the job ends, in real time for a real robot, and stores every scan."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ LOOKS = {
     "job": 0.008,
     "progress": 1.0,
     "panel": 0.1,
-}  # seconds between looks; the sequencer's own period is longer than a look's
+}  # seconds between checks; shorter than the sequencer's period
 AT_REST_RAD_S = 1e-3
 COMMANDED_RAD_S = 1e-6
-COMES_TO_REST_S = 1.0  # how long a run goes on after its job has ended, at most, until the arm is at rest
-OVERTIME_S = 5.0  # beyond the time after which the job holds itself
+COMES_TO_REST_S = 1.0  # longest time that a run continues after the end of its job until the arm is at rest
+OVERTIME_S = 5.0  # added to the time limit at which the job holds itself
 
 
 def no_progress(stage: str, fraction: float) -> None:
-    """For callers who do not watch."""
+    """A progress callback that does nothing."""
 
 
 @dataclass
 class Run(Generic[JobOf]):
     """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
 
-    `interrupted`: why a person ended it before its job had. `clock`: what kept it to the wall clock, where something did.
+    `interrupted`: the reason where a person ended the run before its job. `clock`: the clock of a paced run, else None.
     """
 
     cell: Cell[JobOf]
@@ -64,17 +64,17 @@ class Run(Generic[JobOf]):
 
     @property
     def command(self) -> JobCommand:
-        """What the job asked last."""
+        """The job's last command."""
         return self.cell.job.command(self.root)
 
     @property
     def held(self) -> bool:
-        """The job did not come to its end."""
+        """Whether the job was not completed."""
         return self.interrupted is not None or self.command.held or not self.command.finished
 
     @property
     def reason(self) -> str | None:
-        """Why it did not."""
+        """Why the job was held; None where it was completed."""
         return self.interrupted or self.command.reason
 
     def real_time_factor(self, phase: str | None = None) -> float:
@@ -85,7 +85,7 @@ class Run(Generic[JobOf]):
         return float(sum(s for s, _ in spans) / max(sum(w for _, w in spans), 1e-9))
 
     def timing(self) -> dict[str, object]:
-        """The figures of time that every run's JSON object ends with."""
+        """The timing values at the end of every run's JSON object."""
         found: dict[str, object] = {
             "simulated_seconds": self.seconds,
             "wall_seconds": self.wall_seconds,
@@ -102,10 +102,10 @@ class Run(Generic[JobOf]):
 def run_cell(
     cell: Cell[JobOf], progress: Progress = no_progress, meshcat: Meshcat | None = None, realtime: bool = False
 ) -> Run[JobOf]:
-    """Advance until the job is done or held (or its own time limit holds it) and the arm is at rest.
+    """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
-    Records into `meshcat` where one is given. A station with a pace is kept to the wall clock. Whatever happens, Ctrl-C
-    included, the station is closed: its arm stops.
+    Records into `meshcat` where one is given. A station with a pace runs at that pace of the wall clock. The station is
+    always closed, also on Ctrl-C, which stops its arm.
     """
     simulator, station = Simulator(cell.diagram), cell.station
     run = Run(cell, simulator, clock=None if station.pace is None else WallClock(station.pace))
@@ -167,7 +167,7 @@ def run_cell(
 
 
 def _commanded(cell: Cell[JobOf], root: Context) -> bool:
-    """Whether the arm is told to move."""
+    """Whether the arm is commanded to move."""
     station = cell.station.diagram
     command = station.GetInputPort(f"{FIRST}.velocity_command").Eval(station.GetMyContextFromRoot(root))
     return bool(np.max(np.abs(command)) > COMMANDED_RAD_S)
@@ -180,7 +180,7 @@ def _at_rest(cell: Cell[JobOf], root: Context) -> bool:
 
 
 def _first_pictures(cell: Cell[JobOf], root: Context) -> None:
-    """A renderer's first picture takes a second: let it be taken while nothing moves."""
+    """Take each renderer's first picture, which takes a second, while nothing moves."""
     for system in cell.station.diagram.GetSystems():
         if isinstance(system, RgbdSensor):
             context = system.GetMyContextFromRoot(root)
@@ -191,7 +191,7 @@ def _first_pictures(cell: Cell[JobOf], root: Context) -> None:
 
 
 def _keep_pace(run: Run[JobOf], root: Context) -> None:
-    """The viewer's slider sets how fast the simulation may go."""
+    """Set the simulation's real-time rate from the viewer's slider."""
     panel = run.cell.diagram.GetSubsystemByName("operator_panel")
     pace = float(panel.GetOutputPort("pace").Eval(panel.GetMyContextFromRoot(root))[0])
     if pace != run.simulator.get_target_realtime_rate():
@@ -199,7 +199,7 @@ def _keep_pace(run: Run[JobOf], root: Context) -> None:
 
 
 def _keep_scan(run: Run[JobOf], root: Context) -> None:
-    """A phase that follows a scan begins after the scan was digested: keep it, with its purpose."""
+    """Store a new scan with its purpose; the phase after a scan starts only when the scan has been processed."""
     station = run.cell.station.diagram
     if not run.phases or not run.phases[-1][0].startswith("scan_") or not station.HasOutputPort("scanner.scan"):
         return

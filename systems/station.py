@@ -1,4 +1,4 @@
-"""The station: arms, sensors and tools behind fixed ports; the scenario's driver configs say what is real."""
+"""Builds the station: arms, sensors and tools with fixed ports; the scenario's driver configs select real or simulated."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 @dc.dataclass(frozen=True, eq=False)
 class Truth(Message):
-    """What only a simulation knows; for reports and tests (`cheat.*`), never for an algorithm."""
+    """Ground truth of a simulation, for reports and tests (`cheat.*`) only."""
 
     X_BC: RigidTransform | None
     X_BP: RigidTransform | None
-    workpiece: Workpiece | None  # the part as it really is
+    workpiece: Workpiece | None  # the true part
     tablet: TabletTruth | None = None  # camera and pen on the wrist and the tablet on the table
     X_LC: RigidTransform | None = None  # the scanner on what carries it, where that is not the base
     X_BD: RigidTransform | None = None  # the second arm's base
@@ -46,46 +46,46 @@ class Truth(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class Station:
-    """The station's Diagram and the handles that the cell needs to build around it. Whoever makes one closes it."""
+    """The station's Diagram and the handles that the cell needs. The caller that makes a station must close it."""
 
     diagram: Diagram
     robot: PreparedRobot
     tool: WeldingTool | None
-    cad: Workpiece | None  # the part as drawn
+    cad: Workpiece | None  # the nominal part
     truth: Truth
     world: SimulatedWorld | None  # None where no device is simulated
     second: ArmModel | None = None
 
     @property
     def arm(self) -> ArmModel:
-        """The robot's own arm."""
+        """The arm model of the robot, with its own kinematics."""
         return self.robot.arm
 
     @property
     def q_start(self) -> np.ndarray:
-        """Where the arm stood when the station was built (6,), rad."""
+        """The arm's configuration (6,) rad at the time the station was built."""
         return self.robot.q_start
 
     @property
     def pace(self) -> float | None:
-        """How many seconds of the Diagram a second of the wall clock must be worth; None: as fast as it goes."""
+        """Seconds of the Diagram per second of the wall clock; None: as fast as possible."""
         return self.robot.pace
 
     def close(self) -> None:
-        """Stop the arm and let go of the hardware; a second call does nothing."""
+        """Stop the arm and release the hardware; a second call has no effect."""
         self.robot.close()
 
 
 def apply_driver_config(config: Any, build: StationBuild) -> Any:
-    """Call the ApplyDriverConfig that stands in the module of the config's class, as pydrake.manipulation does."""
+    """Call the ApplyDriverConfig of the module that defines the config's class, as pydrake.manipulation does."""
     apply = getattr(inspect.getmodule(type(config)), "ApplyDriverConfig", None)
     return None if apply is None else apply(config, build)
 
 
 def prepare_robot(config: Any, nominal: ArmModel, q_home: np.ndarray) -> PreparedRobot:
-    """Ask the PrepareRobot in the module of the config's class, where there is one, which arm this is and where it stands.
+    """Call the PrepareRobot of the module that defines the config's class, which returns the arm and its configuration.
 
-    A driver without one has the nominal arm, and it stands at home.
+    A driver without one has the nominal arm at home.
     """
     prepare = getattr(inspect.getmodule(type(config)), "PrepareRobot", None)
     if prepare is None:
@@ -95,7 +95,7 @@ def prepare_robot(config: Any, nominal: ArmModel, q_home: np.ndarray) -> Prepare
 
 
 class CheatPoses(LeafSystem):
-    """Where tip, torch and flange truly are.
+    """Outputs the true positions of tip and torch.
 
     .. pydrake_system::
 
@@ -130,21 +130,21 @@ class CheatPoses(LeafSystem):
 
 
 class Furnish(Protocol):
-    """What a job puts into the simulated world (Job.furnish)."""
+    """The signature of Job.furnish, which adds a job's objects to the simulated world."""
 
     def __call__(
         self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
     ) -> Furnishing:
-        """Draw it from the run's random numbers."""
+        """Draw the furnishing with the run's random numbers."""
 
 
 def make_station(
     scenario: Scenario, seed: int, robot: PreparedRobot | None = None, furnish: Furnish | None = None
 ) -> Station:
-    """Build the station that the scenario describes; every random difference between world and drawing comes from `seed`.
+    """Build the station of a scenario; all random deviations of the simulated world follow from `seed`.
 
-    `robot` is the robot as somebody else has found it; None: the driver in the scenario is asked. `furnish` is the job's.
-    A station in which no device is simulated holds no simulated world: the arm is drawn where it is measured.
+    `robot` is an already prepared robot; None: the driver in the scenario prepares it. `furnish` is the job's method.
+    A station without simulated devices has no simulated world: the arm is displayed at its measured joints.
 
     Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
     `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
@@ -221,7 +221,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
-    """Let the driver that knows one arm drive the second: it is handed a world whose arm this is, and its ports are renamed."""
+    """Apply a single-arm driver to the second arm: it gets a world with this arm as its arm, and its ports are renamed."""
     world = build.require(SimulatedWorld)
     assert world.second is not None
     own = dc.replace(
@@ -243,7 +243,7 @@ def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationB
 
 
 def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
-    """The welding tool, as hard as it is pressed into the groove that it is for."""
+    """The welding tool with the scenario's press deflections and the groove angle of the workpiece."""
     tool, welding = WeldingTool(), scenario.welding
     return dc.replace(
         tool,
@@ -256,7 +256,7 @@ def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
 def _workpieces(
     scenario: Scenario, rng: np.random.Generator
 ) -> tuple[Workpiece | None, Workpiece | None, RigidTransform | None]:
-    """The part as drawn, the part as it is, and where it lies."""
+    """The nominal part, the true part, and the true pose."""
     spec = scenario.workpiece
     if spec is None:
         return None, None, None
@@ -276,7 +276,7 @@ def _workpieces(
 
 
 def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
-    """A plate lies flat on its fixture: it may be moved and turned in its plane."""
+    """Draw the pose error of a plate on its fixture: a translation and a rotation in its plane."""
     error = random_pose_error(rng, translation_m, rotation_rad)
     p = np.array(error.translation())
     length = np.hypot(p[0], p[1])

@@ -1,4 +1,4 @@
-"""The builder of a cell with what each of its parts needs, and short ways to add and connect systems."""
+"""A DiagramBuilder of a cell with the objects that its parts share, and methods to add and connect systems."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """A cell while it is built; `meshcat` where somebody watches, `seed` for what is random."""
+    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers."""
 
     builder: DiagramBuilder
     station: Station
@@ -47,7 +47,7 @@ class Wiring:
         self.builder.Connect(source, self.station.diagram.GetInputPort(name))
 
     def constant(self, name: str, value: object) -> OutputPort:
-        """A port that always shows this message."""
+        """An output port with a constant message."""
         return self.add(name, ConstantValueSource(AbstractValue.Make(value))).get_output_port()
 
     def zeros(self, name: str, size: int) -> OutputPort:

@@ -1,1 +1,1 @@
-"""Bodies that a plant may hold, simulated or only drawn: the flange, the welding tool, printed boards."""
+"""Bodies added to a plant, simulated or for display only: the flange, the welding tool, printed boards."""

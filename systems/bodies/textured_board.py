@@ -1,4 +1,4 @@
-"""A flat board that carries a picture: the print of the tag, the sign of a phase."""
+"""A flat mesh textured with a picture, such as the printed tag or a phase label."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from pydrake.geometry import InMemoryMesh, Mesh
 
 
 def textured_board(name: str, width_m: float, height_m: float, picture: NDArray[np.uint8]) -> Mesh:
-    """A rectangle about the origin in the x-y plane, facing +z, x to the right of the picture and y up.
+    """A rectangle centred on the origin in the x-y plane, facing +z, x to the right of the picture and y up.
 
-    `picture` is (h, w) grey or (h, w, 3) BGR uint8. Renderers interpolate between its pixels, so its edges are as smooth as
-    a camera's picture of a print; edges of geometry would be jagged.
+    `picture` is (h, w) grey or (h, w, 3) BGR uint8. Renderers interpolate between its pixels, so its edges are smooth, as in
+    a camera's picture of a print. Edges of geometry would be aliased.
     """
     w, h = 0.5 * width_m, 0.5 * height_m
     obj = (

@@ -1,4 +1,4 @@
-"""The bodies of flange and welding tool in a plant, as they are seen and as they touch."""
+"""Adds the flange and the welding tool to a plant: bodies, visual geometry and contact geometry."""
 
 from __future__ import annotations
 
@@ -43,36 +43,36 @@ COPPER = (0.80, 0.45, 0.20, 1.0)
 SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
 CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of it
-# A pixel of a camera gathers light over its area through a lens; a renderer looks at one point of each. What lens and pixel
-# blur, in texels, is put into the print, or edges would lie a tenth of a pixel off wherever they run along the pixels.
+# A camera pixel integrates light over its area through a lens; a renderer samples one point of it. The blur of lens and pixel,
+# in texels, is applied to the print. Without it, edges parallel to the pixel rows would be off by a tenth of a pixel.
 BLUR_TEXELS = 1.2
 TIP_FRICTION = 0.2  # soft tip on steel
-# The contact model's ball is a polyhedron inside the ball it is asked for, with this share of its volume (at a resolution of half
-# the radius). It is asked for one as much larger, or the tip would sink by what the corners were cut off.
+# The contact model approximates a sphere by an inscribed polyhedron with this share of its volume (at a resolution of half the
+# radius). The requested sphere is larger by the same factor, so that the polyhedron has the tip's volume.
 CONTACT_MESH_VOLUME = 0.9114
 
 
 def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
-    """A Drake Mesh of a TriMesh, kept in memory."""
+    """Convert a TriMesh to an in-memory Drake Mesh."""
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents=mesh.to_obj(), extension=".obj", filename_hint=name)))
 
 
 def show(
     plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]
 ) -> None:
-    """Give a body something to see, in Meshcat and in the rendered images alike."""
+    """Register visual geometry on a body, for Meshcat and for rendered images."""
     plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
 
 
 def add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> None:
-    """The ISO 9409-1 flange: its face in the flange frame's plane, its back inside the wrist."""
+    """Add the ISO 9409-1 flange: its face in the flange frame's x-y plane, its back inside the wrist."""
     body = plant.GetBodyByName("flange", arm)
     shape = mesh_shape(flange_mesh(get_flange(flange), thickness_m=0.012), "flange.obj")
     show(plant, body, RigidTransform(), shape, "iso_flange", STEEL)
 
 
 def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: TagModel) -> None:
-    """The tag with a white margin of one cell, in the marker frame (x right, y up, z out of the print)."""
+    """Add the tag with a white margin of one cell, in the marker frame (x right, y up, z out of the print)."""
     cells = cv2.copyMakeBorder(255 * tag_cells(tag).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=255)
     sharp = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
     print_ = np.asarray(cv2.GaussianBlur(sharp, (0, 0), BLUR_TEXELS), dtype=np.uint8)
@@ -86,7 +86,7 @@ def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: T
 def add_tool(
     plant: MultibodyPlant, arm: ModelInstanceIndex, tool: WeldingTool, contact_hint_m: float
 ) -> tuple[ModelInstanceIndex, tuple[PrismaticJoint, ...]]:
-    """Plate, ring, camera, torch (welded to the flange) and the soft tip on three sprung prismatic joints."""
+    """Add plate, ring, camera and torch, welded to the flange, and the soft tip on three sprung prismatic joints."""
     instance = plant.AddModelInstance("tool")
     flange_frame = plant.GetFrameByName("flange", arm)
     inertia = SpatialInertia(
@@ -133,7 +133,7 @@ def add_tool(
     show(plant, plate, RigidTransform([p_FW[0], 0.0, t + length / 2]), Cylinder(0.009, length), "torch_body", COPPER)
     show(plant, plate, RigidTransform([p_FW[0], 0.0, p_FW[2] - 0.006]), Cylinder(0.0006, 0.012), "torch_wire", STEEL)
 
-    # Three prismatic joints in series carry the tip; the springs are implicit PD, stable at 2 ms with a mass of grams.
+    # Three prismatic joints in series carry the tip; the springs are implicit PD controllers, stable at 2 ms with a mass of grams.
     parent = plant.AddFrame(_fixed_offset(plant, "tip_rest", plate, tool.X_FT))
     small = SpatialInertia(tool.tip_mass_kg / 3, np.zeros(3), UnitInertia.SolidSphere(0.01))
     joints: list[PrismaticJoint] = []

@@ -1,1 +1,1 @@
-"""One file per backend: the only code that knows what is real and what is simulated."""
+"""Device drivers, one folder per backend; only they distinguish real from simulated devices."""

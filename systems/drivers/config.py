@@ -1,4 +1,4 @@
-"""What every driver's configuration says of itself: which devices it may be, and whether it needs the simulated world."""
+"""Base classes of driver configurations: the devices that a driver supports, and whether it needs the simulated world."""
 
 from __future__ import annotations
 
@@ -13,40 +13,40 @@ DEVICES = ("robot_2", "robot", "scanner", "finger_camera", "wrist_camera", "digi
 
 
 class DriverConfig:
-    """Base class of the dataclass that a driver's module offers; its name is the tag in the scenario, such as `!SimulatedUr`.
+    """Base class of the dataclass that a driver module defines; its name is the tag in the scenario, such as `!SimulatedUr`.
 
-    Beside it the module has `ApplyDriverConfig(config, build)`; a robot's may have `PrepareRobot(config, nominal)`, and any
-    module `preflight(config)` for a check that moves nothing.
+    The module also defines `ApplyDriverConfig(config, build)`. A robot driver may define `PrepareRobot(config, nominal)`, and
+    any driver `preflight(config)`, a check that causes no motion.
     """
 
     FOR: ClassVar[tuple[str, ...]] = ()  # some of DEVICES
-    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ()  # where a scenario does not name the device
-    SIMULATED: ClassVar[bool] = False  # acts in the simulated world
+    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ()  # devices for which it is used where a scenario does not name one
+    SIMULATED: ClassVar[bool] = False  # needs the simulated world
 
 
 @dc.dataclass
 class NoDevice(DriverConfig):
-    """`!NoDevice {}`: this cell has no such device."""
+    """`!NoDevice {}`: the cell does not have this device."""
 
     FOR: ClassVar[tuple[str, ...]] = DEVICES
 
 
 class ScannerConfig(DriverConfig):
-    """What the cell asks of any scanner's configuration."""
+    """Base class of all scanner configurations."""
 
     FOR: ClassVar[tuple[str, ...]] = ("scanner",)
     mounted_on: str = "base"  # or flange, or a link of the arm
 
     def scanner(self) -> ScannerPreset:
-        """Intrinsics, range and noise: what poses are planned by."""
-        raise NotImplementedError(f"{type(self).__name__} does not say which scanner it is")
+        """Intrinsics, range and noise, used by pose planning."""
+        raise NotImplementedError(f"{type(self).__name__} does not define scanner()")
 
 
 class FingerCameraConfig(DriverConfig):
-    """What the cell asks of any finger camera's configuration."""
+    """Base class of all finger camera configurations."""
 
     FOR: ClassVar[tuple[str, ...]] = ("finger_camera",)
 
     def camera(self) -> FingerCamera:
-        """Size, focal length, rate and latency."""
-        raise NotImplementedError(f"{type(self).__name__} does not say which camera it is")
+        """Image size, focal length, frame rate and latency."""
+        raise NotImplementedError(f"{type(self).__name__} does not define camera()")

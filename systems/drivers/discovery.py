@@ -1,4 +1,4 @@
-"""Finds the drivers: modules of weldcal.systems.drivers, and what installed packages offer in the entry-point group."""
+"""Finds drivers: modules of weldcal.systems.drivers, and modules that installed packages register as entry points."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ ENTRY_POINTS = "weldcal.drivers"
 
 @cache
 def plugins() -> tuple[ModuleType, ...]:
-    """The modules that installed packages offer in the group weldcal.drivers.
+    """The modules that installed packages register in the entry-point group weldcal.drivers.
 
     Raises:
-        InputError: one of them cannot be imported; the sentence names its package.
+        InputError: one of them cannot be imported; the message names its package.
     """
     found = []
     for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda p: p.name):
         try:
             loaded = point.load()
-        except Exception as error:  # whatever a stranger's module raises while it is imported
+        except Exception as error:  # a third-party module may raise anything while it is imported
             package = "an installed package" if point.dist is None else f"the package {point.dist.name}"
             raise InputError(
                 f"The driver '{point.name}' of {package} cannot be imported: {error}. Update or uninstall that package."
@@ -40,7 +40,7 @@ def plugins() -> tuple[ModuleType, ...]:
 
 @cache
 def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
-    """The configuration classes that a device may have, its default first.
+    """The configuration classes of all drivers of a device, its default first.
 
     Raises:
         InputError: two drivers have the same name.
@@ -60,13 +60,13 @@ def driver_configs(device: str) -> tuple[type[DriverConfig], ...]:
 
 
 def default_config(device: str) -> DriverConfig:
-    """What a device is where a scenario does not name it."""
+    """The default configuration of a device, used where a scenario does not name it."""
     return driver_configs(device)[0]()
 
 
 @cache
 def _own_modules() -> tuple[ModuleType, ...]:
-    """The modules of drivers/<backend>/ that have an ApplyDriverConfig; what only serves a driver is not imported."""
+    """The modules of drivers/<backend>/ that define ApplyDriverConfig; helper modules are not imported."""
     names = []
     for finder, name, is_package in pkgutil.walk_packages(drivers.__path__, drivers.__name__ + "."):
         spec = None if is_package else finder.find_spec(name, None)
@@ -76,7 +76,7 @@ def _own_modules() -> tuple[ModuleType, ...]:
 
 
 def _configs_of(module: ModuleType) -> list[type[DriverConfig]]:
-    """The configuration classes that a module defines itself, with the types of their fields as objects."""
+    """The configuration classes that a module itself defines, with their field types resolved to objects."""
     found: list[type[DriverConfig]] = []
     for member in vars(module).values():
         if not (inspect.isclass(member) and issubclass(member, DriverConfig) and member.__module__ == module.__name__):
@@ -88,7 +88,7 @@ def _configs_of(module: ModuleType) -> list[type[DriverConfig]]:
 
 
 def _resolve_types(config: type[DriverConfig]) -> None:
-    """Drake's YAML loader reads the types of fields, which are text in a module that postpones annotations."""
+    """Replace field types that are text (postponed annotations) by the types, which Drake's YAML loader needs."""
     types = get_type_hints(config)
     for field in config.__dataclass_fields__.values():  # type: ignore[attr-defined]
         if isinstance(field.type, str):

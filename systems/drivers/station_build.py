@@ -1,4 +1,4 @@
-"""What a driver is given while the station is built: the builder, what else the station holds, and where to export ports."""
+"""The interface between drivers and the station builder: the DiagramBuilder, the station's parts and the ports to export."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ Part = TypeVar("Part")
 
 
 class Closable(Protocol):
-    """What a driver holds open outside the Diagram."""
+    """A resource that a driver holds open outside the Diagram."""
 
     def close(self) -> None:
-        """End it safely; a second call does nothing."""
+        """Close it safely; a second call has no effect."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedRobot:
-    """The robot as it was found before the station is built, by the `PrepareRobot` beside a driver's config.
+    """The state of the robot before the station is built, as the driver's `PrepareRobot` returns it.
 
-    `q_start` (6,) rad is where the arm stands. `pace` is how many seconds of the Diagram a second of the wall clock is worth
-    to the robot; None: it does not care, the Diagram may run as fast as it goes.
+    `q_start` (6,) rad is the arm's present configuration. `pace` is the robot's seconds of the Diagram per second of the wall
+    clock; None: the Diagram may run as fast as possible.
     """
 
     arm: ArmModel
@@ -36,16 +36,17 @@ class PreparedRobot:
     pace: float | None = None
 
     def close(self) -> None:
-        """End what the driver holds open."""
+        """Close the resource that the driver holds open."""
         if self.handle is not None:
             self.handle.close()
 
 
 @dataclass
 class StationBuild:
-    """Collects what the drivers add; `make_station` exports it under fixed names. `q_start` (6,) rad: where the arm stands.
+    """Collects the ports that drivers add; `make_station` exports them under fixed names. `q_start` (6,) rad: the arm's
+    present configuration.
 
-    `parts` are what else the station holds, found by their type: the simulated world, and what a job puts into it.
+    `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's furnishing.
     """
 
     builder: DiagramBuilder

@@ -1,1 +1,1 @@
-"""One folder a job: its systems, and the function that adds them to a cell."""
+"""Jobs, one folder each: the job's systems, and the class that adds them to a cell."""

@@ -1,4 +1,4 @@
-"""Finds the jobs: modules in weldcal.systems.jobs, and what installed packages offer beside their drivers."""
+"""Finds jobs: modules of weldcal.systems.jobs, and modules that installed packages register with their drivers."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MODULE = "job"  # jobs/<job>/job.py holds JOB
 
 @cache
 def jobs() -> tuple[Job[Any], ...]:
-    """Every kind of job, in the order of their keys; the job without a key comes last."""
+    """All jobs, sorted by key; the job without a key is the last."""
     names = [info.name for info in pkgutil.iter_modules(rooms.__path__, rooms.__name__ + ".") if info.ispkg]
     modules = [importlib.import_module(f"{name}.{MODULE}") for name in names]
     found = [module.JOB for module in (*modules, *plugins()) if hasattr(module, "JOB")]
@@ -26,7 +26,7 @@ def jobs() -> tuple[Job[Any], ...]:
 
 
 def job_of(scenario: Scenario) -> Job[Any]:
-    """The job that a scenario describes: the one whose part it has, or else the one without a key.
+    """The job of a scenario: the one whose part the scenario contains, else the job without a key.
 
     Raises:
         InputError: the scenario has the parts of two jobs.
@@ -34,5 +34,5 @@ def job_of(scenario: Scenario) -> Job[Any]:
     asked = [job for job in jobs() if job.key and getattr(scenario, job.key, None) is not None]
     if len(asked) > 1:
         keys = " or ".join(job.key for job in asked)
-        raise InputError(f"A scenario is one procedure: take {keys} out of it, and make another of that.")
+        raise InputError(f"A scenario has one job: move {keys} to another scenario.")
     return asked[0] if asked else jobs()[-1]

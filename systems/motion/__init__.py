@@ -1,1 +1,1 @@
-"""The systems that every job shares: pose recorder, mover, arbiter, limiter, guard, process switch, operator panel."""
+"""Systems shared by all jobs: pose recorder, mover, arbiter, limiter, guard, process switch, operator panel."""

@@ -1,4 +1,4 @@
-"""Moves straight in joint space are made only where the arm stays clear of the table and of itself."""
+"""Checks that moves on straight lines in joint space keep the arm clear of the table and of itself."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ Joints = NDArray[np.float64]
 
 
 def station_bodies(station: Station) -> list[Body]:
-    """What may touch: the arm's links and its tool."""
+    """The bodies of the clearance checks: the arm's links and its tool."""
     return arm_bodies(station.arm, () if station.tool is None else station.tool.capsules())
 
 
 def clear_move(scenario: Scenario, station: Station, bodies: list[Body], q_a: Joints, q_b: Joints) -> bool:
-    """Whether a move straight in joint space stays above the table and keeps the arm off itself; (6,) rad."""
+    """Whether a straight move in joint space stays above the table and free of self-collision; (6,) rad."""
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
     return lowest > scenario.calibration.table_z_m and gap > 0.0
 
 
 def check_way_home(scenario: Scenario, station: Station) -> None:
-    """The job begins at home; an arm that stands elsewhere must have a free way there.
+    """Check that the move from the arm's present configuration to home, where the job starts, is free.
 
     Raises:
-        InputError: it has none; nothing has moved.
+        InputError: it is not free; nothing has moved.
     """
     home = np.deg2rad(scenario.home_deg)
     if stands_at(station.q_start, home) or clear_move(
@@ -43,7 +43,7 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm stands at [{stands}] deg, where a straight joint move to home would touch the table or the arm itself: "
+        f"The arm is at [{stands}] deg. A straight joint move from there to home would touch the table or the arm itself: "
         f"move it by hand near home_deg [{wanted}] first."
     )
 
@@ -51,7 +51,7 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
 def clear_poses(
     scenario: Scenario, station: Station, poses: Sequence[PlannedPose], bodies: list[Body]
 ) -> tuple[PlannedPose, ...]:
-    """The poses that the FlangeMover reaches, each from the one before and with a free way home, in their order.
+    """The poses that the FlangeMover can reach from the previous one and with a free move home, in their order.
 
     Raises:
         UnreachableScanner: too many moves would touch the table or the arm itself.
@@ -67,7 +67,7 @@ def clear_poses(
     needed = 1 + c.maximum_scans + c.verification_scans
     if len(kept) < needed:
         raise UnreachableScanner(
-            f"Only {len(kept)} of {needed} calibration poses can be reached without the arm coming into the table or itself; "
+            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table or itself; "
             "choose another home_deg or fewer maximum_scans."
         )
     return tuple(kept)

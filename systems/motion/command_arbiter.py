@@ -1,4 +1,4 @@
-"""CommandArbiter: one motion channel, so one of mover and servo drives, or neither."""
+"""CommandArbiter: selects the velocity of the mover, of the servo, or zero."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from weldcal.systems.messages import JobCommand, UrStatus
 
 
 class CommandArbiter(LeafSystem):
-    """Passes on the velocity of whoever the job's mode names, and zero while the job or the robot holds.
+    """Outputs the velocity of the source that the job's mode selects, and zero while the job or the robot holds.
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""FlangeMover: takes the arm to a goal on a smooth synchronised joint path, as a stream of joint velocities."""
+"""FlangeMover: moves the arm to a joint goal on a quintic synchronised path, as a stream of joint velocities."""
 
 from __future__ import annotations
 

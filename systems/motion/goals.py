@@ -1,13 +1,13 @@
-"""When an arm counts as standing at a joint goal."""
+"""Checks whether an arm is at a joint goal."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-AT_HOME_RAD = 0.01  # an arm that stands this near to home begins the job from where it is
+AT_HOME_RAD = 0.01  # within this distance of home the job starts without a move
 
 
 def stands_at(q: NDArray[np.float64], q_home: NDArray[np.float64]) -> bool:
-    """Whether each joint (6,) rad is where it should be."""
+    """Whether each joint (6,) rad is within AT_HOME_RAD of home."""
     return bool(np.max(np.abs(q - q_home)) <= AT_HOME_RAD)

@@ -1,4 +1,4 @@
-"""OperatorPanel: Meshcat's button that holds the job and its slider for the pace of the simulation."""
+"""OperatorPanel: reads Meshcat's button that holds the job and its slider for the pace of the simulation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class OperatorPanel(LeafSystem):
         - hold
         - pace
 
-    `hold` (1) is 1.0 from the first click on, for good: nothing resumes by itself. `pace` (1) is the wanted real-time rate.
+    `hold` (1) is 1.0 from the first click on and is never reset. `pace` (1) is the requested real-time rate.
     """
 
     def __init__(self, meshcat: Meshcat, pace: float = 0.0, period_s: float = 0.05) -> None:

@@ -1,4 +1,4 @@
-"""PoseRecorder: remembers the arm's last joint positions, so that a sensor's datum meets the pose of its own time."""
+"""PoseRecorder: stores recent joint positions, so that a sensor's datum is paired with the arm's pose at its capture time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from weldcal.systems.messages import Message
 
 @dataclass(frozen=True, eq=False)
 class PoseHistory(Message):
-    """Times (n,) s, ascending, and joint positions (n, 6) rad of the last moments."""
+    """Recent times (n,) s, ascending, and joint positions (n, 6) rad."""
 
     times: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     positions: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
 
     def joints_at(self, time: float) -> NDArray[np.float64] | None:
-        """Joint positions (6,) interpolated to `time` s; None when the history does not reach it by more than one sample."""
+        """Joint positions (6,) rad interpolated to `time` s; None where `time` is more than one sample outside the history."""
         t = self.times
         if t.size < 2 or not t[0] <= time <= t[-1] + (t[-1] - t[-2]):
             return None
@@ -32,13 +32,13 @@ class PoseHistory(Message):
         return np.asarray((1.0 - w) * self.positions[k - 1] + w * self.positions[k])
 
     def pose_at(self, arm: ArmModel, time: float) -> RigidTransform | None:
-        """Flange pose X_BF at `time` s, or None."""
+        """Flange pose X_BF at `time` s; None as in joints_at."""
         q = self.joints_at(time)
         return None if q is None else forward_kinematics(arm, q)
 
 
 class PoseRecorder(LeafSystem):
-    """Keeps a ring of joint positions, each with the time it was sampled.
+    """Keeps a ring of joint positions with their sample times.
 
     .. pydrake_system::
 

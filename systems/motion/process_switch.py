@@ -1,4 +1,4 @@
-"""ProcessSwitch: the process output; whatever is about to stop the arm turns the torch off first, and it stays off."""
+"""ProcessSwitch: computes the process output; every cause that stops the arm first turns the torch off, latched."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from weldcal.systems.messages import JobCommand, UrStatus
 
 
 class ProcessSwitch(LeafSystem):
-    """Passes on the servo's wish to weld while nothing speaks against it.
+    """Passes on the servo's torch request while robot, guard and operator allow it.
 
     .. pydrake_system::
 
@@ -25,10 +25,10 @@ class ProcessSwitch(LeafSystem):
         - arm_stopped
 
     `torch_wanted` (1) of the servo; `margin` (2) of the SingularityGuard, whose second number is 1 while it stops the arm;
-    `hold` (1) a person's. `process_on` (1) follows all inputs at once: the arm's own command passes through the arbiter and
-    the slew limiter after it, so the torch is off no later than the first tick in which the arm is told to stop.
-    A burning torch that was turned off here stays off for the rest of that weld. `arm_stopped` (1): it was the guard that
-    did it, for the JobSequencer to hold the job.
+    `hold` (1) of the operator. `process_on` (1) follows all inputs without delay. The arm's command passes through the
+    arbiter and the slew limiter, so the torch is off no later than the first tick in which the arm is commanded to stop.
+    A burning torch that was turned off here stays off for the rest of that weld. `arm_stopped` (1): the guard turned it
+    off; the JobSequencer then holds the job.
     """
 
     def __init__(self, period_s: float = 0.002) -> None:
@@ -47,7 +47,7 @@ class ProcessSwitch(LeafSystem):
         return bool(self._margin.Eval(context)[1] > 0.5)
 
     def _free(self, context: Context) -> bool:
-        """Whether robot, guard and person all let the process run."""
+        """Whether robot, guard and operator all allow the process."""
         ready = self._status.Eval(context).ready
         return bool(ready and not self._stopped(context) and self._hold.Eval(context)[0] < 0.5)
 

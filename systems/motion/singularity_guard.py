@@ -1,4 +1,4 @@
-"""SingularityGuard: the wanted twist of the tip becomes joint velocity, slowed and stopped before the arm's singularities."""
+"""SingularityGuard: maps the commanded twist of the tip to joint velocity, slowed and stopped near the arm's singularities."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from weldcal.welding.servo.guards import ArmGuardConfig, guarded_joint_velocity
 
 
 class SingularityGuard(LeafSystem):
-    """Maps a spatial velocity of the tip frame to joint velocities, never faster than the arm can, never through a singularity.
+    """Maps a spatial velocity of the tip frame to joint velocities within the arm's speed limits, and stops it before a
+    singularity.
 
     .. pydrake_system::
 

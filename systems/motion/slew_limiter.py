@@ -1,4 +1,4 @@
-"""SlewLimiter: the last word before the station; finite, and bounded in speed, acceleration and jerk."""
+"""SlewLimiter: limits speed, acceleration and jerk of the joint velocity command and replaces non-finite commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from weldcal.welding.servo.guards import SlewLimits, slew_limit
 
 
 class SlewLimiter(LeafSystem):
-    """Follows the wanted joint velocity as fast as its limits allow.
+    """Follows the commanded joint velocity as fast as its limits allow.
 
     .. pydrake_system::
 
@@ -21,7 +21,7 @@ class SlewLimiter(LeafSystem):
         output_ports:
         - velocity_command
 
-    Both (6) rad/s. A wanted velocity that is not finite makes it slow down to rest.
+    Both (6) rad/s. A commanded velocity that is not finite makes it slow down to rest.
     """
 
     def __init__(self, limits: SlewLimits, period_s: float = 0.002) -> None:

@@ -1,4 +1,4 @@
-"""The spine that every job shares: pose recorder, mover, arbiter and limiter for each arm, the operator's hold, the process switch."""
+"""Builds the spine shared by all jobs: pose recorder, mover, arbiter and limiter for each arm, operator hold, process switch."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SPEED_SHARE, ACCELERATION_SHARE = 0.6, 0.5  # of the arm's own limits
 
 @dataclass(frozen=True, eq=False)
 class JobPorts:
-    """What a job shows the spine, the log and the run loop.
+    """The output ports of a job that the spine, the log and the run loop read.
 
     `commands`: a JobCommand for each arm. `velocity` (6) rad/s drives the first arm while its command's mode is `weld`.
     `torch_wanted` (1) and `margin` (2) go to the ProcessSwitch. `logged`: vector ports by their name in the log.
@@ -42,7 +42,7 @@ class JobPorts:
 
 @dataclass(frozen=True, eq=False)
 class SpineArm:
-    """One arm of the spine: what a job reads of it, and the systems that drive it."""
+    """One arm of the spine: the ports that a job reads, and the systems that drive the arm."""
 
     prefix: str
     position: OutputPort
@@ -60,7 +60,7 @@ class SpineArm:
 
 @dataclass(frozen=True, eq=False)
 class Spine:
-    """`hold` (1) is a person's wish to stop; `switch` shows `process_on` and `arm_stopped`."""
+    """The shared systems: `hold` (1) is the operator's stop request; `switch` outputs `process_on` and `arm_stopped`."""
 
     wiring: Wiring
     arms: tuple[SpineArm, ...]
@@ -73,7 +73,7 @@ class Spine:
         return self.arms[0]
 
     def connect(self, job: JobPorts) -> None:
-        """Connect what the job shows."""
+        """Connect the ports of the job."""
         w, first = self.wiring, self.arm
         for arm, command in zip(self.arms, job.commands, strict=True):
             w.connect(arm.mover, job=command)
@@ -106,13 +106,13 @@ def add_spine(
     acceleration: float = MOVE_ACCELERATION,
     error: LeafSystem | None = None,
 ) -> Spine:
-    """Add the spine's systems and connect what does not depend on the job.
+    """Add the spine's systems and make the connections that do not depend on the job.
 
     Args:
-        wiring: the cell.
-        arms: prefix of the station's ports and model of each arm, the first one first.
+        wiring: the cell under construction.
+        arms: prefix of the station's ports and model of each arm, the first arm first.
         speed, acceleration: of moves, rad/s and rad/s^2 of the fastest joint at speed_factor 1.
-        error: a system with the ports `position_measured`, `job` and `position`, between the first arm and all that reads it.
+        error: a system with the ports `position_measured`, `job` and `position`, between the first arm and its readers.
     """
     w, factor, made = wiring, wiring.scenario.job.speed_factor, []
     for k, (prefix, model) in enumerate(arms):

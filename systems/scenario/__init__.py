@@ -1,1 +1,1 @@
-"""The scenario file: its schema and its checks."""
+"""The scenario file: its schema, its loader and its checks."""

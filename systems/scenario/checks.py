@@ -1,4 +1,4 @@
-"""Refuses what no cell could do, before any work: one sentence that says what to change."""
+"""Checks a scenario before anything is built; each error is one sentence that says what to change."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ DRAWN_ARMS = ("ur10e",)
 
 
 def check_scenario(scenario: Scenario) -> None:
-    """Refuse what no cell could do, before any work.
+    """Check the parts of a scenario against each other.
 
     Raises:
         InputError: one sentence that says what to change.
     """
     if scenario.arm not in DRAWN_ARMS:
         raise InputError(
-            f"The cell is built round the {' or '.join(DRAWN_ARMS)}, whose shape its clearances are made for, not '{scenario.arm}'."
+            f"The arm must be {' or '.join(DRAWN_ARMS)}, whose shape the clearance checks know, not '{scenario.arm}'."
         )
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
-    job_of(scenario)  # refuses two at once
+    job_of(scenario)  # raises for the parts of two jobs
     check_numbers(scenario)
     for job in jobs():
         job.check(scenario)

@@ -1,4 +1,4 @@
-"""Reads scenarios: the ones that ship with weldcal by name, a user's own by path; unknown keys are errors."""
+"""Loads scenarios, by name from the package or by path; unknown keys are errors."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that ship with weldcal."""
+    """Names of the scenarios in the package."""
     return sorted(path.stem for path in SCENARIO_FOLDER.glob("*.yaml"))
 
 
 @cache
 def scenario_class() -> type[Scenario]:
-    """The schema with a union of all installed drivers for each device, and an optional key for each job of its own.
+    """The schema with a union of all installed drivers for each device, and an optional key for each job.
 
     Raises:
         InputError: an installed driver cannot be used.
@@ -42,10 +42,10 @@ def scenario_class() -> type[Scenario]:
 
 
 def load_scenario(name: str, overrides: str = "") -> Scenario:
-    """Load a scenario by name or path; `overrides` is a second YAML text merged on top.
+    """Load a scenario by name or path; `overrides` is a second YAML text merged over it.
 
     Raises:
-        InputError: unknown name, unknown key, wrong type; the sentence says which.
+        InputError: unknown name, unknown key, wrong type; the message says which.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
     if not path.is_file():
@@ -59,7 +59,7 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
             continue
         try:
             scenario = yaml_load_typed(schema=schema, data=text, defaults=scenario)
-        except Exception as error:  # Drake's loader raises several kinds, and not every text names the key
+        except Exception as error:  # Drake's loader raises several types, and not every message names the key
             what = " ".join(str(error).split())
             raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
     check_scenario(scenario)
@@ -67,12 +67,12 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
 
 
 def _part_at_fault(text: str) -> str:
-    """Which top-level part of a YAML text does not load by itself, as words for a sentence; empty where that is not clear."""
+    """The top-level part of a YAML text that does not load by itself, as a phrase for a message; empty where not found."""
     schema = scenario_class()
     parts = re.split(r"^(?=\w+ *:)", text, flags=re.MULTILINE)
     for part in filter(str.strip, parts):
         try:
             yaml_load_typed(schema=schema, data=part, defaults=schema())
-        except Exception:  # the same loader as above: any failure names this part
+        except Exception:  # the same loader as above: any failure identifies this part
             return f" at '{part.split(':')[0].strip()}'"
     return ""

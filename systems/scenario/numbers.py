@@ -1,4 +1,4 @@
-"""The numbers of a scenario: finite, in number and in sign what the cell can work with."""
+"""Checks the numbers of a scenario: finite, with the required sign and list length."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "start_m": 3, "home_deg"
 
 
 def check_numbers(config: Any, place: str = "") -> None:
-    """Walk a tree of configuration dataclasses.
+    """Check all numbers in a tree of configuration dataclasses.
 
     Raises:
-        InputError: naming the first key whose number (or list of numbers) cannot be used.
+        InputError: a number (or list of numbers) is invalid; the message names the first such key.
     """
     for field in dc.fields(config):
         value, key = getattr(config, field.name), f"{place}{field.name}"

@@ -1,4 +1,4 @@
-"""What a scenario YAML may say: typed configuration of one cell; devices and jobs add their own keys."""
+"""The schema of a scenario YAML: typed configuration of one cell; devices and jobs add their own keys."""
 
 import dataclasses as dc
 from typing import TypeVar
@@ -16,7 +16,7 @@ JobConfigOf = TypeVar("JobConfigOf")
 
 @dc.dataclass
 class PoseConfig:
-    """A pose as a person writes it: metres and degrees, roll-pitch-yaw about fixed axes."""
+    """A pose in metres and degrees, roll-pitch-yaw about fixed axes."""
 
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -28,7 +28,7 @@ class PoseConfig:
 
 @dc.dataclass
 class ErrorConfig:
-    """How far the simulated world may differ from what the cell was told (drawn from the run's seed)."""
+    """Deviations of the simulated world from the nominal one (drawn from the run's seed)."""
 
     translation_mm: float = 0.0
     rotation_deg: float = 0.0
@@ -36,67 +36,69 @@ class ErrorConfig:
 
 @dc.dataclass
 class CalibrationConfig:
-    """The calibration job: which feature, which poses, when to stop."""
+    """The calibration: the feature, the poses and the stop criterion."""
 
     configuration: str = "eye_on_base"  # or eye_in_hand, eye_on_arm_target_on_flange, ..._on_base, co_manipulation
     feature: str = "tool_ring"  # tool_ring: the ring on the welding tool; flange: the bare flange
-    mounting_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BC (X_FC, X_LC) as measured with a tape
-    guess_radius_mm: float = 60.0  # how far the feature may be from where the guess puts it
+    mounting_guess: PoseConfig = dc.field(
+        default_factory=PoseConfig
+    )  # nominal X_BC (X_FC, X_LC), such as measured with a tape
+    guess_radius_mm: float = 60.0  # largest distance of the feature from its predicted position
     theta_max_deg: float = 25.0  # between the feature's normal and the line of sight
-    required_error_mm: float = 0.10  # e_required, on the estimate's own error at the work point
+    required_error_mm: float = 0.10  # e_required, for the estimate's expected error at the work point
     minimum_scans: int = 6
-    maximum_scans: int = 10  # k_max, verification scans not counted
+    maximum_scans: int = 10  # k_max, without the verification scans
     verification_scans: int = 1
-    verification_limit_mm: float = 0.5  # a larger error at the unseen pose holds the job
+    verification_limit_mm: float = 0.5  # a larger error at a held-out pose holds the job
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
-    work_radius_mm: float = 200.0  # section 4.2: how far from the flange centre a rotation counts
-    cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: those that matter
+    work_radius_mm: float = 200.0  # section 4.2: distance from the flange centre at which a rotation is weighted
+    cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: the weighted axes
     table_z_m: float = 0.0
     clearance_m: float = 0.05
-    work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # where there is no workpiece
+    work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # used where there is no workpiece
 
 
 @dc.dataclass
 class WorkpieceConfig:
-    """The workpiece as its CAD says, and how far the real one is from that."""
+    """The nominal workpiece from its CAD, and the deviations of the true one."""
 
     shape: str = "s"  # s, straight or l
     length_mm: float = 300.0
-    pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # X_BP as the fixture's drawing says
+    pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # nominal X_BP from the fixture's drawing
     bend_radius_mm: float | None = None  # bent over a cylinder of this radius, its axis across the plate
-    located_by: str = "scan"  # scan: registered to its CAD; drawing: the fixture's drawing is believed
-    placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the plate on the fixture
-    groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the groove against the plate's datums
+    located_by: str = "scan"  # scan: register the CAD to the scan; drawing: use the fixture's drawing
+    placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # deviation of the plate on the fixture
+    groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # deviation of the groove from the plate's datums
     hole_from_mm: float | None = (
-        None  # from this arc length on the real groove has no walls, unseen by the scan: contact is lost
+        None  # from this arc length on the true groove has no walls, which the scan does not show: contact is lost
     )
 
 
 @dc.dataclass
 class ProcessConfig:
-    """The arc as set at the power source, for the weld log; what is not given is not guessed."""
+    """The arc settings of the power source, for the weld log; missing values stay empty."""
 
     name: str | None = None  # MAG, MIG, FCAW, MMA, SAW, TIG or plasma
     current_A: float | None = None
     voltage_V: float | None = None
-    efficiency: float | None = None  # thermal efficiency k; without it the process's own of EN 1011-1
+    efficiency: float | None = None  # thermal efficiency k; default: the value of the process in EN 1011-1
     wire_feed_m_min: float | None = None
 
     def process(self) -> WeldProcess:
-        """The same, checked (WeldProcessError)."""
+        """The settings as a WeldProcess; raises WeldProcessError for invalid ones."""
         return WeldProcess(self.name, self.current_A, self.voltage_V, self.efficiency, self.wire_feed_m_min)
 
 
 @dc.dataclass
 class PlanningConfig:
-    """How the seam is planned from the workpiece's scan."""
+    """The method of planning the seam from the workpiece's scan."""
 
-    method: str = "cad"  # cad: the drawing laid over the scan; cloud: the groove found in the scan, no drawing
-    search: str = "guess"  # of the drawing: guess, near workpiece.pose_guess; anywhere, over the whole scan
+    method: str = "cad"  # cad: the CAD is registered to the scan; cloud: the groove is found in the scan without CAD
+    search: str = "guess"  # search for the CAD: guess, near workpiece.pose_guess; anywhere, in the whole scan
     start_m: list[float] | None = None  # a cloud's seam starts at the end nearest to this; null: nearest to the robot
 
     def planning_method(self) -> PlanningMethod:
-        """The same for the planner; raises InputError for words it does not know."""
+        """The settings as a PlanningMethod; raises InputError for unknown values."""
         x_y_z = None if self.start_m is None else (self.start_m[0], self.start_m[1], self.start_m[2])
         return PlanningMethod(self.method, self.search, x_y_z)
 
@@ -108,26 +110,26 @@ class WeldingConfig:
     speed_mm_s: float = 8.0
     deflection_mm: float = 2.0  # delta_d of Eq. 16
     axial_deflection_mm: float = 3.0
-    clearance_mm: float = 25.0  # height above the seam where the approach ends
-    seam_length_mm: float | None = None  # weld only this much of the seam
+    clearance_mm: float = 25.0  # height above the seam at which the approach ends
+    seam_length_mm: float | None = None  # arc length of the seam to weld
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)
     law: str = "guarded"  # steering law: guarded, or one of the paper's for comparison (welding/servo/laws.py)
 
 
 @dc.dataclass
 class JobConfig:
-    """Which parts of the job run; a part that is off is not attempted."""
+    """The parts of the job to run, and its limits."""
 
     calibrate: bool = True
     weld: bool = True
     X_BC: PoseConfig | None = None  # a known calibration, where `calibrate` is off
-    speed_factor: float = 1.0  # of the arm's moves, 0.05 to 1; the weld keeps its own speed
+    speed_factor: float = 1.0  # speed of the arm's moves, 0.05 to 1; the weld speed does not change
     maximum_time_s: float = 240.0  # at speed_factor 1
 
 
 @dc.dataclass
 class VisualizationConfig:
-    """What Meshcat records."""
+    """Settings of the Meshcat recording."""
 
     recording_fps: float = 10.0
     cloud_points: int = 20000
@@ -137,7 +139,7 @@ class VisualizationConfig:
 class Scenario:
     """One cell: arm, devices, calibration, workpiece, welding and job.
 
-    The class that YAML is read into (see loading.scenario_class) narrows each device to the drivers that are installed, and
+    The class that the YAML is loaded into (see loading.scenario_class) narrows each device to the installed drivers, and
     adds a key for each kind of job.
     """
 
@@ -162,10 +164,10 @@ class Scenario:
     visualization: VisualizationConfig = dc.field(default_factory=VisualizationConfig)
 
     def part(self, kind: type[JobConfigOf]) -> JobConfigOf | None:
-        """The part of the scenario of this type, such as a job's; None where it has none."""
+        """The part of the scenario of this type, such as a job's configuration; None where it has none."""
         found = (getattr(self, field.name) for field in dc.fields(self))
         return next((value for value in found if isinstance(value, kind)), None)
 
     def scanner_config(self) -> ScannerConfig | None:
-        """The scanner; None where there is none."""
+        """The scanner's configuration; None where there is no scanner."""
         return self.scanner if isinstance(self.scanner, ScannerConfig) else None

@@ -1,1 +1,1 @@
-"""What the cell believes, drawn in Meshcat."""
+"""Display of the cell's estimates in Meshcat."""

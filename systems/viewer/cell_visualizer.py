@@ -1,4 +1,4 @@
-"""CellVisualizer: what the cell believes, in Meshcat: clouds, fitted circle, camera, seams, torch and the phase of the job."""
+"""CellVisualizer: shows the cell's estimates in Meshcat: clouds, fitted circle, camera, seams, torch and the job's phase."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ALL_PHASES = (*PHASES, "done", "held")
 
 @dataclass
 class _Drawn:
-    """What has been sent to Meshcat so far, so that each thing is drawn once; no state of the simulation."""
+    """The items sent to Meshcat so far, so that each is drawn once; not part of the simulation's state."""
 
     phase: str = ""
     scan: int = 0
@@ -39,7 +39,7 @@ class _Drawn:
 
 
 class CellVisualizer(LeafSystem):
-    """Draws the cell's beliefs as they change.
+    """Draws the cell's estimates when they change.
 
     .. pydrake_system::
 
@@ -52,7 +52,7 @@ class CellVisualizer(LeafSystem):
         - planned_seam
         - servo_report
 
-    Everything that appears during the job is hidden before its time in the recording, so the recording replays the story.
+    An item that appears during the job is hidden in the recording before that time.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class CellVisualizer(LeafSystem):
     def _draw_camera(
         self, name: str, X_BC: RigidTransform, covariance: NDArray[np.float64] | None, time: float
     ) -> None:
-        """The camera frame as a triad; its 3-sigma position ellipsoid is drawn 100 times its size, or nothing could be seen."""
+        """Draw the camera frame as a triad, with its 3-sigma position ellipsoid magnified 100 times to be visible."""
         path = f"{ROOT}/camera/{name}"
         for axis, rgba in enumerate((Rgba(0.9, 0.2, 0.2, 1), Rgba(0.2, 0.75, 0.2, 1), Rgba(0.2, 0.4, 0.95, 1))):
             ends = np.zeros((3, 2))
@@ -182,7 +182,7 @@ def add_visualizer(
     weld_speed_m_s: float,
     ports: dict[str, OutputPort],
 ) -> CellVisualizer:
-    """Add the viewer of the job's beliefs; the bodies are drawn by the cell itself."""
+    """Add the CellVisualizer to the builder; the cell itself draws the bodies."""
     assert wiring.meshcat is not None
     station, config = wiring.station, wiring.scenario.visualization
     cad = None if station.cad is None else station.cad.mesh

@@ -1,4 +1,4 @@
-"""The arm of a station without a simulated world: kinematics only, drawn where it is measured."""
+"""Adds a kinematic display of the arm, at its measured joints, to a station without a simulated world."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def add_drawn_arm(
     table_z_m: float,
     position_measured: OutputPort,
 ) -> SceneGraph:
-    """Add a scene in which the arm, its tool (tip at rest) and the table stand; frame: the world is the robot base B.
+    """Add a scene with the arm, its tool (tip at rest) and the table; frame: the world is the robot base B.
 
-    `position_measured` (6) rad moves it. No dynamics, no contact, nothing that a sensor could look at.
+    `position_measured` (6) rad sets the arm's pose. The scene has no dynamics, no contact and no rendered sensors.
     """
     scene_graph = builder.AddSystem(SceneGraph())
     scene_graph.set_name("scene_graph")

@@ -1,4 +1,4 @@
-"""The phase of the job as a sign behind the cell: a textured board per phase, shown in its time."""
+"""Labels of the job's phases in the viewer: one textured board per phase, shown during the phase."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.systems.bodies.textured_board import textured_board
 
 WIDTH_M, HEIGHT_M = 0.72, 0.09
-# Above and behind the cell, facing a viewer who stands in front of the robot (+x) and looks back at it.
+# Above and behind the cell, facing a viewer in front of the robot (+x) who looks towards it.
 X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.deg2rad(65.0)), [-0.25, -0.38, 1.0])
 TEXT = {
     "start": "ready",
@@ -20,13 +20,13 @@ TEXT = {
     "scan_verification_cloud": "calibrate: scan for verification",
     "move_to_pose": "calibrate: to the next pose",
     "scan_pose": "calibrate: scan the ring",
-    "move_to_verify": "verify: to an unseen pose",
+    "move_to_verify": "verify: to a held-out pose",
     "scan_verify": "verify: scan the ring",
     "park": "park",
     "scan_workpiece": "scan the workpiece",
     "approach_above": "approach",
     "approach": "approach",
-    "weld": "feel the seam, weld behind",
+    "weld": "track the seam and weld",
     "retract": "retract",
     "home": "home",
     "done": "done",
@@ -35,7 +35,7 @@ TEXT = {
 
 
 def label_image(text: str) -> NDArray[np.uint8]:
-    """A (128, 1024, 3) uint8 BGR board with the text."""
+    """Draw a (128, 1024, 3) uint8 BGR image with the text."""
     board = np.full((128, 1024, 3), (46, 38, 33), dtype=np.uint8)
     (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.6, 2)
     cv2.putText(board, text, ((1024 - width) // 2, 82), cv2.FONT_HERSHEY_DUPLEX, 1.6, (240, 240, 240), 2, cv2.LINE_AA)
@@ -43,7 +43,7 @@ def label_image(text: str) -> NDArray[np.uint8]:
 
 
 def add_phase_label(meshcat: Meshcat, path: str, phase: str) -> None:
-    """Put the board for a phase at `path`."""
+    """Add the board of a phase at the Meshcat path `path`."""
     board = textured_board(f"phase_{phase}", WIDTH_M, HEIGHT_M, label_image(TEXT.get(phase, phase)))
     meshcat.SetObject(path, board)
     meshcat.SetTransform(path, X_WS)

@@ -1,4 +1,4 @@
-"""The weld's gauge: torch speed and n_d . n_t along the seam so far, as a picture for a board in the viewer."""
+"""Draws the weld gauge: torch speed and n_d . n_t along the seam so far, as a picture for a board in the viewer."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 WIDTH_PX, HEIGHT_PX = 1024, 400
-_INK, _SOFT, _GROUND = (240, 240, 240), (150, 145, 140), (46, 38, 33)  # BGR, as the phase's board
+_INK, _SOFT, _GROUND = (240, 240, 240), (150, 145, 140), (46, 38, 33)  # BGR, as in the phase labels
 _BAND, _SPEED, _MEASURE, _ZERO = (70, 62, 56), (66, 145, 242), (235, 190, 110), (90, 90, 240)
 _LEFT, _RIGHT = 60, 990
 _FONT = cv2.FONT_HERSHEY_DUPLEX
 
 
 def gauge_picture(s: Array, speed: Array, n_d_dot_n_t: Array, s_end: float, weld_speed: float) -> Picture:
-    """A (400, 1024, 3) uint8 BGR board.
+    """Draw the gauge as a (400, 1024, 3) uint8 BGR image.
 
     Args:
-        s: (N,) where the torch was along the seam, m, negative before it.
-        speed: (N,) m/s; NaN while the arc was off. n_d_dot_n_t: (N,).
-        s_end: the seam's length, m; weld_speed: the wanted one, m/s.
+        s: (N,) arc length of the torch along the seam, m, negative before its start.
+        speed: (N,) torch speed, m/s; NaN while the arc was off. n_d_dot_n_t: (N,).
+        s_end: the seam's length, m; weld_speed: the target speed, m/s.
     """
     board = np.full((HEIGHT_PX, WIDTH_PX, 3), _GROUND, dtype=np.uint8)
     span = (min(-0.01, float(s.min(initial=0.0))), max(s_end, 0.01))
@@ -35,7 +35,7 @@ def gauge_picture(s: Array, speed: Array, n_d_dot_n_t: Array, s_end: float, weld
     _dashed(board, 210, span, (-0.25, 1.25), 0.0)
     zero = _place(np.array([span[0], span[1]]), np.zeros(2), span, (-0.25, 1.25), 210)[0]
     cv2.putText(board, "0", (_LEFT - 28, int(zero[1]) + 8), _FONT, 0.7, _INK, 1, cv2.LINE_AA)
-    # Fewer shades along its soft edges: a recording holds a board a second, and each is smaller so.
+    # Fewer shades at antialiased edges make the image smaller; a recording holds one a second.
     return (np.minimum(board, 243) + 6) // 12 * 12
 
 
@@ -64,7 +64,7 @@ def _strip(
 
 
 def _dashed(board: Picture, top: int, span: tuple[float, float], reach: tuple[float, float], level: float) -> None:
-    """The wanted speed, or the zero by which the published law would divide."""
+    """Draw a dashed line at the target speed, or at zero, where the published law divides by n_d . n_t."""
     (x0, y), (x1, _) = _place(np.array(span), np.full(2, level), span, reach, top).tolist()
     colour = _ZERO if level == 0.0 else _SOFT
     for x in range(x0, x1, 24):

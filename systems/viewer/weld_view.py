@@ -1,4 +1,4 @@
-"""The weld as it goes on, in Meshcat: CAD over the cloud, planned and felt seam, torch, the deflection's arrow, the gauge."""
+"""Draws the weld's progress in Meshcat: CAD over the cloud, planned and measured seam, torch, deflection arrow, gauge."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from weldcal.systems.viewer.weld_gauge import HEIGHT_PX, WIDTH_PX, gauge_picture
 Array = NDArray[np.float64]
 PLANNED, REFINED, TORCH = Rgba(0.55, 0.55, 0.60, 1.0), Rgba(0.15, 0.45, 0.90, 1.0), Rgba(0.95, 0.45, 0.10, 1.0)
 TIP, CAD, ARROW = Rgba(0.35, 0.80, 0.95, 1.0), Rgba(0.05, 0.50, 0.42, 1.0), Rgba(0.80, 0.10, 0.45, 1.0)
-SHOWN_ABOVE_M = 0.008  # paths are raised out of the groove so that they can be seen
+SHOWN_ABOVE_M = 0.008  # paths are raised above the groove to be visible
 DEFLECTION_SCALE = 10.0
 _OVER_THE_HEAD = np.array([0.0, 0.0, 0.016])
-PIECE_S = 1.0  # paths grow, and the gauge is drawn anew, this often
+PIECE_S = 1.0  # period of the updates of paths and gauge
 GAUGE_HEIGHT_M = SIGN_WIDTH_M * HEIGHT_PX / WIDTH_PX
 
 
 class WeldView:
-    """What has been drawn of the weld, and what comes next. It holds no state of the simulation: only what Meshcat was sent."""
+    """Draws the weld incrementally and keeps the data sent to Meshcat; it holds no state of the simulation."""
 
     def __init__(self, meshcat: Meshcat, root: str, tool: WeldingTool, cad: TriMesh | None, weld_speed: float) -> None:
         self._meshcat, self._root, self._tool, self._cad = meshcat, root, tool, cad
@@ -43,7 +43,7 @@ class WeldView:
         self._arrow = False
 
     def draw(self, planned: PlannedSeam, servo: ServoReport, time: float) -> None:
-        """Bring the viewer up to date."""
+        """Update the viewer with the newest plan and servo report."""
         if planned.sequence > self._seam and planned.seam is not None:
             self._seam, self._length = planned.sequence, planned.seam.length
             line = np.asarray(planned.seam.position(np.linspace(0.0, planned.seam.length, 300)))
@@ -98,7 +98,7 @@ class WeldView:
         self._points, self._pieces = len(refined), piece + 1
 
     def _draw_arrow(self, servo: ServoReport, time: float) -> None:
-        """From the tip's rest to where the tip is, ten times as long, beside a word that says so."""
+        """Draw the tip's deflection from rest as an arrow magnified ten times, with a label of the scale."""
         assert servo.X_BT is not None
         measurement = None if servo.state is None else servo.state.measurement
         length = 0.0 if measurement is None else float(np.linalg.norm(measurement.delta))
@@ -119,19 +119,19 @@ class WeldView:
         self._meshcat.SetTransform(f"{path}/word", RigidTransform(X_WS.rotation(), head + _OVER_THE_HEAD), time)
 
     def _make_arrow(self, path: str) -> None:
-        """An arrow a metre long along z, to be scaled."""
+        """Create an arrow 1 m long along z, which _draw_arrow scales."""
         shaft, head = 0.72, 0.28
         self._meshcat.SetObject(f"{path}/arrow/unit/shaft", Cylinder(0.0018, shaft), ARROW)
         self._meshcat.SetTransform(f"{path}/arrow/unit/shaft", RigidTransform([0.0, 0.0, 0.5 * shaft]))
         self._meshcat.SetObject(f"{path}/arrow/unit/head", MeshcatCone(head, 0.0048, 0.0048), ARROW)
-        # A cone of Meshcat stands on its apex.
+        # A Meshcat cone has its apex at its origin.
         over = RigidTransform(RotationMatrix.MakeXRotation(np.pi), [0.0, 0.0, 1.0])
         self._meshcat.SetTransform(f"{path}/arrow/unit/head", over)
         word = label_image(f"deflection x {DEFLECTION_SCALE:g}")[:, 250:774]
         self._meshcat.SetObject(f"{path}/word", textured_board("deflection", 0.09, 0.022, np.ascontiguousarray(word)))
 
     def _draw_cad(self, X_BP: RigidTransform | None, time: float) -> None:
-        """The drawing's edges where the registration puts them."""
+        """Draw the edges of the CAD at the registered pose."""
         if self._cad is None or X_BP is None:
             return
         path = f"{self._root}/cad"
@@ -141,13 +141,13 @@ class WeldView:
         self._show(path, time)
 
     def _path(self, name: str, points_B: Array, raise_m: float, rgba: Rgba, time: float) -> None:
-        """A path as a row of dots (a browser draws lines one pixel thin)."""
+        """Draw a path as a row of dots (browsers draw lines with a width of one pixel)."""
         dots = PointCloud(len(points_B), Fields(BaseField.kXYZs))
         dots.mutable_xyzs()[:] = (np.asarray(points_B) + np.array([0.0, 0.0, raise_m])).T
         self._meshcat.SetObject(f"{self._root}/{name}", dots, 0.004, rgba)
         self._show(f"{self._root}/{name}", time)
 
     def _show(self, path: str, time: float) -> None:
-        """Hidden before its time in the recording."""
+        """Show an item in the recording from `time` on."""
         self._meshcat.SetProperty(path, "visible", False, 0.0)
         self._meshcat.SetProperty(path, "visible", True, time)

@@ -146,12 +146,12 @@ def test_each_fault_is_named_with_what_to_press(
     assert problem is not None
     assert problem.name == check
     assert found in problem.found
-    assert press in problem.remedy
-    assert problem.remedy.endswith((".", ")."))
-    assert ". " not in problem.remedy, "one sentence"
+    assert press in problem.operator_action
+    assert problem.operator_action.endswith((".", ")."))
+    assert ". " not in problem.operator_action, "one sentence"
     with pytest.raises(RobotRefused) as refused:
         require_ready(report)
-    assert str(refused.value) == problem.remedy
+    assert str(refused.value) == problem.operator_action
 
 
 def test_reduced_mode_is_a_remark(robot: Emulator) -> None:
@@ -168,7 +168,7 @@ def test_a_paused_program_is_a_program(robot: Emulator) -> None:
     problem = preflight(HOST).first_problem
     assert problem is not None
     assert (problem.name, problem.found) == ("program", "PAUSED foreign")
-    assert "the program foreign (PAUSED)" in problem.remedy
+    assert "the program foreign (PAUSED)" in problem.operator_action
     assert stop_program(HOST) == "Stopped"
     robot.wait("runtime_state", "STOPPED")
     assert preflight(HOST).ok
@@ -219,7 +219,7 @@ def test_what_could_not_be_checked_is_not_called_ok(robot: Emulator) -> None:
     left = [check for check in report.checks if not check.checked]
     assert [check.name for check in left] == ["standstill", "joint limits", "kinematics", "flange pose"]
     assert {check.found for check in left} == {"needs power"}
-    assert not any(check.ok or check.remedy for check in left)
+    assert not any(check.ok or check.operator_action for check in left)
     assert report.pose_error_m is None
 
 
@@ -249,7 +249,7 @@ def test_an_old_or_another_controller_is_refused(robot: Emulator, monkeypatch: p
         assert report.first_problem is not None
         assert report.first_problem.name == "version"
         assert set(states(report).values()) == {"ok", "to change", "?"}
-        assert "PolyScope 5.12" in report.first_problem.remedy
+        assert "PolyScope 5.12" in report.first_problem.operator_action
 
 
 class Old(RtdeProbe):
@@ -286,7 +286,7 @@ def test_a_controller_that_stands_still_is_left_in_time(robot: Emulator) -> None
     problem = preflight(HOST, timeout_s=0.3).first_problem
     assert time.monotonic() - start < 1.4
     assert problem is not None
-    assert "says nothing" in problem.remedy
+    assert "sends no data" in problem.operator_action
     time.sleep(max(0.0, start + 1.55 - time.monotonic()))  # until it goes on
 
 
@@ -298,7 +298,7 @@ def test_a_dashboard_that_refuses_in_local_control_is_understood(
     monkeypatch.setattr(module, "ask", lambda *_: words)
     found = preflight(HOST)
     assert [name for name, state in states(found).items() if state != "ok"] == ["remote control"]
-    assert "Local icon" in found.checks[-1].remedy
+    assert "Local icon" in found.checks[-1].operator_action
 
 
 def test_a_dashboard_that_talks_nonsense_is_quoted(robot: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -313,7 +313,10 @@ def test_without_a_dashboard_the_service_to_enable_is_named(robot: Emulator, mon
     report = preflight(HOST)
     assert report.first_problem is not None
     assert report.first_problem.name == "program"
-    assert "enable Dashboard Server on the pendant under Settings > Security > Services" in report.first_problem.remedy
+    assert (
+        "enable Dashboard Server on the pendant under Settings > Security > Services"
+        in report.first_problem.operator_action
+    )
     assert (report.checks[-1].checked, report.checks[-1].found) == (False, "needs program")
 
 
@@ -327,7 +330,7 @@ def test_the_dashboard_answers_one_question_a_connection(robot: Emulator) -> Non
 
 @pytest.fixture
 def mute() -> Iterator[str]:
-    """A host that accepts and says nothing."""
+    """A host that accepts and sends no data."""
     host = "127.0.0.24"
     stop = threading.Event()
     with socket.create_server((host, 30004)) as server:
@@ -359,11 +362,11 @@ def refused(host: str, **limits: float) -> str:
     assert report.first_problem is not None
     with pytest.raises(RobotUnreachable):
         require_ready(report)
-    return report.first_problem.remedy
+    return report.first_problem.operator_action
 
 
 def test_a_host_that_says_nothing(mute: str) -> None:
-    assert "takes a connection on its RTDE port 30004 but says nothing" in refused(mute)
+    assert "accepts a connection on its RTDE port 30004 but sends no data" in refused(mute)
 
 
 def test_an_address_where_nothing_listens() -> None:
@@ -408,7 +411,7 @@ def test_polyscope_x_is_checked_without_a_dashboard() -> None:
         assert report.ok, report.checks
         assert report.version is not None
         assert report.version[0] == 10
-        assert "cannot be asked" in report.checks[CHECKS.index("remote control")].found
+        assert "not readable" in report.checks[CHECKS.index("remote control")].found
         new.fault("foreign_program")
         problem = preflight(HOST_X).first_problem
         assert problem is not None

@@ -272,7 +272,7 @@ def test_an_arm_that_stands_elsewhere_goes_home_and_then_does_its_job(tmp_path: 
 def test_an_arm_without_a_free_way_home_is_refused_before_it_moves() -> None:
     scenario = load_scenario("straight_groove", TOLD)
     robot = standing(np.deg2rad(scenario.home_deg) + np.array([0.0, 1.2, 0.0, 0.0, 0.0, 0.0]))
-    with pytest.raises(InputError, match=r"^The arm stands at \[190, -51, .*move it by hand near home_deg") as refusal:
+    with pytest.raises(InputError, match=r"^The arm is at \[190, -51, .*move it by hand near home_deg") as refusal:
         build_cell(scenario, robot=robot)
     assert str(refusal.value).count(". ") == 0, "one sentence"
 
@@ -335,7 +335,7 @@ def test_an_error_in_the_run_lets_go_of_the_robot() -> None:
     [
         ({"dry_run": True}, "--dry-run and --pace need a controller"),
         ({"robot": "simulated", "pace": 0.5}, "--dry-run and --pace need a controller"),
-        ({"robot": "192.0.2.1", "pace": 0.5}, "keeps its own time"),
+        ({"robot": "192.0.2.1", "pace": 0.5}, "runs in real time"),
         ({"robot": "emulated", "pace": 3.0}, "--pace must be from 0.05 to 1, and it is 3"),
         ({"robot": "127.0.0.9"}, "127.0.0.9"),
         ({"speed_factor": 7.0}, "job.speed_factor"),

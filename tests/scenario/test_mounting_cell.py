@@ -74,8 +74,8 @@ def test_what_is_sought_is_found_where_it_truly_is(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", list(SHORT))
-def test_a_pose_kept_aside_is_where_the_calibration_expects_it(name: str) -> None:
-    (aside,) = finished(name).status.kept_aside
+def test_a_held_out_pose_is_where_the_calibration_expects_it(name: str) -> None:
+    (aside,) = finished(name).status.held_out
     assert aside.error_m < 3e-4
     assert np.degrees(aside.tilt_rad) < 0.1
 
@@ -129,7 +129,7 @@ def test_the_result_says_its_direction_in_words(report: MountingReport) -> None:
     assert "pose of the camera in the arm link frame: X_LC" in text
     assert "base B --X_BL(robot)--> link L ==X_LC==> camera C" in text
     assert "next best pose: joints [" in text
-    assert "kept aside" in text
+    assert "mm at held-out poses" in text
     assert "X_FM is known: the target M is the flange itself" in text
     assert "The arm link L is the forearm." in text
     summary: dict[str, Any] = report.summary()

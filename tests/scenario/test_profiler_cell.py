@@ -168,7 +168,7 @@ def test_a_person_holds_it(alone: Alone) -> None:
         ("profiler_job: {stages: [seam]}", "needs the torch's tip"),
         ("profiler_job: {stages: [sphere, edge]}", "in this order"),
         ("profiler_job: {edge: {scans: 3}}", "8 scans of the edge"),
-        ("tool: welding\ncalibration: {feature: tool_ring}", "takes the tool's place"),
+        ("tool: welding\ncalibration: {feature: tool_ring}", "replaces the tool"),
         ("workpiece: null", "needs a workpiece"),
         ("profiler_job: {torch: {tip_m: [0.0, 0.1]}}", "three numbers"),
         ("profiler: !RenderedProfiler {width_far_mm: 30.0}", "wider far away"),

@@ -143,7 +143,7 @@ def test_a_tablet_that_feels_nothing_holds_the_procedure_and_the_arm_goes_home(a
     assert alone.state.phase == "descend"
     alone.run(alone.plan.longest_descent_s)
     assert alone.state.phase == "held"
-    assert "met no tablet at landmark 1" in alone.state.reason
+    assert "did not touch the tablet at landmark 1" in alone.state.reason
     np.testing.assert_array_equal(alone.state.q_goal, alone.plan.q_home)
 
 
@@ -171,7 +171,7 @@ def test_a_person_holds_the_visit(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.run(0.05)
     assert (alone.state.phase, alone.state.finished) == ("held", True)
-    assert "A person held the visit, in the phase 'descend'" in alone.state.reason
+    assert "A person held the job, in the phase 'descend'" in alone.state.reason
 
 
 def test_a_touch_at_a_time_that_no_pose_is_known_for_is_not_used(alone: Alone) -> None:
@@ -208,12 +208,12 @@ def test_a_visit_that_cannot_be_made_is_refused_before_anything_moves(overrides:
         ("tablet: {columns: 1}", "at least 2"),
         ("tablet: {columns: 40}", "more than 100 landmarks"),
         ("tablet: {across_mm: -1.0}", "tablet.across_mm must be a positive number"),
-        ("tablet: {ring_mm: 50.0}", "run into one another"),
+        ("tablet: {ring_mm: 50.0}", "rings overlap"),
         ("tablet: {tilt_deg: 80.0}", "from 0 to 45"),
         ("tablet: {pen: {radius_mm: 0.0}}", "must be positive"),
         ("tablet: {pen: {tip_m: [0.0, 0.0]}}", "must hold 3 numbers"),
-        ("tablet: {pen: {tip_m: [0.0, 0.0, 0.0]}}", "0.03 m before the flange"),
-        ("scanner: !RenderedScanner {}\njob: {calibrate: true}", "no scanner to calibrate"),
+        ("tablet: {pen: {tip_m: [0.0, 0.0, 0.0]}}", "0.03 m in front of the flange"),
+        ("scanner: !RenderedScanner {}\njob: {calibrate: true}", "neither calibrates a scanner"),
         ("colour: red", "colour"),
     ],
 )

@@ -244,8 +244,8 @@ def test_one_of_everything_survives_being_written_and_read_again(everything: Sce
     )
 
 
-def test_a_scenario_is_one_procedure(everything: Scenario) -> None:
-    with pytest.raises(InputError, match="one procedure"):
+def test_a_scenario_has_one_job(everything: Scenario) -> None:
+    with pytest.raises(InputError, match="one job"):
         check_scenario(everything)
 
 
@@ -301,7 +301,7 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [
-        ("arm: ur3e", "built round the ur10e"),
+        ("arm: ur3e", "arm must be ur10e"),
         ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
         ("calibration: {work_point_m: [1, 2]}", "calibration.work_point_m must hold 3 numbers, not 2"),
         ("robot: !UrRtde {payload_cog_m: [1, 2]}", "robot.payload_cog_m must hold 3 numbers, not 2"),

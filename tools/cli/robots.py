@@ -41,7 +41,7 @@ def check_robot(
     from weldcal.tools.commands.check_robot import as_json, emit_table
 
     report = preflight(host)
-    problem = "" if report.first_problem is None else report.first_problem.remedy
+    problem = "" if report.first_problem is None else report.first_problem.operator_action
     return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
 
 

@@ -1,4 +1,4 @@
-"""Runs a job that has no command of its own, such as one of an installed package: state, timing and recording."""
+"""Runs a job without a command of its own, such as one of an installed package; writes state, timing and recording."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from weldcal.tools.report.render import write_atomic
 
 @dataclass(frozen=True, eq=False)
 class AnyOutcome:
-    """Done or held, and how long it took."""
+    """The state of the run, and its timing."""
 
     options: RunOptions
     finished: JobRun
 
     @property
     def folder(self) -> Path:
-        """Where everything was written."""
+        """The result folder."""
         return self.options.out
 
     def summary(self) -> dict[str, object]:

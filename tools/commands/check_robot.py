@@ -27,9 +27,9 @@ def as_json(report: Preflight) -> Mapping[str, object]:
     problem = report.first_problem
     return {
         "state": "ready" if report.ok else "refused",
-        "reason": problem.remedy if problem else "",
+        "reason": problem.operator_action if problem else "",
         "checks": [
-            {"name": check.name, "state": state_of(check), "found": check.found, "remedy": check.remedy}
+            {"name": check.name, "state": state_of(check), "found": check.found, "remedy": check.operator_action}
             for check in report.checks
         ],
         "version": ".".join(str(number) for number in report.version) if report.version else None,
@@ -56,8 +56,8 @@ def emit_table(report: Preflight) -> None:
         state = state_of(check)
         found = _wrapped(check.found, width, f"  {state:<{marks}}  {check.name:<{names}}  ")
         typer.echo("  " + typer.style(f"{state:<{marks}}", fg=MARKS[state]) + found[2 + marks :])
-        if check.remedy:
-            typer.echo(_wrapped(check.remedy, width, indent))
+        if check.operator_action:
+            typer.echo(_wrapped(check.operator_action, width, indent))
     if waiting := len(report.checks) - len(shown):
         typer.secho(f"  not checked  {waiting} more that need an answer", fg=MARKS["not checked"])
 

@@ -1,4 +1,4 @@
-"""The main job: build the cell of a scenario, run it, write what came of it; demo, live calibration and weld are cuts of it."""
+"""Runs the weld job of a scenario and writes its results; for `demo`, live calibration and `weld`."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from weldcal.tools.report.render import write_atomic
 
 
 def run_demo(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """The whole story of a scenario.
+    """Run all parts of a scenario's job.
 
     Raises:
-        InputError, UnreachableScanner: the scenario or the options cannot be done; nothing has been written.
+        InputError, UnreachableScanner: the scenario or the options cannot be run; nothing has been written.
     """
     return run_scenario(load_scenario(options.scenario), options, progress)
 
 
 def run_calibration_live(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """The calibration of a scenario alone: calibrate, verify, park."""
+    """Run only the calibration of a scenario: calibrate, verify, park."""
     scenario = load_scenario(options.scenario)
     scenario.job.calibrate, scenario.job.weld = True, False
     return run_scenario(scenario, options, progress)
 
 
 def run_weld(options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """The weld of a scenario alone, with the scanner where the cell is told it stands."""
+    """Run only the weld of a scenario, with the scanner at its known pose."""
     return run_scenario(known_camera(options.scenario), options, progress)
 
 
 def known_camera(name: str) -> Scenario:
-    """A scenario that only welds: the scanner stands exactly where its drawing says, and the cell is told so.
+    """Load a scenario that only welds: the scanner is exactly at its nominal pose, which the cell uses.
 
     Raises:
-        InputError: the scenario is not one, or has nothing to weld.
+        InputError: the scenario cannot be loaded, or has nothing to weld.
     """
     scenario = load_scenario(name)
     scenario.job.calibrate, scenario.job.weld = False, True
@@ -55,7 +55,7 @@ def known_camera(name: str) -> Scenario:
 
 
 def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = no_progress) -> DemoResult:
-    """Build, run, measure, write.
+    """Build and run the cell, evaluate the run and write its results.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
@@ -68,7 +68,7 @@ def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = n
 
 
 def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
-    """Hold the run against the truth of its simulation."""
+    """Compare the run with the ground truth of its simulation."""
     cell, status = run.cell, run.cell.job.calibration_status(run.root)
     error = None
     truth = cell.station.truth.X_BC
@@ -78,7 +78,7 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, report.html; each whole or not at all."""
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, report.html, each atomically."""
     folder, run = result.folder, result.run
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(run.cell, result.status, result.options.seed, folder)

@@ -1,4 +1,4 @@
-"""weldcal hand-eye live: a calibration in any mounting, from the first pose to the report, against the truth where it is known."""
+"""Runs `weldcal hand-eye live`: a calibration in any mounting, with files and report, compared with the ground truth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from weldcal.tools.report.render import write_atomic
 
 
 def run_mounting_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MountingReport:
-    """Build, run, write.
+    """Build and run the cell and write the results.
 
     Raises:
         InputError, UnreachableScanner, RobotRefused: see run_job; nothing has been written or moved.
@@ -49,7 +49,7 @@ def write_mounting(report: MountingReport, finished: JobRun) -> None:
     if report.result is not None:
         provenance = Provenance("scenario.yaml", sha256(scenario.encode()).hexdigest())
         export_hand_eye(report.result, report.mounting, folder, provenance)
-    write_atomic(folder / "sightings.csv", _sightings(report))
+    write_atomic(folder / "sightings.csv", _observations(report))
     write_atomic(folder / "summary.txt", report.text() + "\n")
     picture = station_picture(report)
     if picture is not None:
@@ -58,8 +58,8 @@ def write_mounting(report: MountingReport, finished: JobRun) -> None:
     write_atomic(folder / "report.html", mounting_report(report, picture))
 
 
-def _sightings(report: MountingReport) -> str:
-    """One row a scan: joints (deg), centre (mm) and normal in the camera frame, share of the edge that was seen."""
+def _observations(report: MountingReport) -> str:
+    """The rows of sightings.csv, one per scan: joints (deg), centre (mm) and normal in the camera frame, visible share of the edge."""
     two = report.job.scene.two
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -67,7 +67,7 @@ def _sightings(report: MountingReport) -> str:
     writer.writerow(["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"])
     for s in report.status.seen:
         q = np.degrees(s.pose.q if s.pose.q_2 is None else np.concatenate([s.pose.q, s.pose.q_2]))
-        normal = np.zeros(3) if s.sighting.n_CM is None else s.sighting.n_CM
-        values = [*q, *(1e3 * s.sighting.p_CM), *normal, s.coverage]
+        normal = np.zeros(3) if s.observation.n_CM is None else s.observation.n_CM
+        values = [*q, *(1e3 * s.observation.p_CM), *normal, s.coverage]
         writer.writerow([s.label, *(json.dumps(round(float(v), 6)) for v in values)])
     return text.getvalue()

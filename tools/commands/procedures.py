@@ -1,4 +1,4 @@
-"""Which command runs which job: by the key of the job that a scenario describes."""
+"""Maps the key of a scenario's job to the command that runs it."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from weldcal.tools.outcomes.options import RunOptions
 
 
 class Outcome(Protocol):
-    """What every run leaves: a folder, and the JSON object of what it came to."""
+    """The result of every run: a folder and a JSON object."""
 
     @property
     def folder(self) -> Path:
-        """Where everything was written."""
+        """The result folder."""
 
     def summary(self) -> dict[str, object]:
         """The JSON object."""
@@ -44,17 +44,17 @@ def kind_of(scenario: Scenario) -> str:
 
 
 def run_procedure(options: RunOptions, progress: Progress) -> Outcome:
-    """Run a scenario's job, whichever it is; one that no command knows leaves its state and a recording.
+    """Run a scenario's job; for a job without a command, only its state and a recording are written.
 
     Raises:
-        InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be done; nothing has been written.
+        InputError, UnreachableScanner, RobotRefused: the scenario or the options cannot be run; nothing has been written.
     """
     scenario = load_scenario(options.scenario)
     return RUNNERS.get(kind_of(scenario), run_any)(scenario, options, progress)
 
 
 def calibrate_live(options: RunOptions, progress: Progress) -> dict[str, object]:
-    """The JSON object of `calibrate --scenario`: a mounting by its own job, else the calibration of the weld job alone."""
+    """Run `calibrate --scenario` and return its JSON object: the mounting job, or only the calibration of the weld job."""
     scenario = load_scenario(options.scenario)
     if kind_of(scenario) == "mounting":
         return run_mounting_live(scenario, options, progress).summary()

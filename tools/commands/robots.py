@@ -1,4 +1,4 @@
-"""From the word after --robot to the robot of a run: simulated, an emulated controller, or a controller at an address."""
+"""Selects the robot of a run by the --robot option: simulated, an emulated controller, or a controller at an address."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from weldcal.tools.emulators.ur.process import HOST as EMULATOR_HOST
 from weldcal.tools.emulators.ur.process import emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
-EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this they do beside other work
+EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
 SLOWEST_PACE = 0.05
 
 
 @dc.dataclass(frozen=True, eq=False)
 class ChosenRobot:
-    """The robot of a run. `title` names it where a person reads; `prepared` is given where the driver need not look for it."""
+    """The robot of a run. `title` is its name for display; `prepared` is set where the driver need not prepare it."""
 
     title: str
     prepared: PreparedRobot | None = None
@@ -38,17 +38,17 @@ class ChosenRobot:
 def chosen_robot(
     word: str | None, scenario: Scenario, *, dry_run: bool = False, pace: float | None = None
 ) -> Iterator[ChosenRobot]:
-    """Make `scenario.robot` what the word says, for as long as the block runs.
+    """Set `scenario.robot` by the option's value for the duration of the block.
 
     Args:
         word: `simulated`; `emulated`, or `emulated@ADDRESS` for another loopback address; the address of a controller; None:
             the scenario's own.
         scenario: its `robot` is replaced.
-        dry_run: look at the robot, then run with a simulated arm that has its kinematics and stands where it stands.
-        pace: controller seconds per second of the wall clock; only an emulated controller has another than 1.
+        dry_run: read the robot's state, then run with a simulated arm that has its kinematics and configuration.
+        pace: controller seconds per second of the wall clock; other than 1 only for an emulated controller.
 
     Raises:
-        InputError: options that do not go together.
+        InputError: the options cannot be combined.
         RobotRefused: the controller does not answer, or does not allow the job; nothing has moved.
     """
     if word is None and not isinstance(scenario.robot, UrRtde) and not scenario.robot.SIMULATED:
@@ -79,7 +79,7 @@ def chosen_robot(
             yield _at(host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
         return
     if pace is not None and not word.startswith("127."):
-        raise InputError("A controller keeps its own time: --pace is for an emulated one, at a loopback address.")
+        raise InputError("A real controller runs in real time: --pace is for an emulated one, at a loopback address.")
     yield _at(word, f"the controller at {word}", scenario, dry_run=dry_run, pace=1.0 if pace is None else pace)
 
 
@@ -98,13 +98,13 @@ def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float)
         return ChosenRobot(name)
     scenario.robot = SimulatedUr()
     return ChosenRobot(
-        f"dry run: a simulated arm with the kinematics of {name}, from where its arm stands; nothing was sent to it",
+        f"dry run: a simulated arm with the kinematics and configuration of {name}; nothing was sent to it",
         look_at(config, scenario),
     )
 
 
 def robot_at(host: str, scenario: Scenario) -> UrRtde:
-    """The robot at an address, with the load that the scenario's tool is."""
+    """The robot at an address, with the scenario's tool as its payload."""
     if scenario.tool == "none":
         return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
     if scenario.tool == "pen":
@@ -113,10 +113,10 @@ def robot_at(host: str, scenario: Scenario) -> UrRtde:
 
 
 def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
-    """The arm behind a controller, with its own kinematics and where it stands; nothing is written, sent or moved.
+    """Read the kinematics and configuration of a controller's arm; nothing is written, sent or moved.
 
     Raises:
-        RobotRefused: the controller does not answer, or a check of the pre-flight failed; the text says what to press.
+        RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
     """
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm))
     require_ready(report)

@@ -1,4 +1,4 @@
-"""One run of a scenario's job, whichever it is: choose the robot, build the cell, show it, run it; for every command that runs one."""
+"""Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer and advances it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class JobRun:
-    """A run that ended, done or held; the viewer that recorded it, where there is one; what moved, for a person."""
+    """A completed run, done or held; its recording viewer, or None; the name of its robot."""
 
     run: Run[Any]
     meshcat: Meshcat | None
@@ -40,16 +40,16 @@ class JobRun:
         return self.run.cell
 
     def write_recording(self, folder: Path) -> None:
-        """Write recording.html, where there is a recording."""
+        """Write recording.html where the run was recorded."""
         if self.meshcat is not None:
             write_atomic(folder / "recording.html", self.meshcat.StaticHtml())
 
 
 def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: str | None = None) -> JobRun:
-    """Build the cell and run its job to the end; `key` is that of the job that the scenario must describe, None: any.
+    """Build the cell and run its job to the end; `key` is the key of the required job, None: any job.
 
     Raises:
-        InputError: it is another job. UnreachableScanner, RobotRefused: see chosen_robot and build_cell; nothing has been written or moved.
+        InputError: the scenario has another job. UnreachableScanner, RobotRefused: see chosen_robot and build_cell; nothing has been written or moved.
     """
     found = job_of(scenario).key
     if key and found != key:
@@ -70,13 +70,13 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                 _set_the_scene(meshcat, *cell.job.view())
                 if options.browser:
                     webbrowser.open(meshcat.web_url())
-                    time.sleep(2.0 if options.realtime else 0.5)  # the page wants a moment before the story begins
+                    time.sleep(2.0 if options.realtime else 0.5)  # the page needs a moment to load
             run = run_cell(cell, progress, meshcat, options.realtime)
     return JobRun(run, meshcat, robot.title)
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array) -> None:
-    """A calm background and a viewer who stands in front of the job."""
+    """Set the background and the viewer's camera."""
     meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
     meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
     meshcat.SetProperty("/Grid", "visible", False)

@@ -1,4 +1,4 @@
-"""What a run leaves on disk: calibration.yaml, the weld log and the scans as a dataset that `weldcal calibrate` reads again."""
+"""Writes the files of a run: calibration.yaml, the weld log and the scans as a dataset for `weldcal calibrate`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PHASE_NAMES = [str(phase) for phase in Phase]
 
 
 def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> CalibrationResult | None:
-    """The live calibration in the form that `weldcal calibrate` writes; None before there is an estimate."""
+    """The live calibration in the form that `weldcal calibrate` writes; None without an estimate."""
     estimate = status.estimate
     if estimate is None:
         return None
@@ -65,7 +65,7 @@ def _record(id: str, estimate: CalibrationEstimate, k: int) -> PoseRecord:
 
 
 def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int, folder: Path) -> Path | None:
-    """Write calibration.yaml and the forms that other tools read, where there is a calibration."""
+    """Write calibration.yaml and its exports for other tools, where there is a calibration."""
     result = live_result(cell, status, seed)
     if result is None:
         return None
@@ -74,9 +74,9 @@ def write_calibration(cell: Cell[WeldJob], status: CalibrationStatus, seed: int,
 
 
 def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robot: str = "simulated") -> Path | None:
-    """Write the calibration scans as a dataset folder that `weldcal calibrate` reads again; None where there are none.
+    """Write the calibration scans as a dataset folder for `weldcal calibrate`; returns None where there are none.
 
-    `robot` is what moved the feature, for the dataset's note.
+    `robot` is the name of the robot, for the dataset's note.
     """
     cell, scanner = run.cell, run.cell.scenario.scanner_config()
     observed = {o.id: o.X_BR for o in status.observations if o.id in run.scans}
@@ -114,7 +114,7 @@ def _numbers(values: np.ndarray) -> list[float]:
 
 
 def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, robot: str) -> WeldRecord:
-    """The weld as its log tells it: nothing in it is known from the simulation alone."""
+    """The weld record from the log; it contains no ground truth of the simulation."""
     log, cell, config = weld.log, run.cell, run.cell.job.servo_config
     process = cell.scenario.welding.process.process()
     p_BW = log.p_BRobot + log.R_BT @ config.p_TW
@@ -160,7 +160,7 @@ def weld_record(run: Run[WeldJob], weld: WeldOutcome, seed: int, scenario: str, 
 
 
 def write_weld_log(record: WeldRecord, folder: Path) -> Path:
-    """Write weld.csv and weld.json (docs/weld_log.md); the header last, so that it never describes a table not yet there."""
+    """Write weld.csv and weld.json (docs/weld_log.md); the header last, so that it never describes a missing table."""
     table, header = weld_log_texts(record)
     write_atomic(folder / CSV_NAME, table)
     write_atomic(folder / HEADER_NAME, header)

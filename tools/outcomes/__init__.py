@@ -1,1 +1,1 @@
-"""What a run came to, measured against the truth where a simulation knows it: the dataclasses that commands return and reports show."""
+"""Results of runs, as commands return them and reports show them, with errors against the ground truth of a simulation."""

@@ -1,4 +1,4 @@
-"""What a run of the weld job came to: its state, its calibration and weld, and the JSON object of `demo` and `weld`."""
+"""The result of a weld job: state, calibration and weld, and the JSON object of `demo` and `weld`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_inpu
 
 @dataclass(frozen=True, eq=False)
 class DemoResult:
-    """What a run came to; figures against the truth exist in simulation only."""
+    """The result of a run; errors against the ground truth exist in simulation only."""
 
     options: RunOptions
     run: Run[WeldJob]
@@ -30,7 +30,7 @@ class DemoResult:
 
     @property
     def folder(self) -> Path:
-        """Where everything was written."""
+        """The result folder."""
         return self.options.out
 
     @property
@@ -49,7 +49,7 @@ class DemoResult:
 
     @property
     def n_scans(self) -> int:
-        """Scans of the feature that were taken, verification included."""
+        """Number of scans of the feature, verification included."""
         return self.status.sequence
 
     def summary(self) -> dict[str, object]:
@@ -86,13 +86,13 @@ class DemoResult:
             plan = self.run.cell.job.planned_seam(self.run.root)
             if np.isfinite(plan.sigma_m):
                 found["plan_sigma_mm"], found["plan_confidence"] = 1e3 * plan.sigma_m, plan.confidence
-            found["plan_words"] = plan.words
+            found["plan_words"] = plan.summary
             found["peak_omega"] = float(np.nanmax(np.abs(self.weld.log.telemetry["omega"])))
         found |= self.run.timing()
         return found
 
     def calibration_summary(self) -> dict[str, object]:
-        """The JSON object of a live `calibrate`: the keys of the offline one beside those of the run."""
+        """The JSON object of a live `calibrate`: the keys of the offline command and those of the run."""
         found, estimate = self.summary(), self.status.estimate
         found["seconds"] = self.run.wall_seconds
         if estimate is not None:
@@ -112,6 +112,6 @@ class DemoResult:
 
 
 def live_errors(values: np.ndarray) -> dict[str, float]:
-    """Median, mean and 95th percentile of the finite values, in their own unit; empty where there are none."""
+    """Median, mean and 95th percentile of the finite values, in their unit; empty where there are none."""
     found = error_summary(values)
     return {name: found[name] for name in ("median", "mean", "p95") if np.isfinite(found[name])}

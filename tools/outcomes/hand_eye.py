@@ -1,4 +1,4 @@
-"""The outcome of `weldcal hand-eye`: poses with their uncertainty, the comparison of methods, the next pose."""
+"""The result of `weldcal hand-eye`: poses with their uncertainty, the comparison of methods, the next pose."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a live calibration in any mounting came to, against the truth where a simulation knows it."""
+"""The result of a live calibration in any mounting, with errors against the ground truth of a simulation."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from weldcal.tools.outcomes.hand_eye import HandEyeReport
 
 @dataclass(frozen=True)
 class TruthError:
-    """How far an unknown pose is from what only the simulation knows: mm, deg, squared error in units of its covariance, and
-    the bound on it that holds the truth with 99.7 %."""
+    """Error of an estimated pose against the ground truth: mm, deg, squared error in units of its covariance, and the bound
+    that it does not exceed with a probability of 99.7 %."""
 
     mm: float
     deg: float
@@ -29,7 +29,7 @@ class TruthError:
 
 @dataclass(frozen=True, eq=False)
 class MountingReport:
-    """What a live calibration came to, and where it was written."""
+    """The result of a live calibration, and its folder."""
 
     run: Run[AddedMounting]
     result: HandEyeResult | None
@@ -44,7 +44,7 @@ class MountingReport:
 
     @property
     def status(self) -> MountingStatus:
-        """What the calibration came to in the run."""
+        """The calibration's last status in the run."""
         return self.job.status(self.run.root)
 
     @property
@@ -59,7 +59,7 @@ class MountingReport:
 
     @property
     def reason(self) -> str:
-        """Why it is held; empty where it is done."""
+        """The reason why the job was held; empty where it is done."""
         if self.state == "done":
             return ""
         return self.run.reason or self.status.message
@@ -88,7 +88,7 @@ class MountingReport:
         return 1e3 * float(np.linalg.norm(self.result.X @ p - truth @ p))
 
     def summary(self) -> dict[str, object]:
-        """The JSON object: the keys of hand-eye, beside those of the run."""
+        """The JSON object: the keys of hand-eye and those of the run."""
         status, result = self.status, self.result
         out: dict[str, object] = {"state": self.state, "configuration": self.mounting.name, "robot": self.robot}
         if self.reason:
@@ -104,8 +104,8 @@ class MountingReport:
             out |= {
                 "held_out_deg": result.held_out.rms_deg,
                 "held_out_mm": 1e3 * result.held_out.rms_translation,
-                "kept_aside_mm": [1e3 * k.error_m for k in status.kept_aside],
-                "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.kept_aside],
+                "kept_aside_mm": [1e3 * k.error_m for k in status.held_out],
+                "kept_aside_deg": [float(np.degrees(k.tilt_rad)) for k in status.held_out],
                 "expected_error_mm": 1e3 * status.sigma_work_m,
                 "work_error_mm": self.work_error_mm(),
                 "truth": {s: vars(e) for s, e in self.truth_errors().items()},
@@ -118,7 +118,7 @@ class MountingReport:
         return out | self.run.timing() | {"seconds": self.seconds}
 
     def given(self) -> tuple[str, ...]:
-        """What was not sought: where the circle sits, and which link carries the scanner."""
+        """The given data: the pose of the circle, and the link that carries the scanner."""
         scene, scenario = self.job.scene, self.run.cell.scenario
         out = []
         for letter in scene.known:
@@ -126,21 +126,21 @@ class MountingReport:
             circle = (
                 "the circle of the base mounting" if scenario.calibration.configuration in FOOT else "the flange itself"
             )
-            out.append(f"{u.symbol} is known: the target M is {circle}, where the robot's drawing puts it.")
+            out.append(f"{u.symbol} is known: the target M is {circle}, at the pose of the robot's drawing.")
         if "arm" in scene.configuration and (scanner := scenario.scanner_config()) is not None:
             out.append(f"The arm link L is the {scanner.mounted_on.replace('_', ' ')}.")
         return tuple(out)
 
     def text(self) -> str:
-        """What a person reads: the direction in words, the sketch, numbers, and what was never seen."""
+        """The printed result: directions, sketch, numbers, and the errors at held-out poses."""
         status = self.status
         if self.result is None:
             return f"{self.mounting.name}: {self.state}. {self.reason}"
         lines = [HandEyeReport(self.result, self.mounting, (), None, (), self.seconds).text(), ""]
         lines += [f"given        {sentence}" for sentence in self.given()]
-        aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.kept_aside)
+        aside = "  ".join(f"{1e3 * k.error_m:.3f}" for k in status.held_out)
         if aside:
-            lines.append(f"kept aside   {aside} mm at poses the calibration never saw")
+            lines.append(f"verified     {aside} mm at held-out poses, which the calibration did not use")
         lines.append(
             f"expected     {1e3 * status.sigma_work_m:.3f} mm (1 sigma) of a point at the scanner's best distance"
         )

@@ -1,4 +1,4 @@
-"""What a person may choose for a run of a cell."""
+"""The options of a run of a cell."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class RunOptions:
-    """What a person may choose: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast
-    as it goes; the robot (see chosen_robot; None: the scenario's), and how fast the arm's moves are (None: the scenario's)."""
+    """The user's options: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast as
+    possible; the robot (see chosen_robot; None: the scenario's), and the speed of the arm's moves (None: the scenario's)."""
 
     scenario: str
     out: Path

@@ -1,4 +1,4 @@
-"""A live run of the profiler's cell against the truth that only its simulation knows: poses in sigmas of their prediction, seam, torch."""
+"""The result of a live profiler run against the ground truth: pose errors in predicted sigmas, seam and torch errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ JOINT_3_SIGMA = float(chi2.ppf(chi2.cdf(9.0, 1), 6))  # 20.06
 
 @dataclass(frozen=True, eq=False)
 class PoseOutcome:
-    """X_FS against the truth: error, its prediction, each of six parts in its sigma, and e^T C^-1 e of all six."""
+    """X_FS against the ground truth: error, predicted error, each of six components in its sigma, and e^T C^-1 e."""
 
     error_mm: float
     error_deg: float
@@ -36,18 +36,18 @@ class PoseOutcome:
 
     @property
     def within_3_sigma(self) -> bool:
-        """Whether all six together are as likely as 3 sigma of one: 99.73 %."""
+        """Whether the six-component error is within the bound of 99.73 % probability (3 sigma of one component)."""
         return self.nees <= JOINT_3_SIGMA
 
     @property
     def largest(self) -> float:
-        """Of the six parts, in sigmas."""
+        """The largest of the six components, in sigmas."""
         return float(np.abs(self.parts).max())
 
 
 @dataclass(frozen=True, eq=False)
 class PathOutcome:
-    """Something along the seam: where (n,) m, and beside and above (n,) m the line that it should be on."""
+    """Deviations along the seam: arc length (n,) m, and lateral and vertical distance (n,) m from the reference line."""
 
     s: Array
     lateral: Array
@@ -55,13 +55,13 @@ class PathOutcome:
 
     @property
     def distance_mm(self) -> Array:
-        """From the line (n,)."""
+        """Distance from the line (n,), mm."""
         return np.asarray(1e3 * np.hypot(self.lateral, self.height))
 
 
 @dataclass(frozen=True, eq=False)
 class LiveOutcome:
-    """All that a run came to; None for what the scenario has not."""
+    """All results of a run; None for the parts that the scenario does not have."""
 
     edge: PoseOutcome | None
     sphere: PoseOutcome | None
@@ -73,7 +73,7 @@ class LiveOutcome:
 
 
 def pose_outcome(estimate: ProfilerEstimate, X_FS: RigidTransform) -> PoseOutcome:
-    """An estimate against the true X_FS."""
+    """Compare an estimate with the true X_FS."""
     R = X_FS.rotation() @ RotationMatrix.ProjectToRotationMatrix(estimate.rotation).inverse()
     error = RigidTransform(R, X_FS.translation() - estimate.translation)
     parts, nees = pose_sigmas(error, estimate.covariance)
@@ -88,7 +88,7 @@ def pose_outcome(estimate: ProfilerEstimate, X_FS: RigidTransform) -> PoseOutcom
 
 
 def true_torch(run: Run[AddedProfilerJob]) -> Array:
-    """Where the torch truly was while it followed the seam (n, 3) m."""
+    """True torch positions (n, 3) m during its pass along the seam."""
     state: ProfilerState = run.cell.job.state(run.root)
     log = run.cell.logs["torch"].FindLog(run.root)
     t = log.sample_times()
@@ -96,7 +96,7 @@ def true_torch(run: Run[AddedProfilerJob]) -> Array:
 
 
 def live_outcome(run: Run[AddedProfilerJob]) -> LiveOutcome:
-    """The run against the truth of its station."""
+    """Compare the run with the ground truth of its station."""
     cell, s = run.cell, run.cell.job.state(run.root)
     truth, torch_B = cell.station.truth, true_torch(run)
     profiler = truth.profiler
@@ -138,7 +138,7 @@ WITHIN_MM = 0.3
 
 @dataclass(frozen=True, eq=False)
 class ProfilerLive:
-    """What one run came to."""
+    """The result of one run."""
 
     options: RunOptions
     run: Run[AddedProfilerJob]
@@ -147,12 +147,12 @@ class ProfilerLive:
 
     @property
     def folder(self) -> Path:
-        """Where everything was written."""
+        """The result folder."""
         return self.options.out
 
     @property
     def state(self) -> ProfilerState:
-        """Where the job ended, with all that it found."""
+        """The final state of the job, with all its estimates."""
         found: ProfilerState = self.run.cell.job.state(self.run.root)
         return found
 

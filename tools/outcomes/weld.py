@@ -1,4 +1,4 @@
-"""What a run came to: the weld and the calibration measured against the truth that only a simulation knows."""
+"""Errors of the weld and of the calibration of a run against the ground truth of the simulation."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class WeldLog:
     time: Array
     telemetry: dict[str, Array]
     torch_on: NDArray[np.bool_]
-    p_BTip: Array  # the tip as the servo felt it: pose of the arm and tag
+    p_BTip: Array  # tip position measured by the servo from the arm's pose and the tag
     p_BRobot: Array  # origin of T: the "robot end effector" of the paper
     R_BT: Array  # (N, 3, 3)
     p_BTorch: Array
@@ -45,20 +45,20 @@ class WeldLog:
 
 @dataclass(frozen=True, eq=False)
 class WeldOutcome:
-    """The weld against the true seam (simulation only)."""
+    """Errors of the weld against the true seam (simulation only)."""
 
     log: WeldLog
     true_seam: SeamCurve | None
     planned: SeamCurve | None
-    error: PathError | None  # torch while it burned
+    error: PathError | None  # torch while the arc burned
     speed: SpeedStatistics | None
     plan_error: PathError | None
 
 
 @dataclass(frozen=True, eq=False)
 class FeltSeam:
-    """The refined seam point by point, (N,) m: arc length on the true seam, and how far to the left of and above the line
-    on which, by the tool's numbers, a seated tip is felt."""
+    """The points of the refined seam, (N,) m: arc length on the true seam, and distance to the left of and above the nominal
+    line of a seated tip's measured centre."""
 
     s: Array
     lateral: Array
@@ -67,7 +67,7 @@ class FeltSeam:
 
 @dataclass(frozen=True)
 class CalibrationError:
-    """X_BC against the truth: at the camera's origin, and for a point seen at the work point."""
+    """Error of X_BC against the ground truth: at the camera's origin, and for a point at the work point."""
 
     translation_m: float
     rotation_rad: float
@@ -75,7 +75,7 @@ class CalibrationError:
 
 
 def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: Array) -> CalibrationError:
-    """Difference of two camera poses; `at_work_m` is how far a point that truly is at p_BWork lands from it."""
+    """Difference of two camera poses; `at_work_m` is the position error of a point whose true position is p_BWork."""
     turn = RotationMatrix(X_BC_true.rotation().inverse() @ X_BC.rotation()).ToAngleAxis().angle()
     landed = X_BC @ (X_BC_true.inverse() @ p_BWork)
     return CalibrationError(
@@ -86,7 +86,7 @@ def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: 
 
 
 def true_seam(cell: Cell[WeldJob]) -> SeamCurve | None:
-    """Where the torch should have run: above the real groove's root, in B."""
+    """The reference path of the torch: above the true groove's root, in B."""
     truth = cell.station.truth
     if truth.workpiece is None or truth.X_BP is None:
         return None
@@ -97,7 +97,7 @@ def true_seam(cell: Cell[WeldJob]) -> SeamCurve | None:
 
 
 def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
-    """The points that the tip felt and the servo kept, against the truth; None where it felt nothing."""
+    """The seam points that the servo measured with the tip, against the ground truth; None where there are none."""
     state, seam = cell.job.servo_report(root).state, true_seam(cell)
     if state is None or seam is None or len(state.refined) < 10:
         return None
@@ -111,7 +111,7 @@ def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
 
 
 def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
-    """The rows of the run in which the servo was at work, or None."""
+    """The log rows in which the servo was active; None where there are none."""
     if not cell.logs:
         return None
     series = {name: sink.FindLog(root) for name, sink in cell.logs.items()}
@@ -142,9 +142,9 @@ def weld_log(cell: Cell[WeldJob], root: Context) -> WeldLog | None:
 
 
 def new_ticks(ticks: Array) -> NDArray[np.bool_]:
-    """Which of the ticks' times (N,) s, NaN outside a weld, are later than all before.
+    """Mask of the ticks' times (N,) s, NaN outside a weld, that are later than all previous ones.
 
-    After a fault the last report stands, and a robot's clock may stand still for a moment or start anew.
+    After a fault the last report repeats, and a robot's clock may stall or restart.
     """
     newest = np.fmax.accumulate(np.nan_to_num(ticks, nan=-np.inf))
     return np.asarray(ticks > np.concatenate([[-np.inf], newest[:-1]]))
@@ -156,7 +156,7 @@ def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
 
 
 def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
-    """Measure the weld, against the truth where a simulation knows it; None where nothing was welded."""
+    """Measure the weld, with its errors where the ground truth is known; None where nothing was welded."""
     log, seam = weld_log(cell, root), true_seam(cell)
     if log is None:
         return None
@@ -175,7 +175,7 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
 
 
 def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:
-    """Heat input at each row at which the arc burned, kJ/mm as welders read it; None where it is not known."""
+    """Heat input of each row with a burning arc, kJ/mm; None where it is not known."""
     if process.missing is not None or not weld.log.torch_on.any():
         return None
     return 1e-6 * process.heat_input(speed_along(weld.log.time, weld.log.p_BTorch)[weld.log.torch_on])

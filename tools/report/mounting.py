@@ -14,7 +14,7 @@ from weldcal.tools.report.render import fixed, render
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     """The whole report as one self-contained HTML text."""
     status, mounting, result = report.status, report.mounting, report.result
-    aside = np.array([1e3 * k.error_m for k in status.kept_aside])
+    aside = np.array([1e3 * k.error_m for k in status.held_out])
     unknowns, errors = [], report.truth_errors()
     for k, X in {} if result is None else result.poses.items():
         u = mounting.unknowns[k]
@@ -34,8 +34,8 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         deg = "–" if result is None else fixed(float(np.degrees(result.rotation_rad[i])), 4)
         rows.append((s.label, "used" if used else "left out", mm, deg, fixed(100 * s.coverage, 0)))
     rows += [
-        (k.label, "kept aside", fixed(1e3 * k.error_m, 3), fixed(float(np.degrees(k.tilt_rad)), 4), "–")
-        for k in status.kept_aside
+        (k.label, "held out", fixed(1e3 * k.error_m, 3), fixed(float(np.degrees(k.tilt_rad)), 4), "–")
+        for k in status.held_out
     ]
     return render(
         "mounting.html.j2",
@@ -62,7 +62,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         refused=status.refused,
         next_best=None if status.next_best is None else status.next_best.sentence(),
         growth=_growth(report) if len(status.history) > 1 else None,
-        bars=error_bars([k.label for k in status.kept_aside], aside, np.ones(len(aside), bool), "error, mm")
+        bars=error_bars([k.label for k in status.held_out], aside, np.ones(len(aside), bool), "error, mm")
         if len(aside)
         else None,
         rows=rows,

@@ -1,4 +1,4 @@
-"""What a job puts into the simulated world, as it truly is; drawn from the run's seed."""
+"""The objects that a job adds to the simulated world, with true poses drawn from the run's seed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from weldcal.systems.drivers.simulated.world import Fittings
 
 @dataclass(frozen=True, eq=False)
 class Furnishing:
-    """Bodies for `build_world`, and `parts` that drivers find by their type (see StationBuild)."""
+    """Bodies for `build_world`, and `parts` that drivers look up by type (see StationBuild)."""
 
     fittings: Sequence[Fittings] = ()
     second: PlacedArm | None = None

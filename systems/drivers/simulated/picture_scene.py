@@ -1,4 +1,4 @@
-"""What a camera looks at: a scene of its own, in which nothing is moved until a picture is taken."""
+"""A separate scene graph for a camera; its poses are updated only when a picture is taken."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from weldcal.systems.messages import Message
 
 
 class PicturePoses(LeafSystem):
-    """Where the bodies stand that a camera may see.
+    """Computes the poses of the bodies in a camera's scene.
 
     .. pydrake_system::
 
@@ -35,8 +35,8 @@ class PicturePoses(LeafSystem):
         output_ports:
         - frame_poses
 
-    Calculated when a picture is taken and not before: a renderer whose scene is the contact model's own is told of every
-    step of it, 500 times a second, and that costs as much as the contact itself.
+    The poses are calculated only when a picture is taken. A renderer on the contact model's scene graph would be updated at
+    every plant step (500 Hz), which costs as much as the contact computation.
     """
 
     def __init__(self, plant: MultibodyPlant, frames: dict[BodyIndex, FrameId]) -> None:
@@ -60,9 +60,10 @@ class PicturePoses(LeafSystem):
 
 @dataclass(frozen=True)
 class PictureScene(Message):
-    """A scene graph with one renderer, the frames of the bodies that move in it, and who knows where they stand.
+    """A scene graph with one renderer, the frames of its moving bodies, and the system that computes their poses.
 
-    `apart`: the builder it is in where it is not in the cell's own Diagram; `frame_poses` is that one's input.
+    `apart`: the builder of a separate Diagram that holds the scene, with the input `frame_poses`; None: the cell's Diagram
+    holds it.
     """
 
     scene_graph: SceneGraph
@@ -82,15 +83,15 @@ def add_picture_scene(
     background: tuple[float, float, float] | None = None,
     apart: DiagramBuilder | None = None,
 ) -> PictureScene:
-    """Add a scene with what the bodies of `plant` look like in the scene graph `drawn`.
+    """Add a scene with the visual geometry that the bodies of `plant` have in the scene graph `drawn`.
 
     Args:
         plant: finalised.
-        renderer: name of the VTK renderer that is made for it.
-        mount: name of the body that carries the camera; None: it stands still.
-        only: names of the geometries that are seen; None: all.
-        background: red, green and blue, 0 to 1, of what lies behind; None: the renderer's own.
-        apart: a builder that gets the scene, for a Diagram of its own; only the poses stay in `builder` then.
+        renderer: name of the VTK renderer created for the scene.
+        mount: name of the body that carries the camera; None: the camera is fixed.
+        only: names of the visible geometries; None: all.
+        background: background colour, red, green and blue from 0 to 1; None: the renderer's default.
+        apart: builder of a separate Diagram that gets the scene; only the pose computation is then added to `builder`.
     """
     scene = (builder if apart is None else apart).AddSystem(SceneGraph())
     scene.set_name(f"{renderer}_scene")

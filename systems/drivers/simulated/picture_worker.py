@@ -1,4 +1,4 @@
-"""Pictures drawn in a thread of their own, while the Diagram goes on to the moment at which they arrive."""
+"""Renders pictures in a separate thread while the Diagram advances to their arrival time."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U, RgbdSensor
 
-PICTURE_THREAD = "pictures"  # how these threads are named, for whoever sets their priority
+PICTURE_THREAD = "pictures"  # prefix of the thread names, by which their priority is set
 Pixels = NDArray[np.uint8]
 Finish = Callable[[Pixels], Pixels]
 Draw = Callable[[FramePoseVector, Finish], "Future[Pixels]"]
 
 
 class PictureWorker:
-    """Draws a scene as it stood; a picture depends on the poses alone, so it is the same whenever it is ready.
+    """Renders a scene at given poses; a picture depends on the poses only, so the time of rendering does not matter.
 
-    A camera's picture arrives 40 ms after its exposure, and drawing takes a quarter of that: done in the Diagram's own
-    thread, it would be a quarter of a weld's computing time. A Simulator lets go of Python's lock while it advances, and
-    so this thread's own tiny Diagram (scene, camera, a hold that takes the picture) is advanced and not evaluated.
+    A picture arrives 40 ms after its exposure, and rendering takes a quarter of that. In the Diagram's thread it would
+    be a quarter of a weld's computing time. A Simulator releases the GIL while it advances; therefore this thread
+    advances a small Diagram of its own (scene, camera, a hold that samples the picture) and does not evaluate ports.
     """
 
     def __init__(self, scene: DiagramBuilder, sensor: RgbdSensor) -> None:
@@ -39,7 +39,7 @@ class PictureWorker:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=PICTURE_THREAD)
 
     def draw(self, poses: FramePoseVector, finish: Finish) -> Future[Pixels]:
-        """Begin a picture, `finish` of its colours (H, W, 4); pictures are drawn in the order in which they are asked for."""
+        """Start a picture; the future holds `finish` of its colours (H, W, 4). Pictures are rendered in the order of the calls."""
         return self._thread.submit(self._draw, AbstractValue.Make(poses), finish)
 
     def _draw(self, poses: AbstractValue, finish: Finish) -> Pixels:
@@ -47,5 +47,5 @@ class PictureWorker:
             self._simulator = Simulator(self._diagram)
         context = self._simulator.get_mutable_context()
         self._diagram.GetInputPort("frame_poses").FixValue(context, poses)
-        self._simulator.AdvanceTo(context.get_time() + 1.0)  # the hold takes the picture as this second begins
+        self._simulator.AdvanceTo(context.get_time() + 1.0)  # the hold samples the picture at the start of this second
         return finish(self._diagram.GetOutputPort("picture").Eval(context).data)

@@ -1,4 +1,4 @@
-"""How the profiler's fixture really is: pose of the sensor, torch, straightedge and sphere, each off its drawing by the seed."""
+"""Draws the true profiler fixture from the seed: sensor, torch, straightedge and sphere, each off its nominal pose."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def draw_fixture(
     workpiece: Workpiece | None,
     X_BP: RigidTransform | None,
 ) -> ProfilerFixture:
-    """How the real fixture differs from the drawing, from the seed."""
+    """Draw the deviations of the true fixture from its nominal dimensions and poses."""
     off = random_pose_error(rng, error_m, error_rad)
     X_FS = RigidTransform(X_FS_drawn.rotation() @ off.rotation(), X_FS_drawn.translation() + off.translation())
     bent = rng.normal(size=3)

@@ -1,4 +1,4 @@
-"""What a profiler's cell has beside the arm: torch and profiler on the flange, a straightedge and a sphere on posts, as they really are."""
+"""Adds torch, profiler, straightedge and sphere to the simulated world of a profiler cell, at their true poses."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
 
 Array = NDArray[np.float64]
-TIP_RADIUS_M = 2e-5  # of the point that touches: a hundredth of a millimetre is below what any figure shows
+TIP_RADIUS_M = 2e-5  # of the contact point: 0.01 mm is below the resolution of every reported figure
 POST_RADIUS_M = 0.006
-BEVEL_M = 0.007  # thickness of the straightedge, bevelled under 45 degrees: its side is hidden from above
+BEVEL_M = 0.007  # thickness of the straightedge, bevelled under 45 degrees so that its side is hidden from above
 MASS_KG = 0.9
 
 
 @dataclass(frozen=True, eq=False)
 class ProfilerTruth(Message):
-    """What only the simulation knows: X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre in B."""
+    """Ground truth of the simulation: X_FS, the torch's tip in F, the edge (point, direction) and the sphere's centre in B."""
 
     X_FS: RigidTransform
     p_FTip: Array
@@ -36,26 +36,26 @@ class ProfilerTruth(Message):
 
 @dataclass(frozen=True, eq=False)
 class ProfilerFixture(Message):
-    """Truth and job, the pose of the straightedge, and what rays may meet: (mesh in B, how dark 0 to 1) each."""
+    """Ground truth and job, the pose of the straightedge, and the ray-cast objects: (mesh in B, darkness 0 to 1) each."""
 
     truth: ProfilerTruth
     X_BE: RigidTransform
     job: ProfilerJob
     meshes: tuple[tuple[TriMesh, float], ...]
     X_FS_drawn: RigidTransform
-    time_step_s: float = 0.004  # of the plant: nothing in it is softer than the arm's servos
+    time_step_s: float = 0.004  # of the plant: nothing in it is more compliant than the arm's servos
 
 
 @dataclass(frozen=True, eq=False)
 class TouchPair(Message):
-    """The two geometries whose contact is a touch, and the number of the body with the tip."""
+    """The two geometries whose contact counts as a touch, and the index of the body with the tip."""
 
     tip: GeometryId
     ball: GeometryId
 
 
 def straightedge_mesh(length_m: float, width_m: float) -> TriMesh:
-    """A bar whose top is the plane z = 0 from its edge at y = 0 (along x) to y = width, both sides bevelled inwards."""
+    """A bar with its top in the plane z = 0, from its edge at y = 0 (along x) to y = width, both sides bevelled inwards."""
     section = np.array([[0.0, 0.0], [width_m, 0.0], [width_m - BEVEL_M, -BEVEL_M], [BEVEL_M, -BEVEL_M]])
     ends = [np.column_stack([np.full(4, x), section]) for x in (-0.5 * length_m, 0.5 * length_m)]
     triangles = [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]]
@@ -72,7 +72,7 @@ def post_mesh(top: Array, table_z_m: float) -> TriMesh:
 
 
 def under_straightedge(X_BE: RigidTransform, width_m: float) -> Array:
-    """Where the straightedge's post ends: under the middle of its underside."""
+    """The upper end of the straightedge's post: the middle of the straightedge's underside."""
     return np.asarray(X_BE.multiply(np.array([0.0, 0.5 * width_m, -BEVEL_M])))
 
 
@@ -83,7 +83,7 @@ def box_mesh(center: list[float], size: list[float]) -> TriMesh:
 
 
 def rig_points(tip_F: Array, X_FS: RigidTransform) -> tuple[Array, Array]:
-    """What must keep clear of things: points (n, 3) m of torch and profiler in F, and their radii (n,) m."""
+    """Spheres that bound torch and profiler for clearance checks: centres (n, 3) m in F, and radii (n,) m."""
     along = np.linspace(0.15, 0.97, 10)[:, None]
     torch = along * tip_F
     radii = np.minimum(0.008, 0.2 * np.linalg.norm(tip_F - torch, axis=1) + 0.001)
@@ -95,7 +95,7 @@ def rig_points(tip_F: Array, X_FS: RigidTransform) -> tuple[Array, Array]:
 def add_fixture(
     plant: MultibodyPlant, arm: ModelInstanceIndex, fixture: ProfilerFixture, table_z_m: float
 ) -> TouchPair:
-    """Add it to a plant that is not finalised; the tip and the sphere are all that can touch."""
+    """Add the fixture to a plant that is not finalised; only the tip and the sphere have contact geometry."""
     truth, job = fixture.truth, fixture.job
     rig = plant.AddModelInstance("profiler_rig")
     inertia = SpatialInertia(MASS_KG, np.zeros(3), UnitInertia.SolidBox(0.16, 0.07, 0.12))
@@ -129,7 +129,7 @@ def add_fixture(
 
 
 def _show_torch(show: object, plate: object, tip: Array, rgba: tuple[float, ...]) -> None:
-    """A tube to near its tip, then a needle, both along the line from the flange's centre to the tip."""
+    """Show a tube that ends near the tip, then a needle, both along the line from the flange's centre to the tip."""
     assert callable(show)
     length = float(np.linalg.norm(tip))
     d = tip / length

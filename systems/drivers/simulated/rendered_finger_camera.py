@@ -1,4 +1,4 @@
-"""The finger camera in simulation: the tag rendered as it moves with the soft tip, with noise and latency."""
+"""Simulated finger camera: renders the tag that moves with the soft tip, and adds noise and latency."""
 
 import dataclasses as dc
 from concurrent.futures import Future
@@ -31,28 +31,28 @@ from weldcal.systems.messages import Image, Message
 
 @dc.dataclass
 class RenderedFingerCamera(FingerCameraConfig):
-    """`!RenderedFingerCamera`: the camera in the tool, looking at the tag."""
+    """`!RenderedFingerCamera`: the camera in the tool that observes the tag."""
 
     DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("finger_camera",)
     SIMULATED: ClassVar[bool] = True
-    width: int = 400  # the window that is read out of a 640 x 480 sensor: the tag and as far as it can move
+    width: int = 400  # the window that is read out of a 640 x 480 sensor: the tag and its range of motion
     height: int = 300
     focal_px: float = 450.0
     rate_hz: float = 30.0
     latency_s: float = 0.040
     noise_grey: float = 2.0
     hidden_from_s: float | None = (
-        None  # spatter on the lens: from this time after the camera started, the tag is not seen
+        None  # spatter on the lens: the tag is not visible from this time after the camera started
     )
 
     def camera(self) -> FingerCamera:
-        """The camera as numbers."""
+        """Image size, focal length, frame rate and latency."""
         return FingerCamera(self.width, self.height, self.focal_px, self.rate_hz, self.latency_s, self.noise_grey)
 
 
 @dc.dataclass(frozen=True, eq=False)
 class _Exposed(Message):
-    """A frame that was exposed, and its pixels (H, W), which may still be in the making."""
+    """An exposed frame and its pixels (H, W), which may still be rendering."""
 
     frame: Image
     pixels: "Future[Pixels]"
@@ -60,7 +60,7 @@ class _Exposed(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class _Stream(Message):
-    """The newest frames, oldest first: some are still on their way through the latency."""
+    """The newest frames, oldest first, including those that the latency has not released yet."""
 
     started: float = -np.inf
     count: int = 0
@@ -69,7 +69,7 @@ class _Stream(Message):
 
 @lru_cache(maxsize=4)
 def _noise_table(sigma: float) -> np.ndarray:
-    """65536 equally likely values of Gaussian noise, cut to whole grey levels as a camera cuts: a draw is one look-up."""
+    """65536 equally likely values of Gaussian noise, rounded to whole grey levels as by a camera; a draw is one look-up."""
     return np.asarray(np.floor(sigma * ndtri((np.arange(65536) + 0.5) / 65536)), dtype=np.int16)
 
 
@@ -80,7 +80,7 @@ def with_noise(grey: np.ndarray, sigma: float, rng: np.random.Generator) -> np.n
 
 
 class StreamingColourCamera(LeafSystem):
-    """Takes grey frames at the camera's rate while it is asked to stream.
+    """Takes grey frames at the camera's rate while streaming is on.
 
     .. pydrake_system::
 
@@ -92,8 +92,9 @@ class StreamingColourCamera(LeafSystem):
         - image
         - capture_time
 
-    A frame shows the world as of the plant's last step, so that is the capture time it carries. `frame_poses` (FramePoseVector):
-    where the bodies of the camera's scene stand; `draw` begins a picture of them, which is waited for when the frame arrives.
+    A frame shows the world at the plant's last step, and its capture time is the time of that step. `frame_poses`
+    (FramePoseVector): poses of the bodies in the camera's scene; `draw` starts a picture of them, and the system waits for
+    the picture when the frame arrives.
     """
 
     def __init__(self, config: RenderedFingerCamera, seed: int, plant_period_s: float, draw: Draw) -> None:
@@ -111,7 +112,7 @@ class StreamingColourCamera(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / config.rate_hz, 0.0, self._expose)
 
     def first_picture(self, context: Context) -> Pixels:
-        """The colours (H, W, 4) of what stands there now, waited for: a renderer's first picture takes a second."""
+        """Render and return the colours (H, W, 4) at the current poses; a renderer's first picture takes a second."""
         return self._draw(self._poses.Eval(context), lambda colours: colours.copy()).result()
 
     def _expose(self, context: Context, state: State) -> None:
@@ -125,15 +126,17 @@ class StreamingColourCamera(LeafSystem):
         covered = np.full((self._config.height, self._config.width), 25, dtype=np.uint8)
 
         def finish(colours: Pixels) -> Pixels:
-            # The tag is black on white: one channel says it all.
+            # The tag is black on white: one channel is sufficient.
             grey = covered if hidden else np.asarray(cv2.extractChannel(colours, 1), dtype=np.uint8)
             return with_noise(grey, self._config.noise_grey, rng)
 
         pixels = self._draw(self._poses.Eval(context), finish)
         step = self._plant_period_s
-        taken = (np.ceil(now / step - 1e-6) - 1.0) * step  # on a tick itself the plant still shows the step before
+        taken = (
+            np.ceil(now / step - 1e-6) - 1.0
+        ) * step  # at the time of a tick the plant's outputs still show the previous step
         frame = _Exposed(Image(stream.count + 1, taken, exposed_at=now), pixels)
-        kept = 2 + int(self._config.latency_s * self._config.rate_hz)  # enough to look back through the latency
+        kept = 2 + int(self._config.latency_s * self._config.rate_hz)  # enough frames to cover the latency
         new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
         state.get_mutable_abstract_state(self._state).set_value(new)
 
@@ -151,7 +154,7 @@ class StreamingColourCamera(LeafSystem):
 
 
 def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None:
-    """Mount a colour camera in the tool and stream it."""
+    """Add a colour camera to the tool and its streaming system to the station."""
     world, tool = build.require(SimulatedWorld), build.tool
     view = world.finger_view
     if tool is None or view is None or view.apart is None:

@@ -1,4 +1,4 @@
-"""A laser profiler in simulation: a fan of rays from the wrist, cast at the real geometry, then noise, rounding and lost returns."""
+"""Simulated laser profiler: casts a fan of rays at the true geometry; adds noise, rounding and lost returns."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -22,22 +22,22 @@ from weldcal.systems.jobs.profiler.config import pose_of
 from weldcal.systems.messages import ProfileScan, TorchTouch
 
 Array = NDArray[np.float64]
-FORCE_N = 0.02  # from here on a touch is felt
+FORCE_N = 0.02  # contact force above which a touch is reported
 
 
 @dc.dataclass
 class RenderedProfiler(DriverConfig):
-    """`!RenderedProfiler`: where the profiler sits on the flange as drawn, how far it is off, and how it measures.
+    """`!RenderedProfiler`: nominal pose of the profiler on the flange, its deviation, and its measurement model.
 
-    The numbers are of the straight-edge paper's profiler: 40 mm wide at 60 mm to 160 mm at 350 mm, rounded to 0.1 mm, and
-    0.16 mm of noise, here shared between each sample and the whole profile.
+    The numbers are those of the profiler in the straight-edge paper: 40 mm wide at 60 mm to 160 mm at 350 mm, rounded to
+    0.1 mm, and 0.16 mm of noise, here divided between each sample and the whole profile.
     """
 
     FOR: ClassVar[tuple[str, ...]] = ("profiler",)
     SIMULATED: ClassVar[bool] = True
-    xyz_m: list[float] = dc.field(default_factory=lambda: [0.070, 0.0, 0.045])  # X_FS as drawn
+    xyz_m: list[float] = dc.field(default_factory=lambda: [0.070, 0.0, 0.045])  # nominal X_FS
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 90.0])
-    mounting_translation_mm: float = 4.0  # the true pose differs by this much, drawn from the seed
+    mounting_translation_mm: float = 4.0  # deviation of the true pose, drawn from the seed
     mounting_rotation_deg: float = 2.0
     samples: int = 480
     nearest_mm: float = 60.0
@@ -49,14 +49,12 @@ class RenderedProfiler(DriverConfig):
     quantum_mm: float = 0.1
     share_missing: float = 0.01
     share_spikes: float = 0.005
-    grazing_deg: float = (
-        78.0  # a surface this steep to the ray returns half of what it should, one 8 degrees steeper nothing
-    )
+    grazing_deg: float = 78.0  # at this angle of incidence half of the samples return, 8 degrees steeper none
     exposure_s: float = 0.004
 
     @property
     def apex_m(self) -> float:
-        """How far behind the origin of S the rays of the fan meet."""
+        """Distance of the fan's apex behind the origin of S, m."""
         widening = (self.width_far_mm - self.width_near_mm) / (self.farthest_mm - self.nearest_mm)
         return 1e-3 * (self.width_near_mm / widening - self.nearest_mm)
 
@@ -67,11 +65,11 @@ class RenderedProfiler(DriverConfig):
         return np.linspace(-half, half, self.samples)
 
     def pitch_m(self, z_m: float) -> float:
-        """Distance of neighbouring samples at a depth."""
+        """Distance (m) of neighbouring samples at a depth."""
         return float((z_m + self.apex_m) * (self.slopes[1] - self.slopes[0]))
 
     def preset(self) -> ProfilerPreset:
-        """The noise of samples, in the words of models.profilers; raises InputError for numbers that no profiler has."""
+        """The noise of samples as a ProfilerPreset; raises InputError for numbers that no profiler has."""
         if (
             not self.width_far_mm > self.width_near_mm > 0.0
             or min(self.noise_mm, self.jitter_mm, self.exposure_s) < 0.0
@@ -91,17 +89,17 @@ class RenderedProfiler(DriverConfig):
 
 
 def last_step(now: float, step: float) -> float:
-    """The time that the plant's outputs show: on a tick itself still the step before."""
+    """Time of the plant step that the plant's outputs show: at the time of a tick, the previous step."""
     return max(0.0, float((np.ceil(now / step - 1e-6) - 1.0) * step))
 
 
 class RayFan:
-    """The fan of rays against what stands still in B: meshes, and the sphere itself."""
+    """Casts the fan of rays at the objects fixed in B: meshes, and the exact sphere."""
 
     def __init__(self, config: RenderedProfiler, fixture: ProfilerFixture) -> None:
         self._config = config
         self._scene = o3d.t.geometry.RaycastingScene()
-        # about the sphere's centre: single precision is good to a tenth of a micron there
+        # relative to the sphere's centre, where single precision resolves 0.1 micrometre
         self._origin = np.array(fixture.truth.center)
         self._radius = fixture.truth.radius_m
         self._dark = []
@@ -126,7 +124,7 @@ class RayFan:
         number = hit["geometry_ids"].numpy().astype(np.int64)
         dark = np.array([*self._dark, 1.0])[
             np.minimum(number, len(self._dark))
-        ]  # a miss has the largest number there is
+        ]  # a miss is the largest representable number
         t_ball, normal_ball = self._sphere(start, d)
         nearer = t_ball < t
         t, dark = np.where(nearer, t_ball, t), np.where(nearer, 0.0, dark)
@@ -137,7 +135,7 @@ class RayFan:
         return np.column_stack([slopes * (z + c.apex_m), z]), cosine, dark
 
     def _sphere(self, start: Array, d: Array) -> tuple[Array, Array]:
-        """Where the rays enter the sphere, which stands at this scene's origin: t (n,), infinite for a miss, and normals."""
+        """Where the rays enter the sphere at the scene's origin: t (n,), infinite for a miss, and normals."""
         a, b = np.einsum("ni,ni->n", d, d), d @ start
         root = b**2 - a * (start @ start - self._radius**2)
         t = np.where(root > 0.0, (-b - np.sqrt(np.maximum(root, 0.0))) / a, np.inf)
@@ -147,7 +145,7 @@ class RayFan:
 def measured_profile(
     config: RenderedProfiler, clean: Array, cosine: Array, dark: Array, rng: np.random.Generator
 ) -> Array:
-    """The same profile as the sensor returns it: jitter, noise, rounding, spikes; grazing and dark surfaces lose returns."""
+    """Apply the sensor model to a profile: jitter, noise, rounding, spikes; grazing and dark surfaces lose returns."""
     p = clean + 1e-3 * config.jitter_mm * rng.standard_normal(2)
     p = with_noise(p, config.preset(), rng)
     steep = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
@@ -158,7 +156,7 @@ def measured_profile(
 
 
 class ProfilerSensor(LeafSystem):
-    """Takes one profile when the trigger grows.
+    """Takes one profile when the trigger increases.
 
     .. pydrake_system::
 
@@ -169,8 +167,8 @@ class ProfilerSensor(LeafSystem):
         output_ports:
         - profile
 
-    `trigger` (1) is the number of the newest profile that was asked for. A profile shows the world as of the plant's last
-    step, which is the capture time it carries; it appears after the exposure.
+    `trigger` (1) is the number of the newest requested profile. A profile shows the world at the plant's last step, and its
+    capture time is the time of that step. It appears on `profile` after the exposure.
     """
 
     def __init__(
@@ -218,7 +216,8 @@ class ProfilerSensor(LeafSystem):
 
 
 class TouchSensor(LeafSystem):
-    """Feels when the torch's tip meets the sphere, as the sphere paper's microcontroller does: by the plant's contact.
+    """Detects contact of the torch's tip with the sphere from the plant's contact results; it takes the place of the sphere
+    paper's microcontroller.
 
     .. pydrake_system::
 
@@ -245,7 +244,7 @@ class TouchSensor(LeafSystem):
         felt = any(self._felt(results, k) for k in range(results.num_point_pair_contacts()))
         if felt == old.down:
             return
-        # contact is found where the last step began: one step before the place that the plant's poses show
+        # contact is computed at the start of the last step: one step before the poses that the plant's outputs show
         time = last_step(context.get_time(), self._step) - self._step
         new = TorchTouch(old.sequence + 1, time, True) if felt else dc.replace(old, down=False)
         state.get_mutable_abstract_state(self._touch).set_value(new)
@@ -260,7 +259,7 @@ class TouchSensor(LeafSystem):
 
 
 class CheatTorch(LeafSystem):
-    """Where the torch's tip truly is.
+    """Outputs the true position of the torch's tip.
 
     .. pydrake_system::
 
@@ -284,12 +283,12 @@ class CheatTorch(LeafSystem):
 
 
 def drawn_pose(config: RenderedProfiler) -> RigidTransform:
-    """X_FS as drawn."""
+    """The nominal X_FS."""
     return pose_of(config.xyz_m, config.rpy_deg)
 
 
 def ApplyDriverConfig(config: RenderedProfiler, build: StationBuild) -> None:
-    """Put the profiler on the flange at its true pose, and feel the torch's touches."""
+    """Add the profiler at its true pose on the flange, and the sensor of the torch's touches."""
     world = build.require(SimulatedWorld)
     fixture, pair = build.require(ProfilerFixture), world.touch_pair
     if pair is None:

@@ -1,4 +1,4 @@
-"""A structured-light scanner in simulation: depth rendering at the real geometry, then the scanner's own noise."""
+"""Simulated structured-light scanner: renders the depth of the true geometry and adds the scanner's noise."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -33,7 +33,7 @@ from weldcal.systems.messages import Scan
 
 @dc.dataclass
 class RenderedScanner(ScannerConfig):
-    """`!RenderedScanner`: where the simulated scanner truly stands, and what it is."""
+    """`!RenderedScanner`: the preset of the simulated scanner, its nominal pose and the deviation from it."""
 
     DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("scanner",)
     SIMULATED: ClassVar[bool] = True
@@ -42,9 +42,7 @@ class RenderedScanner(ScannerConfig):
     height: int | None = 616
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.95])  # nominal X_BC
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, -90.0])
-    mounting_translation_mm: float = (
-        15.0  # the true pose differs from the nominal one by this much, drawn from the seed
-    )
+    mounting_translation_mm: float = 15.0  # deviation of the true pose from the nominal one, drawn from the seed
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
     field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
@@ -53,7 +51,7 @@ class RenderedScanner(ScannerConfig):
     )
 
     def scanner(self) -> ScannerPreset:
-        """The scanner with the resolution and the field of view that are asked for; pixels stay as square as they were."""
+        """The scanner with the configured resolution and field of view; the pixels' aspect ratio is unchanged."""
         preset = get_scanner(self.preset, width=self.width, height=self.height)
         if self.field_of_view_deg is None:
             return preset
@@ -62,18 +60,18 @@ class RenderedScanner(ScannerConfig):
 
 
 def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
-    """A pose error of exactly this size in a random direction."""
+    """A pose error of exactly this magnitude (m, rad) in a random direction."""
     axis, direction = rng.normal(size=3), rng.normal(size=3)
     axis /= np.linalg.norm(axis)
     direction /= np.linalg.norm(direction)
     return RigidTransform(RotationMatrix(AngleAxis(rotation_rad, axis)), translation_m * direction)
 
 
-BRIGHT_GREY = 80.0  # of 255: what reflects this much light or more is measured as a bright surface
+BRIGHT_GREY = 80.0  # of 255: surfaces that reflect this much light or more count as bright
 
 
 def darkness(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """0 (bright) to 1 (black) for each pixel of an image (H, W, 3), 0 to 255."""
+    """Darkness of each pixel of an image (H, W, 3), 0 to 255: 0 (bright) to 1 (black)."""
     luminance = rgb @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     return np.asarray(np.clip(1.0 - luminance / BRIGHT_GREY, 0.0, 1.0), dtype=np.float32)
 
@@ -91,8 +89,8 @@ class DepthSensor(LeafSystem):
         output_ports:
         - scan
 
-    `trigger` (1) is the sequence number of the newest scan that was asked for; when it grows, the depth image is rendered,
-    the scanner's noise is added from the seed and the sequence number, and the cloud appears on `scan` after the exposure.
+    `trigger` (1) is the sequence number of the newest requested scan. When it increases, the depth image is rendered and the
+    scanner's noise is added from the seed and the sequence number. The cloud appears on `scan` after the exposure.
     """
 
     def __init__(self, preset: ScannerPreset, seed: int, exposure_s: float, period_s: float = 0.02) -> None:
@@ -131,7 +129,7 @@ class DepthSensor(LeafSystem):
             state.get_mutable_abstract_state(self._pending).set_value(scan)
 
     def _darkness(self, context: Context) -> np.ndarray | None:
-        """How dark each pixel's surface is, 0 to 1, from the colour image; None where no colour image is connected."""
+        """Darkness of each pixel's surface, 0 to 1, from the colour image; None where no colour image is connected."""
         if not self._color.HasValue(context):
             return None
         rgb = np.asarray(self._color.Eval(context).data[:, :, :3], dtype=np.float32)
@@ -142,18 +140,18 @@ class DepthSensor(LeafSystem):
 
 
 def _carrier(world: SimulatedWorld, mounted_on: str) -> RigidBody | None:
-    """The body that carries the scanner; None: it stands still in the base."""
+    """The body that carries the scanner; None: the scanner is fixed in the base."""
     if mounted_on == "base":
         return None
     return world.plant.GetBodyByName(mounted_on if mounted_on == "flange" else f"{mounted_on}_link", world.arm)
 
 
 def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBody | None) -> None:
-    """The scanner's body where it truly stands: for viewers only (not in the scanner's own scene), so that it does not see itself."""
+    """Add the scanner's housing at its true pose, for viewers only: the scanner's own scene does not contain it."""
     scene_graph = world.scene_graph
     if carrier is not None:
         plant = world.plant
-        size = Box(0.26, 0.07, 0.08)  # a short one and its bracket
+        size = Box(0.26, 0.07, 0.08)  # a short housing and its bracket
         housing = GeometryInstance(X_BC @ RigidTransform([0.0, 0.0, -0.045]), size, "scanner_housing")
         grey = np.array([0.18, 0.20, 0.23, 1.0])
         seen = PerceptionProperties()
@@ -170,9 +168,9 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBod
 
 
 def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
-    """Stand a depth camera on its carrier at its true pose (known to `cheat.*` alone) and add the scanner behind it.
+    """Mount a depth camera at the scanner's true pose (exported by `cheat.*` only) and add the scanner's noise model.
 
-    Returns the true pose of the scanner in the frame of what carries it: X_BC, X_FC or X_LC.
+    Returns the true pose of the scanner in its carrier's frame: X_BC, X_FC or X_LC.
     """
     world = build.require(SimulatedWorld)
     preset = config.scanner()

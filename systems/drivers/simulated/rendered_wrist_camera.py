@@ -1,4 +1,4 @@
-"""A depth camera on the wrist in simulation: takes one picture of the world as it really stands when it is asked."""
+"""Simulated wrist depth camera: takes one picture of the true geometry per trigger."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -23,23 +23,23 @@ _NEAR_M, _FAR_M = 0.05, 2.0
 
 @dc.dataclass
 class RenderedWristCamera(DriverConfig):
-    """`!RenderedWristCamera`: a camera on the flange as drawn, by how much the real one differs, and its noise."""
+    """`!RenderedWristCamera`: nominal pose of the camera on the flange, the deviation of the true pose, and its noise."""
 
     FOR: ClassVar[tuple[str, ...]] = ("wrist_camera",)
     SIMULATED: ClassVar[bool] = True
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.075, 0.0, 0.030])  # nominal X_FC
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 90.0])
-    mounting_translation_mm: float = 4.0  # the true pose differs from the nominal one by this much, drawn from the seed
+    mounting_translation_mm: float = 4.0  # deviation of the true pose from the nominal one, drawn from the seed
     mounting_rotation_deg: float = 2.0
     width: int = 640
     height: int = 480
     focal_px: float = 617.7
     noise_grey: float = 2.0
-    depth_scale: float = 0.985  # it reads this share of the true depth
+    depth_scale: float = 0.985  # scale factor of the measured depth
     depth_noise_mm: float = 0.8
 
     def nominal(self) -> RigidTransform:
-        """X_FC as drawn."""
+        """The nominal X_FC."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
     def camera_matrix(self) -> NDArray[np.float64]:
@@ -49,7 +49,7 @@ class RenderedWristCamera(DriverConfig):
 
 
 class WristCamera(LeafSystem):
-    """Takes a picture when the trigger grows.
+    """Takes a picture when the trigger increases.
 
     .. pydrake_system::
 
@@ -61,7 +61,7 @@ class WristCamera(LeafSystem):
         output_ports:
         - picture
 
-    `trigger` (1) is the sequence number of the newest picture that was asked for; its noise follows from seed and number.
+    `trigger` (1) is the sequence number of the newest requested picture; its noise follows from seed and number.
     """
 
     def __init__(self, config: RenderedWristCamera, seed: int, period_s: float = 0.02) -> None:
@@ -96,7 +96,7 @@ class WristCamera(LeafSystem):
 
 
 def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:
-    """Hang the camera on the flange of the simulated arm where it truly is (known to `cheat.truth` alone)."""
+    """Mount the camera on the simulated flange at its true pose (exported by `cheat.truth` only)."""
     world, builder = build.require(SimulatedWorld), build.builder
     view = add_picture_scene(builder, world.plant, world.scene_graph, RENDERER, mount="flange")
     K = config.camera_matrix()

@@ -1,4 +1,4 @@
-"""A second arm in the simulated world: another model in the one plant, where its base truly stands"""
+"""Adds a second arm to the simulated plant, with its base at its true pose."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from weldcal.models.arms.urdf import arm_urdf
 from weldcal.systems.jobs.mounting.config import SecondArm
 
 SECOND = "ur10e_2"
-"""Prefix of its ports, as `ur10e` is the first one's."""
+"""Prefix of the second arm's ports; `ur10e` is the prefix of the first arm's."""
 
 
 @dc.dataclass(frozen=True, eq=False)
 class PlacedArm:
-    """An arm, where its base truly stands in the first one's (X_BD), and where it starts (6,) rad."""
+    """An arm, the true pose X_BD of its base in the first arm's base, and its start configuration (6,) rad."""
 
     arm: ArmModel
     X_BD: RigidTransform
@@ -30,7 +30,8 @@ class PlacedArm:
 
 
 def place_second_arm(config: SecondArm, off: RigidTransform) -> PlacedArm:
-    """The arm as it stands, ``off`` from its drawing (turned in its own frame, moved in the first base's)."""
+    """Place the arm with the deviation ``off`` from its nominal pose (rotation in its own frame, translation in the first
+    arm's base)."""
     drawn = config.pose()
     X_BD = RigidTransform(drawn.rotation() @ off.rotation(), drawn.translation() + off.translation())
     return PlacedArm(load_arm(config.arm), X_BD, np.deg2rad(config.home_deg))
@@ -39,7 +40,7 @@ def place_second_arm(config: SecondArm, off: RigidTransform) -> PlacedArm:
 def add_second_arm(
     plant: MultibodyPlant, placed: PlacedArm, stiffness: tuple[float, ...], damping: tuple[float, ...]
 ) -> ModelInstanceIndex:
-    """Add the arm to a plant that is not finalised, in joint servos as the first one's."""
+    """Add the arm to a plant that is not finalised, with joint servos like the first arm's."""
     (instance,) = Parser(plant).AddModelsFromString(arm_urdf(placed.arm, SECOND), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance), placed.X_BD)
     for name, p, d in zip(placed.arm.joint_names, stiffness, damping, strict=True):

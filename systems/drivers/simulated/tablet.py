@@ -1,4 +1,4 @@
-"""A tablet in simulation: its glass feels the pen by the contact force, and says where to a tenth of a pixel."""
+"""Simulated tablet: detects the pen by its contact force and reports the position to a tenth of a pixel."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -16,23 +16,23 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.tablet.config import TabletConfig
 from weldcal.systems.jobs.tablet.messages import TabletTouch, TabletTruth
 
-GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two geometries that touch
+GLASS, NIB = "tablet_glass", "pen_nib"  # names of the two contact geometries
 
 
 @dc.dataclass
 class SimulatedTablet(DriverConfig):
-    """`!SimulatedTablet`: how far it lies from where it is thought to lie, and how it feels."""
+    """`!SimulatedTablet`: deviation of the tablet's true pose from the nominal one, and its touch threshold."""
 
     FOR: ClassVar[tuple[str, ...]] = ("digitizer",)
     SIMULATED: ClassVar[bool] = True
     placement_translation_mm: float = 4.0  # drawn from the seed
     placement_rotation_deg: float = 1.5
     touch_noise_px: float = 0.3
-    touch_force_N: float = 0.02  # from here on it feels the pen
+    touch_force_N: float = 0.02  # contact force above which the pen is detected
 
 
 class TabletDigitizer(LeafSystem):
-    """Feels the pen through the glass: a touch begins when the contact force passes its threshold, and counts once.
+    """Detects the pen on the glass: a touch begins when the contact force exceeds its threshold, and counts once.
 
     .. pydrake_system::
 
@@ -75,7 +75,7 @@ class TabletDigitizer(LeafSystem):
         state.get_mutable_abstract_state(self._touch).set_value(new)
 
     def _felt(self, results: ContactResults) -> np.ndarray | None:
-        """Where on the page (2,) m the pen presses hard enough; None where it does not."""
+        """Position on the page (2,) m of a contact above the threshold; None where there is none."""
         for k in range(results.num_hydroelastic_contacts()):
             info = results.hydroelastic_contact_info(k)
             surface = info.contact_surface()
@@ -98,7 +98,7 @@ def _geometry(plant: MultibodyPlant, body: str, build: StationBuild, name: str) 
 
 
 def ApplyDriverConfig(config: SimulatedTablet, build: StationBuild) -> None:
-    """Let the glass of the simulated world feel the pen."""
+    """Add the digitizer of the simulated tablet to the station."""
     plant = build.require(SimulatedWorld).plant
     pair = {_geometry(plant, "", build, GLASS), _geometry(plant, "pen", build, NIB)}
     px_per_m, X_BT = 1e3 * build.require(TabletConfig).px_per_mm, build.require(TabletTruth).X_BT

@@ -1,4 +1,4 @@
-"""What a visit to the tablet adds to the simulated world: plate, camera body and sprung pen on the flange, a tablet on the table."""
+"""Adds the tablet job's bodies to the simulated world: plate, camera and sprung pen on the flange, tablet on the table."""
 
 from __future__ import annotations
 
@@ -46,21 +46,21 @@ _PEN_MASS_KG = 0.02
 _PEN_DAMPING = 3.0  # N s / m
 _PEN_MODULUS_PA = 1e7  # of the soft nib
 _PEN_FRICTION = 0.1
-_NIB_FACETS = 8.0  # edges of the contact model's nib per radius: the touched point is a centroid of its facets
-_HOLE = 0.62  # of a ring's radius, as the page draws it
-_FRAME_M, _THICK_M = 0.010, 0.008  # the tablet's frame around the page, and how thick the tablet is
+_NIB_FACETS = 8.0  # edges of the contact model's nib per radius: the contact point is a centroid of its facets
+_HOLE = 0.62  # of a ring's radius, as drawn on the page
+_FRAME_M, _THICK_M = 0.010, 0.008  # width of the tablet's frame around the page, and its thickness
 _CAMERA_BOX = Box(0.09, 0.024, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
 class TabletFittings:
-    """What `build_world` is to add, standing where it truly stands."""
+    """Bodies that `build_world` adds, at their true poses."""
 
     tablet: TabletConfig
     truth: TabletTruth
 
     def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
-        """Add everything before the plant is finalised; returns the model instance of what the flange carries."""
+        """Add all bodies before the plant is finalised; returns the model instance of the bodies on the flange."""
         _add_tablet(plant, self.tablet, self.truth.X_BT)
         return _add_rig(plant, arm, self.tablet, self.truth)
 
@@ -68,9 +68,10 @@ class TabletFittings:
 def tablet_fittings(
     tablet: TabletConfig, camera: DriverConfig, page: DriverConfig, rng: np.random.Generator
 ) -> TabletFittings:
-    """How camera, pen and tablet really are, from the seed.
+    """Draw the true poses of camera, pen and tablet from the seed.
 
-    What a device's driver does not simulate stands as drawn. The tablet lies flat but for its error in place and turn.
+    A device without a simulated driver has its nominal pose. The tablet lies flat; its error is a translation in the plane
+    and a rotation about the normal.
     """
     X_FC, X_BT = RigidTransform(), tablet.pose()
     if isinstance(camera, RenderedWristCamera):
@@ -87,7 +88,7 @@ def tablet_fittings(
 
 
 def page_picture(tablet: TabletConfig) -> NDArray[np.uint8]:
-    """The screen as the page draws it (h, w), its first landmark `margin_mm` from the upper left."""
+    """The screen's picture (h, w), its first landmark `margin_mm` from the upper left corner."""
     size = 1e3 * tablet.landmarks_m().max(axis=0) + 2.0 * tablet.margin_mm
     w, h = (round(v * _TEXELS_PER_MM) for v in size)
     screen = np.full((h, w), 235, dtype=np.uint8)
@@ -117,7 +118,7 @@ def _contact() -> ProximityProperties:
 def _add_rig(
     plant: MultibodyPlant, arm: ModelInstanceIndex, tablet: TabletConfig, truth: TabletTruth
 ) -> ModelInstanceIndex:
-    """Plate and camera welded to the flange; the pen gives way along z_F against its spring."""
+    """Add plate and camera, welded to the flange, and the pen, which yields along z_F against its spring."""
     pen = tablet.pen
     rig = plant.AddModelInstance("pen_rig")
     inertia = SpatialInertia(0.4, np.zeros(3), UnitInertia.SolidBox(0.14, 0.07, 0.03))
@@ -143,14 +144,14 @@ def _add_rig(
 
 
 def _add_tablet(plant: MultibodyPlant, tablet: TabletConfig, X_BT: RigidTransform) -> None:
-    """The tablet with its page, that cameras see, and its glass, that the pen meets; frame: the world is the base B."""
+    """Add the tablet: its page as visual geometry and its glass as contact geometry. Frame: the world is the base B."""
     ground = plant.world_body()
     far = tablet.landmarks_m().max(axis=0)
     width, height = far + 2e-3 * tablet.margin_mm
     middle = X_BT @ RigidTransform(np.r_[0.5 * far, 0.0])
     slab = Box(width + 2.0 * _FRAME_M, height + 2.0 * _FRAME_M, _THICK_M)
     _show(plant, ground, middle @ RigidTransform([0.0, 0.0, 0.5 * _THICK_M + 0.0005]), slab, "tablet", DARK)
-    facing = RotationMatrix.MakeXRotation(np.pi)  # the board looks along its z, the tablet's z goes into it
+    facing = RotationMatrix.MakeXRotation(np.pi)  # the board faces along its z; the tablet's z points into it
     board = textured_board("page", float(width), float(height), page_picture(tablet))
     page = GeometryInstance(middle @ RigidTransform(facing), board, "page")
     page.set_perception_properties(PerceptionProperties())

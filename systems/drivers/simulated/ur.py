@@ -1,4 +1,4 @@
-"""A UR10e in simulation: what a controller's speedj does, over the MultibodyPlant's implicit joint servos."""
+"""Simulated UR10e: the controller's speedj on top of the MultibodyPlant's implicit joint servos."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -16,7 +16,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
 from weldcal.welding.numerics import within
 
-_LARGEST_MM = 1.0  # an arm that misses by more is broken, not unrepeatable
+_LARGEST_MM = 1.0  # a larger error is a defect, not repeatability
 
 
 READY = UrStatus()
@@ -24,20 +24,20 @@ READY = UrStatus()
 
 @dc.dataclass
 class SimulatedUr(DriverConfig):
-    """`!SimulatedUr`: the controller's speedj over the arm of the simulated world."""
+    """`!SimulatedUr`: the controller's speedj for the simulated arm."""
 
     FOR: ClassVar[tuple[str, ...]] = ("robot", "robot_2")
     DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("robot",)
     SIMULATED: ClassVar[bool] = True
 
-    control_period_s: float = 0.002  # 500 Hz, as the real controller
-    following_error_rad: float = 0.05  # beyond this the controller stops the arm
-    # rms distance of the flange from where the controller says it stands, drawn anew for each stop; 0: it says the truth
+    control_period_s: float = 0.002  # 500 Hz, like the real controller
+    following_error_rad: float = 0.05  # a larger following error stops the arm
+    # rms distance of the true flange position from the reported one, drawn for each stop; 0: the report is exact
     repeatability_mm: float = 0.0
 
 
 class SpeedJointServo(LeafSystem):
-    """Integrates the newest joint velocity into the reference of the joint servos and samples the arm, at 500 Hz.
+    """Integrates the newest joint velocity to the reference of the joint servos and samples the arm, at 500 Hz.
 
     .. pydrake_system::
 
@@ -53,11 +53,11 @@ class SpeedJointServo(LeafSystem):
         - sample_time
         - status
 
-    Velocity (6) rad/s in, arm state (12) rad, rad/s in. Outputs depend on the discrete state only: no feedthrough, one tick
-    of latency. Speeds and accelerations beyond the arm's are clamped as the controller clamps them; a reference that leaves
-    the arm by more than the following error latches a fault and the reference freezes. With a repeatability, what is measured
-    differs from where the arm is by a small joint offset that holds for as long as the arm stands and is drawn anew, from
-    ``seed`` and the number of the stop, when it sets off.
+    Inputs: velocity (6) rad/s, arm state (12) rad, rad/s. Outputs depend on the discrete state only: no feedthrough, one tick
+    of latency. Speeds and accelerations above the arm's limits are clamped as by the controller. A reference that differs
+    from the arm by more than the following error latches a fault and freezes the reference. With a repeatability above zero
+    the measured joints differ from the true ones by a small offset. It is constant while the arm is at rest and is drawn
+    anew, from ``seed`` and the number of the stop, when the arm starts to move.
     """
 
     def __init__(self, arm: ArmModel, config: SimulatedUr, q_start: np.ndarray, seed: int = 0) -> None:
@@ -69,7 +69,7 @@ class SpeedJointServo(LeafSystem):
         own = [*offset, 0.0] if config.repeatability_mm else []
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._arm_state = self.DeclareVectorInputPort("arm_state", 12)
-        # q_ref, v_ref, q, v, sample time, fault; of an arm that repeats imperfectly: joint offset of this stop, its number
+        # q_ref, v_ref, q, v, sample time, fault; with a repeatability above zero: joint offset of this stop, its number
         state = self.DeclareDiscreteState(
             np.concatenate([q_start, np.zeros(6), q_start - offset, np.zeros(6), [0.0, 0.0], own])
         )
@@ -96,14 +96,14 @@ class SpeedJointServo(LeafSystem):
         q_ref = within(old[:6] + dt * v_ref, self._arm.position_lower, self._arm.position_upper)
         own = old[26:].copy()
         if own.size:
-            if not old[6:12].any() and v_ref.any():  # it sets off
+            if not old[6:12].any() and v_ref.any():  # the arm starts to move
                 own[6] += 1.0
                 own[:6] = self._offset(measured[:6], int(own[6]))
             measured[:6] -= own[:6]
         discrete.set_value(np.concatenate([q_ref, v_ref, measured, [context.get_time(), fault], own]))
 
     def _offset(self, q: np.ndarray, stop: int) -> np.ndarray:
-        """Joint offsets (6,) rad that displace the flange by the repeatability (rms), whatever the arm's pose."""
+        """Joint offsets (6,) rad that displace the flange by the repeatability (rms) at any arm pose."""
         if not self._config.repeatability_mm:
             return np.zeros(6)
         lever = float(np.linalg.norm(jacobian(self._arm, q)[3:]))
@@ -136,13 +136,13 @@ class SpeedJointServo(LeafSystem):
 
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
-    """Add the servo and wire it to the arm of the simulated world."""
+    """Add the servo and connect it to the simulated arm."""
     if not 0.0 <= config.repeatability_mm <= _LARGEST_MM:
         raise InputError(
             f"robot.repeatability_mm must be from 0 to {_LARGEST_MM:g}, and it is {config.repeatability_mm:g}."
         )
     world = build.require(SimulatedWorld)
-    # the others' random numbers stay what they are where the arm needs none
+    # no draw where it is not needed: the other devices' random numbers stay the same
     seed = int(build.rng.integers(2**32)) if config.repeatability_mm else 0
     servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed))
     servo.set_name("ur10e_servo")

@@ -1,4 +1,4 @@
-"""The simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant, with what its cameras see."""
+"""Builds the simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant and scene graph."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
 
 @dataclass(frozen=True)
 class SimulatedWorld(Message):
-    """Handles into the plant that drivers and `cheat.*` ports need."""
+    """Handles into the plant for drivers and `cheat.*` ports."""
 
     plant: MultibodyPlant
     scene_graph: SceneGraph
@@ -61,16 +61,16 @@ class SimulatedWorld(Message):
 
 
 class Fittings(Protocol):
-    """What else a scenario puts into the world: bodies on the flange and on the table."""
+    """Further bodies of a scenario, on the flange and on the table."""
 
     def add(self, plant: MultibodyPlant, arm: ModelInstanceIndex) -> ModelInstanceIndex:
-        """Add them before the plant is finalised; returns the model instance whose springs are to rest at zero."""
+        """Add them before the plant is finalised; returns the model instance whose springs have their rest position at zero."""
 
 
 def compensate_gravity(builder: DiagramBuilder, plant: MultibodyPlant, models: list[ModelInstanceIndex]) -> None:
-    """The controller's feed-forward: joint torques against gravity, so that the servos need not sag to find them.
+    """Add the controller's feed-forward torques against gravity, so that the servos have no static error.
 
-    Gravity stays on: an arm at rest without any force leaves the contact solver no scale to converge by.
+    Gravity stays on: without any force on an arm at rest, the contact solver has no scale for its convergence test.
     """
     feed_forward = builder.AddSystem(InverseDynamics(plant, InverseDynamics.InverseDynamicsMode.kGravityCompensation))
     feed_forward.set_name("gravity_compensation")
@@ -97,17 +97,17 @@ def build_world(
     second: PlacedArm | None = None,
     foot: BaseCircle | None = None,
 ) -> SimulatedWorld:
-    """Build the plant with everything the station needs; the arm stands at `q_start` and hangs in its implicit joint servos.
+    """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
-    A robot's driver says where they pull it: the simulated controller, or a real arm whose shadow this one then is.
-    Frame: the world is the robot base B. `workpiece` is the real part (it may differ from its CAD), placed at X_BP.
-    `second` is another arm; `foot` the ring of the base mounting, drawn as round as a scan can tell.
+    A robot driver sets the servos' reference: the simulated controller, or a real arm that the simulated one follows.
+    Frame: the world is the robot base B. `workpiece` is the true part (it may differ from its CAD), placed at X_BP.
+    `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
     """
     plant, scene_graph = AddMultibodyPlant(
         MultibodyPlantConfig(
             time_step=time_step_s,
             contact_model="hydroelastic" if profiler is None else "point",
-            discrete_contact_approximation="lagged",  # with `sap` the tip's rest position depends on the sliding speed
+            discrete_contact_approximation="lagged",  # with `sap` the tip's rest position would depend on the sliding speed
         ),
         builder,
     )
@@ -140,7 +140,7 @@ def build_world(
     plant.Finalize()
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):
-        raise RuntimeError("the six joint servos of the arm are not in place")
+        raise RuntimeError("the arm does not have six joint servos")
     plant.SetDefaultPositions(instance, q_start)
     if second_arm is not None and second is not None:
         plant.SetDefaultPositions(second_arm, second.q_start)
@@ -164,8 +164,10 @@ def build_world(
             FINGER_RENDERER,
             mount="tool_plate",
             only=("tag_print", "tag_white"),
-            apart=DiagramBuilder(),  # drawn in a thread of its own
-            background=SOFT[:3],  # the membrane fills the view behind the tag: shading it would cost as much as the tag
+            apart=DiagramBuilder(),  # rendered in a separate thread
+            background=SOFT[
+                :3
+            ],  # the membrane fills the view behind the tag; rendering it would cost as much as the tag
         )
     return SimulatedWorld(
         plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, second_arm, touch_pair

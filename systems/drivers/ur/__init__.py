@@ -1,1 +1,1 @@
-"""The hardware interface to a Universal Robots controller: worker process, guard script, pre-flight."""
+"""Driver of Universal Robots controllers: worker process, guard script, pre-flight checks."""

@@ -1,4 +1,4 @@
-"""Robot time on the host's clock: the earliest arrivals of many packages, with a straight line for the drift."""
+"""Maps robot time to the host's clock: a line fitted to the earliest package arrivals, with offset and drift."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import numpy as np
 BIN_S = 0.5
 BINS = 60  # half a minute of bins
 BINS_FOR_DRIFT = 8
-DRIFT_LIMIT = 5e-4  # quartz against quartz is below 1e-4
-STEP_S = 0.005  # more than this off the line for a whole bin: the controller stood still, or its clock was set
+DRIFT_LIMIT = 5e-4  # the drift of two quartz clocks is below 1e-4
+STEP_S = 0.005  # more than this off the line for a whole bin: the controller stalled, or its clock was set
 
 
 class ClockMap:
     """host time = robot time / pace + offset + drift * robot time.
 
-    A package can only be late, so the least of (host - robot) in each half second is the best sight of the offset; a
-    line through these least values, weighted to none, gives offset and drift, and its residual says how good that is.
-    Where a whole bin lies off the line by more than STEP_S, what was seen before it belongs to another clock and is dropped;
-    where the line is steeper than two quartzes can differ, the controller does not keep its own pace, and the last bin counts.
+    A package can only be late, so the minimum of (host - robot) in each half second is the best estimate of the offset. An
+    unweighted line through these minima gives offset and drift; its residual is a measure of the accuracy.
+    Where a whole bin is off the line by more than STEP_S, all earlier data are dropped. Where the slope exceeds the drift of
+    two quartz clocks, the controller does not keep its pace, and only the last bin is used.
     """
 
     def __init__(self, pace: float = 1.0) -> None:
@@ -33,7 +33,7 @@ class ClockMap:
         self.residual_s = 0.0
 
     def update(self, robot_time: float, host_time: float) -> None:
-        """A package of this robot time (s) was seen at this host time (s, monotonic)."""
+        """Add a package with this robot time (s), received at this host time (s, monotonic)."""
         seen = host_time - robot_time / self._pace
         if self._least is None:
             self._origin, self._offset = robot_time, seen
@@ -58,11 +58,11 @@ class ClockMap:
             slope, at_origin = np.polyfit(t - self._origin, seen, 1)
             self.drift, self._offset = float(slope), float(at_origin)
             if abs(slope) > DRIFT_LIMIT:
-                # No quartz: a controller that lost time, and how much is in the newest packages alone.
+                # Above quartz drift: the controller lost time, and only the newest packages show the present offset.
                 self.drift, self._offset = 0.0, float(seen[-1])
         line = self._offset + self.drift * (t - self._origin)
         self.residual_s = float(np.sqrt(np.mean((seen - line) ** 2)))
 
     def to_host(self, robot_time: float) -> float:
-        """The host time (s) at which the robot's clock showed this."""
+        """Convert robot time (s) to host time (s)."""
         return robot_time / self._pace + self._offset + self.drift * (robot_time - self._origin)

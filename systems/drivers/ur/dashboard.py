@@ -1,4 +1,4 @@
-"""The dashboard of PolyScope 5: one line in, one line out, on a fresh connection each time."""
+"""Client of the PolyScope 5 dashboard: sends one command line and reads one answer, on a new connection each time."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_P
     Args:
         host: name or address of the controller.
         command: one line, without its newline.
-        timeout_s: connecting takes at most this long, and so does the exchange.
-        port: where the dashboard listens.
+        timeout_s: longest time of the connection, and of the exchange.
+        port: port of the dashboard.
 
     Raises:
-        RobotUnreachable: no dashboard answers there in time (PolyScope X has none).
+        RobotUnreachable: no dashboard answers in time (PolyScope X has none).
     """
     with Line(host, port, "Dashboard Server", timeout_s) as line:
         until = line.deadline()
@@ -30,13 +30,13 @@ def ask(host: str, command: str, timeout_s: float = 2.0, port: int = DASHBOARD_P
 
 
 def stop_program(host: str, timeout_s: float = 2.0) -> str:
-    """Ends the running or paused program; "Stopped" where that was done, else the controller's refusal, or nothing.
+    """Stop the running or paused program; returns "Stopped", the controller's refusal, or an empty text.
 
-    After a fault this is the only word to say: `play` would go on with the velocity that the registers still hold. Where
-    there is no dashboard (PolyScope X) the word goes to the script port, which does not answer.
+    After a fault only a stop is safe: `play` would continue with the velocity that the registers still hold. Where there
+    is no dashboard (PolyScope X), the command goes to the script port, which does not answer.
 
     Raises:
-        RobotUnreachable: neither port answers there in time.
+        RobotUnreachable: neither port answers in time.
     """
     try:
         return ask(host, "stop", timeout_s)

@@ -1,4 +1,4 @@
-"""Why a robot is not started: one sentence each, with what to press."""
+"""Errors for a robot that cannot be started; each message is one sentence with the operator action."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from weldcal.models.errors import WeldcalError
 
 
 class RobotRefused(WeldcalError):
-    """The robot, or its state, does not allow the job to begin; nothing has moved."""
+    """The robot or its state does not allow the job to start; nothing has moved."""
 
 
 class RobotUnreachable(RobotRefused):

@@ -1,4 +1,4 @@
-"""Every reason for which the hardware interface stops the arm, each with what a person does about it."""
+"""The faults for which the UR driver stops the arm, each with its message and operator action."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class Fault(IntEnum):
-    """Latched by the first that occurs; only a new start clears it."""
+    """The first fault is latched; only a new start clears it."""
 
     NONE = 0
     LINK_STALE = 1
@@ -43,9 +43,9 @@ class Fault(IntEnum):
 SENTENCES = {
     Fault.LINK_STALE: "LINK: no new state from the robot for {detail:.0f} ms; check the network cable and the load of this computer, then start again.",
     Fault.LINK_CLOSED: "LINK: the controller closed the connection; check the network cable and that the controller is on, then start again.",
-    Fault.WORKER_DIED: "LINK: the connection broke down, and our process at it ended; check that the controller is on, and the cable, then start again.",
+    Fault.WORKER_DIED: "LINK: the connection failed, and its worker process ended; check that the controller is on, and the cable, then start again.",
     Fault.CONTROLLER_DEAF: "LINK: the controller has not taken a command for {detail:.0f} ms; "
-    "check the cable, and that nobody started another program or writes its registers; start again.",
+    "check the cable, and that no other program runs or writes its registers; start again.",
     Fault.CLOCK_JUMPED: "LINK: the controller's clock jumped by {detail:.3f} s; if it was restarted, start again when it is ready.",
     Fault.STATE_IMPLAUSIBLE: "LINK: a joint was reported {detail:.3f} rad from where it was 4 ms before; check the network and start again.",
     Fault.COMMAND_LATE: "COMMAND LATE: the cell gave no new velocity for {detail:.0f} ms while the arm moved; close other programs here and start again.",
@@ -63,18 +63,18 @@ SENTENCES = {
     Fault.SAFETY_VIOLATION: "SAFETY FAULT: the safety system reports mode {detail:.0f}; restart the safety system on the pendant, then start again.",
     Fault.RECOVERY_MODE: "RECOVERY MODE: the arm is outside its safety limits; move it back by hand in recovery mode, then start again.",
     Fault.ROBOT_NOT_RUNNING: "ROBOT NOT RUNNING: the arm is in mode {detail:.0f}; switch it on and release its brakes on the pendant, then start again.",
-    Fault.PROGRAM_STOPPED: "PROGRAM STOPPED: somebody or something stopped the program on the controller; start again.",
+    Fault.PROGRAM_STOPPED: "PROGRAM STOPPED: the program on the controller was stopped; start again.",
     Fault.PROGRAM_PAUSED: "PROGRAM PAUSED: the program on the controller was paused; press Stop, not Play, on the pendant, and start again.",
-    Fault.GUARD_REFUSED: "An old command stands in the controller's registers and would not go: close whatever else writes them and start again.",
-    Fault.UPLOAD_REFUSED: "The controller did not start our program: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
+    Fault.GUARD_REFUSED: "An old command in the controller's registers could not be cleared: close the program that writes them and start again.",
+    Fault.UPLOAD_REFUSED: "The controller did not start the guard script: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
     Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",
     Fault.TCP_NOT_ZERO: "The TCP could not be set to zero: set it to zero in Installation > General > TCP on the pendant and start again.",
     Fault.OUTPUT_IN_USE: "The digital output of the process (robot.process_output) is taken: close the other RTDE client or fieldbus that writes the outputs.",
-    Fault.START_FAILED: "The process that talks to the robot could not start; run `weldcal check-robot` and try again.",
+    Fault.START_FAILED: "The worker process of the robot link could not start; run `weldcal check-robot` and try again.",
 }
 
 
-# what the guard script writes into its output register when it latches
+# codes that the guard script writes into its output register when it latches
 GUARD_REASONS = {
     3: "because no new command came for 40 ms",
     4: "because a joint velocity was too high",
@@ -83,5 +83,5 @@ GUARD_REASONS = {
 
 
 def sentence(fault: Fault, detail: float = 0.0) -> str:
-    """The fault in words, with what to press."""
-    return SENTENCES[fault].format(detail=detail, reason=GUARD_REASONS.get(int(detail), "for no known reason"))
+    """The message of a fault, with the operator action."""
+    return SENTENCES[fault].format(detail=detail, reason=GUARD_REASONS.get(int(detail), "for an unknown reason"))

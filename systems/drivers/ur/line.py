@@ -1,4 +1,4 @@
-"""A TCP connection to a controller on which no call waits longer than it was told, and every failure is a sentence."""
+"""A TCP connection to a controller with a time limit on each call; failures raise RobotUnreachable with a message."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ RELEASE_WAIT_S = 0.3
 
 
 class Line:
-    """One connection; every reading or writing call ends within `timeout_s`, however slowly the bytes drip.
+    """One connection; each read or write call ends within `timeout_s`, even where data arrive byte by byte.
 
     Raises (all methods):
-        RobotUnreachable: nothing answers, in one sentence that says what to look at.
+        RobotUnreachable: nothing answers; the message says what to check.
     """
 
     def __init__(self, host: str, port: int, service: str, timeout_s: float) -> None:
@@ -48,19 +48,19 @@ class Line:
         self.close()
 
     def send(self, data: bytes) -> None:
-        """Writes all of it."""
+        """Write all of `data`."""
         try:
             self._socket.settimeout(self._timeout_s)
             self._socket.sendall(data)
         except OSError as error:
-            raise self._lost("took nothing in") from error
+            raise self._lost("accepts no data") from error
 
     def deadline(self) -> float:
-        """When a call that starts now must end (s, monotonic)."""
+        """The time at which a call that starts now must end (s, monotonic)."""
         return time.monotonic() + self._timeout_s
 
     def read(self, size: int, until: float) -> bytes:
-        """Exactly `size` bytes."""
+        """Read exactly `size` bytes."""
         while len(self._inbox) < size:
             self._fill(until)
         data = bytes(self._inbox[:size])
@@ -68,7 +68,7 @@ class Line:
         return data
 
     def read_line(self, until: float) -> str:
-        """Text up to the next newline, without it."""
+        """Read text up to the next newline, without it."""
         while b"\n" not in self._inbox:
             self._fill(until)
             if len(self._inbox) > 65536:
@@ -76,7 +76,7 @@ class Line:
         return self.read(self._inbox.index(b"\n") + 1, until).decode("utf-8", "replace").strip()
 
     def drain(self) -> None:
-        """Throws away what has arrived."""
+        """Discard the received data."""
         self._inbox.clear()
         self._socket.settimeout(0.0)
         with contextlib.suppress(OSError):
@@ -84,21 +84,21 @@ class Line:
                 pass
 
     def nonsense(self) -> RobotUnreachable:
-        """What to raise where the bytes make no sense."""
+        """The exception for data that do not follow the protocol."""
         return RobotUnreachable(
-            f"What answers at {self._host} port {self._port} is no UR controller: compare the address with the one on "
+            f"The server at {self._host} port {self._port} is not a UR controller: compare the address with the one on "
             "the pendant under Settings > System > Network."
         )
 
     def _fill(self, until: float) -> None:
         left = until - time.monotonic()
         if left <= 0.0:
-            raise self._lost("says nothing")
+            raise self._lost("sends no data")
         try:
             self._socket.settimeout(left)
             data = self._socket.recv(65536)
         except TimeoutError as error:
-            raise self._lost("says nothing") from error
+            raise self._lost("sends no data") from error
         except OSError as error:
             raise self._lost("hangs up") from error
         if not data:
@@ -107,12 +107,12 @@ class Line:
 
     def _lost(self, what: str) -> RobotUnreachable:
         return RobotUnreachable(
-            f"{self._host} takes a connection on its {self._service} port {self._port} but {what}: check that this is "
+            f"{self._host} accepts a connection on its {self._service} port {self._port} but {what}: check that this is "
             "the robot's address, and restart the control box if it is."
         )
 
     def close(self) -> None:
-        """Hangs up and waits a moment for the other side to do so too: what was claimed is free then."""
+        """Close the connection and wait briefly for the other side to close; claimed inputs are free then."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_WR)
             until = time.monotonic() + RELEASE_WAIT_S
@@ -124,7 +124,7 @@ class Line:
 
 
 def _resolve(host: str, port: int, timeout_s: float) -> tuple[str, int]:
-    """The address of a host; the system's own look-up knows no deadline, so it runs beside us."""
+    """Resolve the address of a host in a thread, because the system's look-up has no time limit."""
     found: list[tuple[str, int]] = []
 
     def look_up() -> None:

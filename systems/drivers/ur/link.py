@@ -1,4 +1,4 @@
-"""The cell's side of the link: starts the worker, shares memory with it, never blocks, and sees to it that the program ends."""
+"""The cell's side of the robot link: starts the worker, shares memory with it without blocking, and ends the program."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PLAYING, PAUSING, PAUSED = 2, 3, 4
 
 @dataclass(frozen=True, eq=False)
 class LinkState:
-    """What the worker last knew. Times in s of the host's monotonic clock, except `robot_time` (the controller's own)."""
+    """The worker's newest state. Times in s of the host's monotonic clock, except `robot_time` (the controller's clock)."""
 
     q: NDArray[np.float64]
     qd: NDArray[np.float64]
@@ -52,11 +52,11 @@ class LinkState:
     late_periods: int
     clock_residual_s: float
     clock_drift: float
-    process_on: bool = False  # the process output, as the controller reports it
+    process_on: bool = False  # process output as reported by the controller
 
 
 class UrLink:
-    """A running worker. Made by `start`; `close` ends program and worker in order."""
+    """A running worker. `start` creates it; `close` ends the program, then the worker."""
 
     def __init__(self, config: WorkerConfig) -> None:
         self._config = config
@@ -98,10 +98,10 @@ class UrLink:
         payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
         process_output: int | None = None,
     ) -> UrLink:
-        """Start the worker, upload the guard, and wait until it obeys. The arm does not move, `process_output` is off.
+        """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
 
         Raises:
-            RobotRefused: one sentence that says what to press; nothing is left behind.
+            RobotRefused: the message gives the operator action; worker and program are ended.
         """
         config = WorkerConfig(
             host, arm, limits, rate_hz, upper_registers, payload_kg, payload_cog_m, os.getpid(), process_output
@@ -125,7 +125,7 @@ class UrLink:
         raise RobotRefused(sentence(Fault.START_FAILED) + (f" It said: {said}" if said else ""))
 
     def command(self, qd: NDArray[np.float64], process: bool = False) -> int:
-        """Hand the newest joint velocity (6,) rad/s, and whether the process may run, to the worker; its number. Never blocks."""
+        """Pass a joint velocity (6,) rad/s and the process enable to the worker; returns the command's number. Never blocks."""
         self._number += 1
         self._memory.command.write([float(self._number), time.monotonic(), 0.0, float(process), *map(float, qd)])
         return self._number
@@ -138,7 +138,7 @@ class UrLink:
         """The newest state. Never blocks.
 
         Raises:
-            RuntimeError: the worker has not obeyed yet.
+            RuntimeError: the worker is not active yet.
         """
         with contextlib.suppress(TornRead):
             self._last = self._memory.state.read() or self._last
@@ -186,7 +186,7 @@ class UrLink:
         )
 
     def close(self) -> None:
-        """Brake, end the program in order, end the worker; then make sure through the dashboard. May be called twice."""
+        """Brake, end the program, end the worker, then confirm the stop through the dashboard. May be called twice."""
         if not self._finalizer.alive:
             return
         if self._process.poll() is None:
@@ -203,13 +203,13 @@ class UrLink:
         self._end()
 
     def _see_to_the_stop(self) -> None:
-        """After a stop that is not our own, the program is stopped for good: a paused one could be played again."""
+        """Stop the program after a stop that the driver did not command: a paused program could be resumed."""
         if self._stopper is None:
             self._stopper = threading.Thread(target=self._stop_program, daemon=True)
             self._stopper.start()
 
     def _stop_program(self) -> None:
-        # PolyScope X has no dashboard, and a dead network has none either: the guard's watchdog has stopped the arm
+        # without a dashboard (PolyScope X, or no network) the guard's watchdog has stopped the arm
         with contextlib.suppress(RobotRefused):
             stop_program(self._config.host)
 

@@ -1,4 +1,4 @@
-"""Turns a digital output off over an RTDE connection of its own, whatever program runs or stands still on the controller."""
+"""Turns a digital output off over a separate RTDE connection, independent of the program on the controller."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ MASK, VALUE = "standard_digital_output_mask", "standard_digital_output"
 
 
 class OffSwitch:
-    """Only off: what turns the output on is the guard script, which knows when nobody is there any more.
+    """Turns the output off; only the guard script turns it on, because it detects a lost client.
 
-    The connection is opened at the start and held, so that one package of five bytes is all that is left to do.
+    The connection is opened at the start and held, so that turning off takes one package of five bytes.
 
     Raises:
-        RobotRefused: another client writes the outputs; RobotUnreachable: no RTDE there.
+        RobotRefused: another client writes the outputs; RobotUnreachable: no RTDE server answers.
     """
 
     def __init__(self, host: str, output: int) -> None:
@@ -30,6 +30,6 @@ class OffSwitch:
         self._package = struct.pack(">BBB", recipe, 1 << output, 0)
 
     def off(self) -> None:
-        """One package; a connection that is gone is left alone: then the guard and the controller turn it off."""
+        """Send the package. A broken connection is ignored: the guard and the controller turn the output off then."""
         with contextlib.suppress(RobotUnreachable):
             self._probe.write(self._package)

@@ -1,4 +1,4 @@
-"""Who runs before whom on the cell's computer: the cell, the worker's loop, and the threads that ur_rtde polls the robot with."""
+"""Sets the thread priorities on the cell's computer: the cell, the worker's loop, and ur_rtde's polling threads."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ import os
 import threading
 
 CELL_PRIORITY = 1
-LOOP_PRIORITY = 2  # of SCHED_RR; an emulated controller, which stands for another computer, has 3
+LOOP_PRIORITY = 2  # of SCHED_RR; an emulated controller, which takes the place of another computer, has 3
 
 
 def take_priority() -> None:
-    """Run this thread, and those that it starts from now on, before everything that is not real time, where the system lets
-    us; else as politely placed as it allows.
+    """Give this thread, and those that it starts later, real-time priority; where the system refuses it, the highest
+    ordinary priority that it allows.
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(LOOP_PRIORITY))
@@ -22,12 +22,12 @@ def take_priority() -> None:
 
 
 def poll_beside_the_cell() -> None:
-    """Give all other threads of this process the cell's own priority, where the system lets us.
+    """Give all other threads of this process the cell's priority, where the system allows it.
 
-    Each connection of ur_rtde has a thread that looks for data, sleeps for 0.1 ms and looks again. With the loop's priority
-    they would take the processor from the cell thousands of times a second, and two cores could not keep up with half of real time.
-    With the cell's they run on another core, or after it; ordinary threads might not run at all while it computes. On one core
-    they would wait until it is done, and stay as they are.
+    Each connection of ur_rtde has a thread that polls for data and sleeps for 0.1 ms. With the loop's priority these threads
+    would preempt the cell thousands of times a second, and two cores could not keep up with half of real time. With the
+    cell's priority they run on another core or after the cell; with ordinary priority they might not run while it computes.
+    On one core they would wait for the cell, so their priority is not changed.
     """
     if len(os.sched_getaffinity(0)) < 2:
         return

@@ -1,4 +1,4 @@
-"""The robot through ur_rtde: connect, upload the guard, one coherent sample, one numbered velocity. For the worker process only."""
+"""The worker's interface to the robot through ur_rtde: connect, upload the guard, read samples, send numbered velocities."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ALWAYS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "ru
 
 
 class Refused(Exception):
-    """The start failed."""
+    """The start failed, with the fault that caused it."""
 
     def __init__(self, fault: Fault) -> None:
         super().__init__(fault.name)
@@ -37,8 +37,8 @@ class Refused(Exception):
 
 
 def guard_script(upper_registers: bool, output: int | None = None) -> str:
-    """The guard's text for the register range in use: 24 to 47, or 0 to 23 which fieldbuses share; `output`: the standard
-    digital output of the process, None where none is wired.
+    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share; `output`: the
+    standard digital output of the process, None where none is wired.
     """
     text = files("weldcal.systems.drivers.ur").joinpath("guard.script").read_text(encoding="utf-8")
     if output is not None:
@@ -50,7 +50,7 @@ def guard_script(upper_registers: bool, output: int | None = None) -> str:
 
 
 def _sockets_to(port: int) -> dict[int, int]:
-    """Descriptors of this process's connections to that port, each with its inode."""
+    """File descriptors of this process's connections to a port, each with its inode."""
     found = {}
     for name in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
@@ -64,7 +64,7 @@ def _sockets_to(port: int) -> dict[int, int]:
 
 
 class Robot:
-    """Both ur_rtde interfaces, the clock and the newest whole package."""
+    """Both ur_rtde interfaces, the clock map and the newest complete package."""
 
     def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel, output: int | None = None) -> None:
         self._word = 36 if upper else 12
@@ -80,7 +80,7 @@ class Robot:
             *ALWAYS,
             "actual_TCP_pose",
             f"output_int_register_{self._word}",
-            # the echo of the newest number, and the TCP read back
+            # echo of the newest command number, and the TCP read back
             *(f"output_double_register_{self._word + i}" for i in range(7)),
             *(() if output is None else ("actual_digital_output_bits",)),
         ]
@@ -106,7 +106,7 @@ class Robot:
             raise Refused(Fault.OUTPUT_IN_USE) from error
 
     def start_guard(self) -> None:
-        """Clear the command register, upload the guard and wait until it obeys."""
+        """Clear the command register, upload the guard and wait until it is active."""
         with tempfile.NamedTemporaryFile("w", suffix=".script", delete=False) as file:
             file.write(self._script)
         try:
@@ -126,10 +126,10 @@ class Robot:
             Path(file.name).unlink(missing_ok=True)
 
     def set_load(self, mass_kg: float, cog_m: list[float]) -> None:
-        """Payload, and the TCP read back: the guard has set it to zero."""
+        """Set the payload, and read back the TCP, which the guard has set to zero."""
         if not self.control.setPayload(mass_kg, cog_m):
             raise Refused(Fault.START_FAILED)
-        # where the client looks for the answer depends on the controller's version: it is read from our own registers
+        # the register in which the client expects the answer depends on the controller's version: read our own registers
         self.control.getTCPOffset()
         asked = self.receive.getTimestamp()
         until = time.monotonic() + 0.5 / self._pace
@@ -141,7 +141,7 @@ class Robot:
             raise Refused(Fault.TCP_NOT_ZERO)
 
     def sample(self, now: float) -> RobotSample:
-        """The newest package, all fields of one package."""
+        """The newest sample, all fields of one package."""
         receive = self.receive
         for _ in range(5):
             robot_time = float(receive.getTimestamp())
@@ -170,7 +170,7 @@ class Robot:
         )
 
     def _connected(self) -> bool:
-        """Both connections are still those of the start: ur_rtde reconnects by itself, and then says that all is well."""
+        """Whether both connections are still those of the start; ur_rtde reconnects by itself and then reports no error."""
         if not (self.receive.isConnected() and self.control.isConnected()):
             return False
         try:
@@ -185,8 +185,8 @@ class Robot:
             self._first_unheard = min(self._sent.values(), default=now)
 
     def send(self, qd: np.ndarray, acceleration: float, process: bool = False) -> bool:
-        """One velocity, numbered for the guard's deadman; a half behind the number asks for the process. False where the
-        program does not run.
+        """Send one velocity, numbered for the guard's watchdog; a number plus one half enables the process. Returns False where
+        the program does not run.
         """
         self._number = np.floor(self._number) % 1_000_000.0 + (1.5 if process else 1.0)
         now = time.monotonic()
@@ -196,27 +196,27 @@ class Robot:
         return bool(self.control.speedJ(qd.tolist(), acceleration, self._number))
 
     def torch_off(self) -> None:
-        """The process output off, past the guard, which may stand still or be gone."""
+        """Turn the process output off without the guard, which may have stopped."""
         if self._switch is not None:
             self._switch.off()
 
     @property
     def process_on(self) -> bool:
-        """What the controller reports of the output."""
+        """The state of the process output as reported by the controller."""
         return self._output is not None and bool(self.receive.getActualDigitalOutputBits() >> self._output & 1)
 
     @property
     def numbers(self) -> tuple[float, float, float]:
-        """Number of the newest command sent, when that was, and the newest that the guard has seen."""
+        """Number of the newest command sent, its time, and the newest number that the guard has read."""
         sent_at = self._sent.get(self._number, 0.0)
         return self._number, sent_at, float(self.receive.getOutputDoubleRegister(self._word))
 
     def forget(self) -> None:
-        """Leave no command behind in the registers: a call while the program does not run writes zero."""
+        """Clear the command register: a call while the program does not run writes zero."""
         self.control.kickWatchdog()
 
     def end_program(self) -> None:
-        """The arm is at rest: end the guard, in order."""
+        """End the guard script while the arm is at rest."""
         if self.control.isProgramRunning():
             self.control.speedStop(5.0)
             self.control.stopScript()

@@ -1,4 +1,4 @@
-"""A real UR behind the station's ports: reads the link in an update event, sends in a publish event, computes nothing else."""
+"""Driver of a UR robot: reads the link in an update event and sends in a publish event."""
 
 import dataclasses as dc
 from typing import Any, ClassVar, Protocol
@@ -26,34 +26,34 @@ N_OUTPUTS = 8
 
 @dc.dataclass
 class UrRtde(DriverConfig):
-    """`!UrRtde`: a Universal Robots e-Series arm, or its emulator, at an address."""
+    """`!UrRtde`: a Universal Robots e-Series arm, or its emulator, at a network address."""
 
     FOR: ClassVar[tuple[str, ...]] = ("robot",)
 
     host: str = ""
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
-    velocity_share: float = 0.6  # of the arm's own limits; a faster command is refused
-    upper_registers: bool | None = None  # 24 to 47 (the lower ones belong to fieldbuses); null: where ur_rtde can
+    velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
+    upper_registers: bool | None = None  # 24 to 47 (fieldbuses use the lower ones); null: where ur_rtde supports it
     payload_kg: float = 1.4  # of the welding tool
     payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
     process_output: int | None = None  # standard digital output (0 to 7) that switches the torch; null: none is wired
 
     def limits(self, arm: ArmModel) -> Limits:
-        """What the worker holds commands against."""
+        """The limits against which the worker checks commands."""
         return Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
 
 
 class ArmLink(Protocol):
-    """What the arm needs of its link; neither call blocks."""
+    """The interface of a robot link; neither call blocks."""
 
     def state(self) -> LinkState:
         """The newest state."""
 
     def command(self, qd: np.ndarray, process: bool = False) -> int:
-        """Hand over the newest joint velocity (6,) rad/s, and whether the process may run."""
+        """Pass on the newest joint velocity (6,) rad/s and the process enable."""
 
 
 class UrRtdeArm(LeafSystem):
@@ -73,9 +73,10 @@ class UrRtdeArm(LeafSystem):
         - sample_time
         - status
 
-    Units as in the simulated arm. `sample_time` is when the robot took the sample, on the Diagram's clock: the moment of
-    the update less the sample's age, which robot time mapped to host time gives. `desired_state` (12) rad, rad/s is where the
-    real arm will be at the next tick, for a world that shadows it. Outputs depend on the state only: no feedthrough.
+    Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of the
+    update less the sample's age, computed from robot time mapped to host time. `desired_state` (12) rad, rad/s is the
+    predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
+    feedthrough.
     `process_on` (1) switches the torch's digital output, where one is wired; unconnected means off.
     """
 
@@ -115,7 +116,7 @@ class UrRtdeArm(LeafSystem):
 
     def _send(self, context: Context) -> EventStatus:
         wanted = np.array(self._command.Eval(context))
-        # an arm that is to stand still is told exactly so: only then may the cell think for as long as it likes
+        # at rest exactly zero is sent: only then may the cell compute without a time limit
         process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
         self._link.command(np.zeros(6) if np.abs(wanted).max() < STILL_RAD_S else wanted, process)
         return EventStatus.Succeeded()
@@ -140,11 +141,11 @@ class UrRtdeArm(LeafSystem):
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
-    """Pre-flight, the robot's own kinematics, then the link with its guard; the arm does not move.
+    """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not move.
 
     Raises:
-        InputError: the scenario names no host, or a pace that no real robot has.
-        RobotRefused, RobotUnreachable: one sentence that says what to press.
+        InputError: the scenario names no host, or a pace other than 1 for a real robot.
+        RobotRefused, RobotUnreachable: the message gives the operator action.
     """
     require_ur_rtde()
     if not config.host:
@@ -175,7 +176,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
-    """Add the arm over its link, and let the arm of the simulated world follow the real one, for the rendered sensors."""
+    """Add the arm with its link; the simulated arm follows the real one, for the rendered sensors."""
     if build.robot is None or not isinstance(build.robot.handle, UrLink):
         raise RuntimeError("the robot was not prepared")
     arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, config.pace))

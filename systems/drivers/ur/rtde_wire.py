@@ -1,7 +1,7 @@
-"""A small RTDE client: reads chosen outputs once, asks whether inputs are free, and writes those that it was granted.
+"""A small RTDE client: reads selected outputs once, checks whether inputs are free, and writes claimed inputs.
 
 Packages of protocol version 2 are big endian: uint16 size (header included), uint8 type, payload. The driver's stream
-goes through ur_rtde; this client exists because ur_rtde cannot read `tcp_offset` and claims registers only for good.
+uses ur_rtde; this client is needed because ur_rtde cannot read `tcp_offset` and cannot release claimed registers.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Value = float | int | bool | tuple[float, ...] | tuple[int, ...]
 
 
 class RtdeProbe:
-    """One connection to a controller's RTDE port; a context manager, whose end gives back every input it was granted.
+    """One connection to a controller's RTDE port; a context manager that releases all claimed inputs at its end.
 
     Raises (all methods):
         RobotUnreachable: nothing answers in time, or what answers is not RTDE.
@@ -66,9 +66,9 @@ class RtdeProbe:
         self._line.close()
 
     def read(self, names: Sequence[str]) -> dict[str, Value]:
-        """The next values of these outputs, all of one control step; a name that the controller lacks is left out.
+        """Read the next values of these outputs, all of one control step; names unknown to the controller are omitted.
 
-        Vectors come as tuples; poses are x, y, z (m) and a rotation vector (rad), joints rad and rad/s.
+        Vectors are tuples; poses are x, y, z (m) and a rotation vector (rad), joints rad and rad/s.
         """
         types = self._set_outputs(names)
         wanted = [name for name, kind in zip(names, types, strict=True) if kind != NOT_FOUND]
@@ -96,9 +96,9 @@ class RtdeProbe:
         return values
 
     def claim(self, names: Sequence[str]) -> dict[str, str]:
-        """Asks for these inputs: each one's type where it is free, else IN_USE or NOT_FOUND.
+        """Claim these inputs; returns the type of each where it is free, else IN_USE or NOT_FOUND.
 
-        Nothing is written to them. Those granted stay this connection's until it is closed.
+        Nothing is written to them. Claimed inputs belong to this connection until it is closed.
         """
         answer: dict[str, str] = {}
         for group in _groups(names):
@@ -107,17 +107,17 @@ class RtdeProbe:
         return answer
 
     def grant(self, names: Sequence[str]) -> int | None:
-        """Takes these inputs for `write`, and starts: the recipe's number, or None where one of them is not free."""
+        """Claim these inputs for `write`, and start; returns the recipe's number, or None where one of them is not free."""
         payload = self._request(_INPUTS, ",".join(names).encode())
         if {IN_USE, NOT_FOUND} & set(self._types(payload, len(names))):
             return None
-        # a controller starts only what has outputs; once a second is next to nothing
+        # a controller starts only a client with outputs; one package a second costs almost nothing
         self._set_outputs(("timestamp",), SLOWEST_HZ)
         self._request(_START, b"")
         return payload[0]
 
     def write(self, package: bytes) -> None:
-        """One input package, its recipe's number first; what has arrived meanwhile is thrown away."""
+        """Send one input package, which starts with its recipe's number, and discard the received data."""
         self._line.drain()
         self._line.send(struct.pack(">HB", len(package) + 3, _DATA) + package)
 
@@ -136,7 +136,7 @@ class RtdeProbe:
         return self._next(kind)
 
     def _next(self, kind: int) -> bytes:
-        """Payload of the next package of this type; others (text messages, late data) are passed over."""
+        """Payload of the next package of this type; others (text messages, late data) are skipped."""
         until = self._line.deadline()
         while True:
             size, found = struct.unpack(">HB", self._line.read(3, until))
@@ -153,7 +153,7 @@ class RtdeProbe:
 
 
 def _groups(names: Sequence[str]) -> list[list[str]]:
-    """The names in lists that fit into one recipe each."""
+    """Split the names into lists that each fit into one recipe."""
     groups: list[list[str]] = [[]]
     size = 0
     for name in names:

@@ -1,4 +1,4 @@
-"""The memory that two processes share: blocks with one writer each, read whole or not at all, and a ring of joint positions."""
+"""Memory shared by two processes: blocks with one writer each and consistent reads, and a ring of joint positions."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ RING_ROWS = 1024  # 2 s at 500 Hz
 
 
 class TornRead(RuntimeError):
-    """The writer overtook the reader in every try."""
+    """The writer changed the block during each attempt to read it."""
 
 
 class Block:
     """Numbers with one writer and any number of readers: a seqlock over two slots.
 
-    A writer that is preempted in the middle of a write leaves the other slot whole. The count says how many writes are
-    complete and, by its last bit, where the newest stands; the checksum covers machines that reorder stores.
+    A writer that is preempted during a write leaves the other slot intact. The count is the number of complete writes; its
+    last bit selects the newest slot. The checksum covers machines that reorder stores.
     """
 
     def __init__(self, memory: mmap.mmap, offset: int, names: tuple[str, ...]) -> None:
         self._memory, self._offset = memory, offset
         self.names = names
         self._payload = struct.Struct(f"<{len(names)}d")
-        # an aligned element of an array is written and read in one piece; struct.pack_into goes byte by byte
+        # an aligned array element is written and read atomically; struct.pack_into writes byte by byte
         self._writes = np.frombuffer(memory, dtype=np.uint64, count=1, offset=offset)
         self._count = 0
 
@@ -54,10 +54,10 @@ class Block:
         self._writes[0] = self._count
 
     def read(self) -> tuple[float, ...] | None:
-        """All numbers of one write, the newest, or None where nothing has been written yet.
+        """All numbers of the newest write; None where nothing has been written yet.
 
         Raises:
-            TornRead: the writer overtook the reader in every try.
+            TornRead: the writer changed the block during each attempt.
         """
         size = self._payload.size
         for _ in range(_TRIES):
@@ -67,10 +67,10 @@ class Block:
             start = self._slot(count)
             payload = self._memory[start : start + size]
             (check,) = _CHECK.unpack_from(self._memory, start + size)
-            # while the count stands, nobody writes into the slot that it names
+            # while the count is unchanged, its slot is not written
             if count == int(self._writes[0]) and check == zlib.crc32(payload):
                 return self._payload.unpack(payload)
-        raise TornRead("the shared memory could not be read whole")
+        raise TornRead("the shared memory could not be read consistently")
 
 
 class JointRing:
@@ -93,7 +93,7 @@ class JointRing:
         self._head[0] = head + 1
 
     def samples(self) -> Array:
-        """(n, 7) host time and joint positions, oldest first; rows that were overwritten while they were read are left out."""
+        """(n, 7) host time and joint positions, oldest first; rows overwritten during the read are omitted."""
         before = int(self._head[0])
         n = min(before, RING_ROWS)
         rows = self._rows[np.arange(before - n, before) % RING_ROWS].copy()
@@ -101,7 +101,7 @@ class JointRing:
         return rows[lost:]
 
     def at(self, host_time: float, *, beyond_s: float = 0.004) -> Array | None:
-        """Joint positions (6,) rad interpolated to a host time; None where the ring does not reach it."""
+        """Joint positions (6,) rad interpolated to a host time; None where the ring does not cover it."""
         rows = self.samples()
         if rows.shape[0] < 2 or not rows[0, 0] <= host_time <= rows[-1, 0] + beyond_s:
             return None
@@ -128,7 +128,7 @@ STATE = (
     "fault_time",
     "number",  # of the newest command that was sent on
     "sent_time",
-    "echo",  # the newest number that the guard script has seen
+    "echo",  # newest number that the guard script has read
     "echo_latency",
     "worst_period",
     "late_periods",  # passes that came more than 20 ms late
@@ -139,7 +139,7 @@ STATE = (
 
 
 class Memory:
-    """The whole of it: one anonymous file, mapped by both processes."""
+    """The shared memory: one anonymous file, mapped by both processes."""
 
     def __init__(self, descriptor: int) -> None:
         command, state = Block.size(COMMAND), Block.size(STATE)

@@ -1,4 +1,4 @@
-"""What the worker decides in each pass: send, brake, stop or leave; a plain function of what it sees, without any wire."""
+"""Decides in each pass of the worker whether to send, brake, stop or leave; a pure function of sample and command."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7
 RUNNING = 7
 PLAYING, PAUSING, PAUSED = 2, 3, 4
-# what the guard script says of itself in its output register
+# states that the guard script writes into its output register
 OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time
 
 
 class Action(IntEnum):
-    """What to do with the arm."""
+    """The action of a worker pass."""
 
-    SEND = 0  # the wanted velocity
-    BRAKE = 1  # zero velocity with the braking acceleration, through the same stream
+    SEND = 0  # send the commanded velocity
+    BRAKE = 1  # send zero velocity with the braking acceleration through the same stream
     STOP = 2  # send nothing more; the program is stopped through the dashboard
-    LEAVE = 3  # the link is not to be trusted: leave at once, the controller's own watchdogs stop the arm
+    LEAVE = 3  # the link is unreliable: leave at once; the controller's watchdogs stop the arm
 
 
 ACTIONS = {
@@ -40,7 +40,7 @@ ACTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """What the worker holds commands and state against. (6,) in rad, rad/s, rad/s^2; times in s of the host."""
+    """The limits for commands and state. (6,) in rad, rad/s, rad/s^2; times in s of the host."""
 
     position_lower: Array
     position_upper: Array
@@ -64,7 +64,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class RobotSample:
-    """The newest package; `fresh_at` is the host time at which its timestamp was first seen."""
+    """The newest package; `fresh_at` is the host time at which its timestamp was first received."""
 
     robot_time: float
     fresh_at: float
@@ -77,24 +77,24 @@ class RobotSample:
     guard: int
     connected: bool
     pose_error_m: float = 0.0
-    unheard_s: float = 0.0  # for how long the guard script has not seen a newer command
+    unheard_s: float = 0.0  # time for which the guard script has read no newer command
 
 
 @dataclass(frozen=True, eq=False)
 class Command:
-    """The newest velocity that the cell asked for; `given_at` is host time."""
+    """The newest velocity command of the cell; `given_at` is host time."""
 
     number: int = 0
     given_at: float = -np.inf
     qd: Array = field(default_factory=lambda: np.zeros(6))
     stop: bool = False
-    orphaned: bool = False  # the cell's process is gone
-    process: bool = False  # the torch may burn
+    orphaned: bool = False  # the cell's process has ended
+    process: bool = False  # the process output is enabled
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What to do, and for which fault."""
+    """The action, and the fault that caused it."""
 
     action: Action
     fault: Fault = Fault.NONE
@@ -102,7 +102,7 @@ class Decision:
 
 
 class Supervisor:
-    """Looks at every pass; the first fault latches for good."""
+    """Checks every pass; the first fault is latched."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
@@ -115,13 +115,13 @@ class Supervisor:
         self.latched = Decision(Action.SEND)
 
     def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
-        """The decision of this pass. `now` is host time, s."""
+        """Compute the decision of this pass. `now` is host time, s."""
         if self.latched.fault is Fault.NONE:
             fault, detail = self._look(now, robot, command)
             if fault is not Fault.NONE:
                 self.latched = Decision(ACTIONS[fault], fault, detail)
         elif self.latched.action is not Action.LEAVE:
-            # a link that breaks while the arm brakes is still a broken link
+            # a link failure during braking overrides the latched fault
             fault, detail = self._link(now, robot)
             if fault is not Fault.NONE:
                 self.latched = Decision(Action.LEAVE, self.latched.fault, self.latched.detail)
@@ -196,7 +196,7 @@ class Supervisor:
         if command.qd.any() and late > limits.late_s and not (command.stop or command.orphaned):
             return Fault.COMMAND_LATE, 1e3 * late
         if command.number != self._command.number:
-            # a cell makes up for a delay of 20 ms, and begins anew after a longer one; passes may skip commands
+            # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip commands
             passed = limits.pace * max(command.given_at - self._command.given_at, 0.0)
             if passed > MADE_UP_FOR_S:
                 passed = limits.pace * (now - self._stepped_at)
@@ -211,7 +211,7 @@ class Supervisor:
         return self._tracking(now, robot, command)
 
     def _tracking(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
-        """Where the commands of the last moments lead, against where the arm is; the reference forgets in half a second."""
+        """Check the arm's position against the integral of the recent commands, which decays in half a second."""
         limits = self._limits
         if self._reference is None:
             self._reference, self._referred_at = robot.q.copy(), now
@@ -219,6 +219,6 @@ class Supervisor:
         self._referred_at = now
         self._reference = self._reference + dt * self._command.qd + (robot.q - self._reference) * min(dt / 0.5, 1.0)
         apart = float(np.abs(self._reference - robot.q).max())
-        # commands and state together are up to 40 ms on their way
+        # commands and state together have up to 40 ms of delay
         allowed = limits.tracking_rad + 0.04 * float(np.abs(command.qd).max())
         return (Fault.TRACKING, apart) if apart > allowed else (Fault.NONE, 0.0)

@@ -1,7 +1,7 @@
-"""The worker process: reads the robot, asks the supervisor, sends, and leaves when the link is not sound.
+"""The worker process: reads the robot, calls the supervisor, sends commands, and exits when the link fails.
 
-It alone holds ur_rtde, whose constructors hold the GIL, whose getters never say that they are old, whose send reconnects
-by itself, and which may crash; none of this reaches the cell, which shares only memory with this process.
+Only this process uses ur_rtde, whose constructors hold the GIL, whose getters do not report stale data, whose send
+reconnects by itself, and which may crash. The cell is isolated from it: it shares only memory with this process.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Lim
 if TYPE_CHECKING:
     from weldcal.systems.drivers.ur.robot import Robot
 
-ACCELERATION = 40.0  # rad/s^2 of speedj: the stream is ramped by the cell, the controller is only to follow
+ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the controller only follows
 LATE_PASS_S = 0.020
 REST_RAD_S = 1e-3
 STOP_LIMIT_S = 2.0
-LEFT = 3  # exit code of a worker that left because of the link
+LEFT = 3  # exit code of a worker that exited because of the link
 
 
 class Phase(IntEnum):
-    """Where the worker is in its life."""
+    """The phase of the worker process."""
 
     STARTING = 0
     OBEYING = 1
@@ -45,7 +45,7 @@ class Phase(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class WorkerConfig:
-    """What the cell tells its worker. `arm` has the robot's own kinematics."""
+    """The configuration that the cell passes to its worker. `arm` has the robot's own kinematics."""
 
     host: str
     arm: ArmModel
@@ -59,7 +59,7 @@ class WorkerConfig:
 
 
 class Worker:
-    """The loop, with what it counts."""
+    """The worker's loop and its counters."""
 
     def __init__(self, config: WorkerConfig, memory: Memory) -> None:
         self._config, self._memory = config, memory
@@ -75,7 +75,7 @@ class Worker:
         self._braking_since: float | None = None
 
     def run(self, robot: Robot) -> int:
-        """Until the cell asks it to stop or the link breaks; the process's exit code."""
+        """Run until the cell requests a stop or the link fails; returns the process's exit code."""
         period = 1.0 / self._config.rate_hz
         self._phase = Phase.OBEYING
         deadline = last = time.monotonic()
@@ -87,7 +87,7 @@ class Worker:
             self._worst = max(self._worst, now - last)
             self._late += now - last > period + LATE_PASS_S
             if now - last > LATE_PASS_S:
-                # this whole process stood still: let the receiving thread take in what has arrived before it is judged
+                # the whole process was suspended: let the receiving thread read the pending data before the checks
                 time.sleep(0.003)
                 now = time.monotonic()
             last, deadline = now, max(deadline + period, now)
@@ -105,7 +105,7 @@ class Worker:
                 self._drive(now, robot, sample, command, decision)
             self._publish(now, robot, sample, decision)
             if (command.stop or command.orphaned) and self._phase is not Phase.OBEYING:
-                # leaving closes both connections at once; ur_rtde's own disconnect takes half a second for each
+                # the exit closes both connections at once; ur_rtde's disconnect takes half a second for each
                 self._phase = Phase.ENDED
                 self._publish(now, robot, sample, decision)
                 return 0
@@ -122,10 +122,10 @@ class Worker:
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
-            # a cell that thinks may keep the arm at rest, not the torch burning
+            # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
             process = command.process and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.qd, ACCELERATION, process):
-                self._phase = Phase.STOPPED  # the next sample says why
+                self._phase = Phase.STOPPED  # the next sample shows the cause
         elif decision.action is Action.STOP:
             robot.forget()
             self._phase = Phase.STOPPED
@@ -133,7 +133,7 @@ class Worker:
             self._brake(now, robot, sample)
 
     def _brake(self, now: float, robot: Robot, sample: RobotSample) -> None:
-        """Zero through the same stream until the arm rests, then the program is ended."""
+        """Send zero velocity until the arm is at rest, then end the program."""
         self._braking_since = now if self._braking_since is None else self._braking_since
         robot.send(np.zeros(6), self._config.limits.braking)
         resting = np.abs(sample.qd).max() < REST_RAD_S
@@ -156,7 +156,7 @@ class Worker:
         self._memory.state.write([float(value) for value in values])
 
     def refuse(self, fault: Fault) -> None:
-        """The start failed: say why."""
+        """Publish the fault that made the start fail."""
         values = [0.0] * len(self._memory.state.names)
         values[0], values[1] = time.monotonic(), Phase.ENDED
         values[self._memory.state.names.index("fault")] = float(fault)
@@ -164,8 +164,8 @@ class Worker:
 
 
 def main() -> None:
-    """`python -m weldcal.systems.drivers.ur.worker FD`, with a pickled WorkerConfig on stdin."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupted cell asks its worker to stop, in order
+    """Entry point of `python -m weldcal.systems.drivers.ur.worker FD`, with a pickled WorkerConfig on stdin."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupted cell requests a regular stop of its worker
     memory = Memory(int(sys.argv[1]))
     config: WorkerConfig = pickle.load(sys.stdin.buffer)
     take_priority()
@@ -182,11 +182,11 @@ def main() -> None:
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
-        poll_beside_the_cell()  # not before: ur_rtde's calls of the start wait for these threads without a pause
+        poll_beside_the_cell()  # not earlier: ur_rtde's start-up calls busy-wait for these threads
     except Refused as refused:
         worker.refuse(refused.fault)
         os._exit(1)
-    # no destructor of ur_rtde runs: it would try to reconnect on a broken link
+    # skip ur_rtde's destructors: they would try to reconnect on a broken link
     os._exit(worker.run(robot))
 
 

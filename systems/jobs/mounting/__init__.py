@@ -1,1 +1,1 @@
-"""Calibration of a scanner in any mounting, live."""
+"""Live calibration of a scanner in any mounting."""

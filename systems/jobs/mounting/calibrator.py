@@ -1,4 +1,4 @@
-"""MountingCalibrator: scan after scan of a circle into the unknown poses of any mounting, and which pose to add next."""
+"""MountingCalibrator: estimates the unknown poses of any mounting from scans of a circle, and proposes the next pose."""
 
 from __future__ import annotations
 
@@ -24,31 +24,29 @@ from weldcal.calibration.planning.mounting_poses import MountingPose, informatio
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
-from weldcal.systems.jobs.mounting.messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
+from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
 Array = NDArray[np.float64]
 
-FIT_SHARE = (
-    1.25  # errors of the fits over their own sigma (which takes a scan's noise for independent), rms in simulated scans
-)
+FIT_SHARE = 1.25  # errors of the fits over their predicted sigma (which assumes independent noise in a scan), rms in simulated scans
 
 
 @dc.dataclass(frozen=True)
 class MountingFitConfig:
-    """What to look for and when to stop (m)."""
+    """Settings of the circle fit and the stop criterion (m)."""
 
     standard: FlangeStandard
     guess_radius_m: float
-    foot: bool  # the ring of the base mounting, whose far side its column hides
+    foot: bool  # the ring of the base mounting, whose far side is hidden by its column
     minimum_scans: int
     required_error_m: float
 
 
 class MountingCalibrator(LeafSystem):
-    """Fits the circle in each scan where the belief expects it, and solves the mounting's equation from all of them.
+    """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all observations.
 
     .. pydrake_system::
 
@@ -61,7 +59,7 @@ class MountingCalibrator(LeafSystem):
         output_ports:
         - status
 
-    `history_2` is read where the scene has a second arm.
+    `history_2` is read only where the scene has a second arm.
     """
 
     def __init__(
@@ -111,7 +109,7 @@ def digest(
     config: MountingFitConfig,
     plan: Sequence[MountingPose],
 ) -> MountingStatus:
-    """The status after one more scan; one that cannot be used is refused by name with its reason."""
+    """Compute the status after one more scan; an unusable scan is listed as refused with its label and the reason."""
     status = dc.replace(status, sequence=scan.sequence)
     q, q_2 = joints
     if q is None or (scene.two and q_2 is None):
@@ -123,10 +121,10 @@ def digest(
     except FlangeNotFound as error:
         return dc.replace(status, refused=(*status.refused, (job.label, str(error))), message=str(error))
     if job.purpose == "verify":
-        return dc.replace(status, kept_aside=(*status.kept_aside, compare(job.label, fit, belief, q, q_2)))
+        return dc.replace(status, held_out=(*status.held_out, compare(job.label, fit, belief, q, q_2)))
     X_CR = belief.seen(q, q_2)
-    sighting = scene.observation(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
-    seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), sighting, fit.coverage)
+    observation = scene.observation(q, q_2, fit.center_C, fit.normal_C, own_covariance(fit, X_CR))
+    seen = SeenCircle(job.label, MountingPose(q, q_2, X_CR), observation, fit.coverage)
     status = dc.replace(status, seen=(*status.seen, seen), message="")
     if len(status.seen) < fewest(scene):
         return status
@@ -148,7 +146,7 @@ def digest(
 def find_circle(
     points_C: Array, belief: MountingScene, q: Array, q_2: Array | None, config: MountingFitConfig
 ) -> FlangeFit:
-    """The circle in a cloud (H, W, 3), looked for where the belief expects it. Raises FlangeNotFound with the reason."""
+    """Find the circle in a cloud (H, W, 3) near its predicted position. Raises FlangeNotFound with the reason."""
     X_CR = belief.seen(q, q_2)
     radius = config.guess_radius_m + 0.5 * config.standard.outer_m
     guess = FlangeGuess(X_CR.translation(), radius, X_CR.rotation().matrix()[:, 2])
@@ -158,7 +156,7 @@ def find_circle(
 
 
 def own_covariance(fit: FlangeFit, X_CR: RigidTransform) -> Array:
-    """Covariance (6, 6) [rotation; translation] of a fitted circle in its own axes; an arc places its centre unequally well."""
+    """Covariance (6, 6) [rotation; translation] of a fitted circle in its own axes; for an arc it is not isotropic."""
     R = X_CR.rotation().matrix()
     out = np.zeros((6, 6))
     out[:3, :3] = fit.normal_sigma**2 * np.eye(3)
@@ -167,13 +165,13 @@ def own_covariance(fit: FlangeFit, X_CR: RigidTransform) -> Array:
 
 
 def fewest(scene: MountingScene) -> int:
-    """Sightings before anything is solved: six numbers of position more than are sought, or their noise would go unseen."""
+    """Smallest number of observations to solve: six position equations more than unknowns, to estimate the noise."""
     return 2 + 2 * (len(scene.mounting.unknowns) - len(scene.known))
 
 
 def solve_mounting(scene: MountingScene, seen: Sequence[SeenCircle], *, folds: int = 0) -> HandEyeResult:
-    """The unknown poses from all sightings, the belief as one start among the closed forms. Raises as solve_problem."""
-    mounting, problem = scene.mounting, scene.problem([s.sighting for s in seen])
+    """Solve for the unknown poses with all observations; the starts are closed forms and the prior. Raises as solve_problem."""
+    mounting, problem = scene.mounting, scene.problem([s.observation for s in seen])
     result = solve_problem(
         problem,
         scene.state,
@@ -191,24 +189,24 @@ def sigma_of_work(scene: MountingScene, result: HandEyeResult) -> float:
     return float(np.sqrt(np.trace(J @ result.covariance["X"] @ J.T)))
 
 
-def compare(label: str, fit: FlangeFit, belief: MountingScene, q: Array, q_2: Array | None) -> KeptAside:
-    """Position and tilt of a circle that the calibration never saw, off what it expects."""
+def compare(label: str, fit: FlangeFit, belief: MountingScene, q: Array, q_2: Array | None) -> HeldOut:
+    """Position error and tilt of a held-out circle against the calibration's prediction."""
     X_CR = belief.seen(q, q_2)
     cosine = float(np.clip(X_CR.rotation().matrix()[:, 2] @ fit.normal_C, -1.0, 1.0))
-    return KeptAside(label, float(np.linalg.norm(X_CR.translation() - fit.center_C)), float(np.arccos(cosine)))
+    return HeldOut(label, float(np.linalg.norm(X_CR.translation() - fit.center_C)), float(np.arccos(cosine)))
 
 
 def next_best(
     belief: MountingScene, result: HandEyeResult, seen: Sequence[SeenCircle], plan: Sequence[MountingPose]
 ) -> NextBest | None:
-    """Of the planned poses (all within reach, in sight and clear) the one not yet visited that would shrink the error at the
-    work point most; None where all were visited."""
+    """The unvisited planned pose (all are reachable, visible and clear) that reduces the predicted error at the work point
+    most; None where all were visited."""
     size = len(result.joint_covariance)
     own = np.median([np.diag(_covariance_of(s)) for s in seen], axis=0)
     left = [p for p in plan if all(float(np.abs(p.q - s.pose.q).max()) > 1e-2 for s in seen)]
     if not left:
         return None
-    problem = belief.problem([s.sighting for s in seen]).pick(result.inliers)
+    problem = belief.problem([s.observation for s in seen]).pick(result.inliers)
     taken = information_of(problem, belief.state)[0] + prior(belief)[:size, :size]
     more = information(belief, left, np.sqrt(own[3:]), float(np.sqrt(own[0])))[:, :size, :size]
     J = np.hstack([-skew(belief.X_LC.rotation().matrix() @ work_point(belief)), np.eye(3)])
@@ -223,5 +221,5 @@ def next_best(
 
 
 def _covariance_of(seen: SeenCircle) -> Array:
-    C = seen.sighting.covariance
+    C = seen.observation.covariance
     return np.zeros((6, 6)) if C is None else C

@@ -1,4 +1,4 @@
-"""What a scenario says of a calibration in another mounting than a scanner beside the arm: the target, and the second arm."""
+"""Configuration of a calibration in a mounting other than eye-to-hand: the target, and the second arm."""
 
 import dataclasses as dc
 
@@ -9,7 +9,7 @@ from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.errors import InputError
 
 CARRIERS = ("base", "flange", *LINKS)
-"""What may carry a scanner: nothing that moves, the flange, or a link of the arm."""
+"""The possible carriers of a scanner: the base, the flange, or a link of the arm."""
 CARRIED = {
     "eye_in_hand": ("flange",),
     "eye_on_base": ("base",),
@@ -17,39 +17,39 @@ CARRIED = {
     "eye_on_arm_target_on_base": LINKS[:-1],
     "co_manipulation": ("flange",),
 }
-"""What carries the scanner in each configuration."""
+"""The carriers of the scanner in each configuration."""
 
 
 @dc.dataclass
 class SecondArm:
-    """The second robot of a co-manipulation as it is drawn, and how far it truly stands from there (from the run's seed)."""
+    """The nominal pose of a co-manipulation's second robot, and the deviation of its true pose (from the run's seed)."""
 
     arm: str = "ur10e"
-    xyz_m: list[float] = dc.field(default_factory=lambda: [1.5, 0.0, 0.0])  # X_BD, its base in the first one's
+    xyz_m: list[float] = dc.field(default_factory=lambda: [1.5, 0.0, 0.0])  # X_BD, its base in the first arm's base
     rpy_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 180.0])
     placement_translation_mm: float = 20.0
     placement_rotation_deg: float = 1.0
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
 
     def pose(self) -> RigidTransform:
-        """X_BD as drawn."""
+        """The nominal X_BD."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
 
 @dc.dataclass
 class MountingJob:
-    """Calibrate by looking at the robot itself: its flange, its base circle, or the flange of a second arm."""
+    """A calibration with a circle of the robot as its target: the flange, the base circle, or the flange of a second arm."""
 
-    target_known: bool = True  # the drawing says where the circle sits; false: that is sought too
+    target_known: bool = True  # the circle's pose is known from the drawing; false: it is estimated too
     second_arm: SecondArm | None = None
-    spread_deg: float = 35.0  # how far joints may go from home where a joint, not a view, is what is chosen
-    travel_deg: float = 126.0  # and where it follows from the view: shorter moves, but poses that tell less
+    spread_deg: float = 35.0  # largest joint distance from home where joints are sampled, not views
+    travel_deg: float = 126.0  # and where views are sampled: shorter moves, but less informative poses
 
 
 def check_mounting(
     configuration: str, job: MountingJob | None, mounted_on: str, *, second_robot: bool, weld: bool
 ) -> None:
-    """Refuse what does not belong together.
+    """Check the mounting's settings against each other.
 
     Raises:
         InputError: one sentence that says what to change.

@@ -1,4 +1,4 @@
-"""The mounting job: a scanner in any mounting calibrates itself by the robot's own flange or base circle, with one arm or two."""
+"""The mounting job: calibrates a scanner in any mounting by the robot's flange or base circle, with one arm or two."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
-SPARE = 8  # poses beyond those that are visited: the next best one is named among them
+SPARE = 8  # additional poses, from which the next best one is selected
 FOOT = ("eye_in_hand", "eye_on_arm_target_on_base")
-"""Configurations that look at the circle of the base mounting; the others look at a flange."""
+"""Configurations with the circle of the base mounting as target; the others have a flange."""
 
 
 @dataclass(frozen=True, eq=False)
 class MountingPlanned:
-    """What is believed before the first scan, the circle to look for, and the poses to visit."""
+    """The scene as known before the first scan, the dimensions of the circle, and the poses to visit."""
 
     scene: MountingScene
     standard: FlangeStandard
@@ -45,7 +45,7 @@ class MountingPlanned:
 
 @dataclass(eq=False)
 class AddedMounting(AddedJob):
-    """The systems of the job; `truth` (X, and Y or Z as far as they are sought) is for reports and tests only."""
+    """The systems of the job; `truth` (X, and Y or Z where they are estimated) is for reports and tests only."""
 
     scene: MountingScene
     plan: tuple[MountingPose, ...]
@@ -57,7 +57,7 @@ class AddedMounting(AddedJob):
     maximum_time_s: float
 
     def status(self, root: Context) -> MountingStatus:
-        """What the calibration has come to."""
+        """The present result of the calibration."""
         status: MountingStatus = self.calibrator.GetOutputPort("status").Eval(
             self.calibrator.GetMyContextFromRoot(root)
         )
@@ -89,7 +89,7 @@ class Mounting(Job[MountingPlanned]):
     def furnish(
         self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
     ) -> Furnishing:
-        """See Job: the ring of the base mounting, and the second arm where it truly stands."""
+        """See Job: the ring of the base mounting, and the second arm at its true pose."""
         job, second = scenario.part(MountingJob), None
         config = None if job is None else job.second_arm
         if config is not None:
@@ -97,7 +97,7 @@ class Mounting(Job[MountingPlanned]):
                 rng, 1e-3 * config.placement_translation_mm, np.deg2rad(config.placement_rotation_deg)
             )
             second = place_second_arm(config, off)
-        return Furnishing(second=second, foot=base_circle(scenario.arm), time_step_s=0.004)  # nothing is touched
+        return Furnishing(second=second, foot=base_circle(scenario.arm), time_step_s=0.004)  # this job has no contact
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> MountingPlanned:
         """See Job."""
@@ -149,7 +149,7 @@ class Mounting(Job[MountingPlanned]):
 
 
 def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, FlangeStandard]:
-    """What is believed before the first scan, from the drawing and the tape measure; and the circle to look for."""
+    """The scene as known before the first scan, from drawings and rough measurements; and the dimensions of the circle."""
     job, c, scanner = scenario.part(MountingJob), scenario.calibration, scenario.scanner_config()
     if job is None or scanner is None:
         raise InputError("A mounting job needs a scanner and a mounting part: write mounting: {} in the scenario.")
@@ -176,7 +176,7 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, Fl
 
 
 def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[MountingPose, ...]:
-    """Poses of the calibration, those kept aside, and spare ones; nothing has moved. Raises UnreachableScanner."""
+    """Plan the calibration poses, the held-out poses and spare ones, before any motion. Raises UnreachableScanner."""
     c, job = scenario.calibration, scenario.part(MountingJob)
     assert job is not None
     visited = c.maximum_scans + c.verification_scans
@@ -193,7 +193,7 @@ def plan_mounting(scenario: Scenario, scene: MountingScene, seed: int) -> tuple[
 
 
 def true_poses(scene: MountingScene, station: Station) -> dict[str, RigidTransform]:
-    """The unknowns as they are: in simulation the circle sits exactly where the drawing says."""
+    """The true values of the unknowns; in simulation the circle is exactly at its nominal pose."""
     found = {} if station.truth.X_LC is None else {"X": station.truth.X_LC}
     if station.truth.X_BD is not None:
         found["Y"] = station.truth.X_BD

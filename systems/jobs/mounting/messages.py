@@ -1,4 +1,4 @@
-"""What travels in a mounting cell: where the procedure stands, and what the calibration has come to."""
+"""Messages of the mounting job: the state of the procedure and the status of the calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MountingState(Message):
-    """Where the procedure stands. `phase`: start, move, scan, done or held; `route`: moves still to make, (arm 0 or 1, joints)."""
+    """State of the procedure. `phase`: start, move, scan, done or held; `route`: remaining moves, (arm 0 or 1, joints)."""
 
     phase: str = "start"
     since: float = 0.0
@@ -26,26 +26,26 @@ class MountingState(Message):
     moving: int = 0
     q_goal: Array | None = None
     route: tuple[tuple[int, Array], ...] = ()
-    visit: int = -1  # which of the planned poses
+    visit: int = -1  # index of the planned pose
     trigger: int = 0
-    purpose: str = ""  # of the newest scan: calibrate, or verify at a pose kept aside
+    purpose: str = ""  # of the newest scan: calibrate, or verify at a held-out pose
     label: str = ""
     reason: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenCircle(Message):
-    """One scan that showed the circle: where the arms stood, what was seen, the share of its edge."""
+    """One scan with the circle: the arms' poses, the observation, and the visible share of the circle's edge."""
 
     label: str
     pose: MountingPose
-    sighting: TargetObservation
+    observation: TargetObservation
     coverage: float
 
 
 @dataclass(frozen=True)
-class KeptAside:
-    """How far the circle was, in a scan that the calibration never saw, from where the calibration expects it."""
+class HeldOut:
+    """Errors of the calibration's prediction of the circle in a held-out scan."""
 
     label: str
     error_m: float
@@ -64,12 +64,12 @@ class NextBest:
     sigma_after_m: float
 
     def sentence(self) -> str:
-        """What to do, for a person."""
+        """The proposal as one sentence for the operator."""
         joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.q))
         second = "" if self.q_2 is None else f", second arm [{', '.join(f'{v:.0f}' for v in np.degrees(self.q_2))}] deg"
         p = 1e3 * self.X_BF.translation()
         return (
-            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would take the "
+            f"joints [{joints}] deg{second} (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the "
             f"sigma of a scanned point from {1e3 * self.sigma_before_m:.4f} to {1e3 * self.sigma_after_m:.4f} mm."
         )
 
@@ -84,7 +84,7 @@ class MountingStatus(Message):
     result: HandEyeResult | None = None
     sigma_work_m: float = np.inf  # predicted error (3-D, rms) of a point at the scanner's best distance
     history: tuple[tuple[int, float], ...] = ()
-    kept_aside: tuple[KeptAside, ...] = ()
+    held_out: tuple[HeldOut, ...] = ()
     next_best: NextBest | None = None
     done: bool = False
     message: str = ""

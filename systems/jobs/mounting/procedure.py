@@ -1,4 +1,4 @@
-"""MountingProcedure: visit the planned poses with one arm or two, scan at each, keep some aside, come home."""
+"""MountingProcedure: visits the planned poses with one arm or two, scans at each, holds out some scans, returns home."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENDS = ("done", "held")
 
 
 class MountingProcedure(LeafSystem):
-    """Runs the procedure; a robot fault, or a goal that is not reached, holds it with a sentence.
+    """Runs the procedure; a robot fault, or a goal that is not reached, holds it with a reason.
 
     .. pydrake_system::
 
@@ -40,23 +40,24 @@ class MountingProcedure(LeafSystem):
         - trigger
         - state
 
-    One arm moves at a time: towards a pose the second one first, homewards the first one first; the way home is thus the way
-    from home backwards. An arm that stands elsewhere goes home first. `hold` (1) is a person's wish to stop. The first `scans`
-    poses of the plan are for the calibration (fewer where it is sure enough before), `kept_aside` more for its verification.
+    One arm moves at a time: towards a pose the second arm first, towards home the first arm first, so that the move home is
+    the reversed move from home. An arm that is not at home moves there first. `hold` (1) is the operator's stop request. The
+    first `scans` poses of the plan are for the calibration (fewer where the required error is reached earlier), the next
+    `held_out` poses for its verification.
     """
 
     def __init__(
         self,
         plan: Sequence[MountingPose],
         scans: int,
-        kept_aside: int,
+        held_out: int,
         home: tuple[Array, Array | None],
         timeout_s: float = 60.0,
         maximum_time_s: float = np.inf,
         period_s: float = 0.008,
     ) -> None:
         super().__init__()
-        self._plan, self._scans, self._kept_aside = tuple(plan), scans, kept_aside
+        self._plan, self._scans, self._held_out = tuple(plan), scans, held_out
         self.home, self._timeout_s, self._maximum_time_s = home, timeout_s, maximum_time_s
         self._settled = [self.DeclareVectorInputPort(n, 1) for n in ("settled_goal", "settled_goal_2")]
         self._robots = [
@@ -111,9 +112,9 @@ class MountingProcedure(LeafSystem):
         if status.sequence != s.trigger:
             return s
         if s.purpose == "calibrate" and (status.done or s.visit + 1 >= self._scans):
-            # the poses kept aside are reached from home, wherever the calibration ended
+            # the held-out poses are approached from home, wherever the calibration ended
             return _go(replace(s, visit=self._scans - 1), self._homeward(), "", now)
-        if s.visit + 1 >= self._scans + self._kept_aside:
+        if s.visit + 1 >= self._scans + self._held_out:
             return _go(s, self._homeward(), "", now)
         return self._visit(s, s.visit + 1, now)
 
@@ -122,7 +123,7 @@ class MountingProcedure(LeafSystem):
             return _go(s, s.route, s.label, now)
         if s.label:
             return replace(s, phase="scan", since=now, trigger=s.trigger + 1)
-        if s.visit + 1 < self._scans + self._kept_aside:
+        if s.visit + 1 < self._scans + self._held_out:
             return self._visit(s, s.visit + 1, now)
         return replace(s, phase="done", since=now)
 
@@ -163,7 +164,7 @@ class MountingProcedure(LeafSystem):
 
 
 def _go(s: MountingState, route: tuple[tuple[int, Array], ...], label: str, now: float) -> MountingState:
-    """Set out on a route; `label` of the pose that it ends in, empty for home."""
+    """Start a route; `label` of the pose at its end, empty for home."""
     (arm, q), rest = route[0], route[1:]
     moving = replace(s, phase="move", since=now, goal_id=s.goal_id + 1, moving=arm, q_goal=np.array(q))
     return replace(moving, route=rest, label=label)

@@ -1,1 +1,1 @@
-"""Calibration of a laser profiler by an edge or a sphere, live, and a seam measured with it."""
+"""Live calibration of a laser profiler by an edge or a sphere, and measurement of a seam with it."""

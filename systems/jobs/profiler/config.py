@@ -1,4 +1,4 @@
-"""What a scenario says of a profiler's job: torch, straightedge and sphere as drawn, how far they may be off, what is done in which order."""
+"""Configuration of the profiler job: nominal torch, straightedge and sphere, their deviations, and the stages in order."""
 
 import dataclasses as dc
 
@@ -13,7 +13,7 @@ STAGES = ("edge", "sphere", "seam")
 
 @dc.dataclass
 class Torch:
-    """The pointed torch beside the profiler: its tip in F as drawn, and how far the real one is bent."""
+    """The pointed torch beside the profiler: nominal tip position in F, and the deviation of the true one."""
 
     tip_m: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.125])
     error_mm: float = 2.5
@@ -21,7 +21,7 @@ class Torch:
 
 @dc.dataclass
 class Straightedge:
-    """A bevelled straightedge on a post: its middle and how it lies as thought (x along the edge, z up), and by how much it is off."""
+    """A bevelled straightedge on a post: nominal centre and orientation (x along the edge, z up), and its deviation."""
 
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.62, -0.02, 0.14])
     rpy_deg: list[float] = dc.field(default_factory=lambda: [6.0, -5.0, 35.0])
@@ -33,7 +33,7 @@ class Straightedge:
 
 @dc.dataclass
 class Ball:
-    """A sphere on a post, its centre as thought, and by how much it is off."""
+    """A sphere on a post: nominal centre, and its deviation."""
 
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.66, 0.22, 0.16])
     radius_mm: float = 20.0
@@ -42,7 +42,7 @@ class Ball:
 
 @dc.dataclass
 class EdgeStage:
-    """Scans of the straightedge: how many, how many more that the calibration does not see, the largest tilt."""
+    """Scans of the straightedge: number of scans, number of held-out scans, largest tilt."""
 
     scans: int = 40
     held_out: int = 8
@@ -58,27 +58,27 @@ class SphereStage:
     touches: int = 24
     tilt_deg: float = 26.0
     descent_mm_s: float = 6.0
-    gap_mm: float = 10.0  # of the tip above the sphere, as thought, where the descent begins
-    deepest_mm: float = 10.0  # below where the sphere is thought to be: then the touch is given up
+    gap_mm: float = 10.0  # nominal height of the tip above the sphere at which the descent begins
+    deepest_mm: float = 10.0  # below the nominal sphere, at which the touch is abandoned
 
 
 @dc.dataclass
 class SeamStage:
-    """The pass of the profiler along the groove, and of the torch after it."""
+    """The passes of the profiler along the groove, and the following pass of the torch."""
 
-    passes: int = 2  # forth and back: the robot's own error is another one each time
+    passes: int = 2  # forward and back: the robot's error differs between passes
     pass_mm_s: float = 25.0
-    every_mm: float = 2.0  # a profile this often
-    stand_off_mm: float = 85.0  # of the plate, from the profiler
+    every_mm: float = 2.0  # period of the profiles
+    stand_off_mm: float = 85.0  # distance of the plate from the profiler
     torch_mm_s: float = 12.0
-    above_root_mm: float = 2.0  # where the torch runs
-    ends_mm: float = 12.0  # left out at both ends of the seam
-    seam_length_mm: float | None = None  # only this much of it
+    above_root_mm: float = 2.0  # height of the torch's path
+    ends_mm: float = 12.0  # not measured at both ends of the seam
+    seam_length_mm: float | None = None  # length of the seam to measure
 
 
 @dc.dataclass
 class ProfilerJob:
-    """What is done: stages of edge, sphere and seam in this order; a seam takes what the sphere's stage found."""
+    """The stages of the job: edge, sphere and seam in this order; the seam stage uses the result of the sphere stage."""
 
     stages: list[str] = dc.field(default_factory=lambda: ["edge", "sphere", "seam"])
     torch: Torch = dc.field(default_factory=Torch)
@@ -88,45 +88,45 @@ class ProfilerJob:
     sphere: SphereStage = dc.field(default_factory=SphereStage)
     seam: SeamStage = dc.field(default_factory=SeamStage)
     robot_sigma_mm: float = (
-        0.06  # per axis, of where the flange is against where the controller says, anew at each pose
+        0.06  # per axis: error of the flange position reported by the controller, drawn at each pose
     )
-    clearance_mm: float = 6.0  # between torch or profiler and what is scanned, as thought
-    near_mm: float = 72.0  # the field in which the calibration measures
+    clearance_mm: float = 6.0  # nominal distance between torch or profiler and the scanned object
+    near_mm: float = 72.0  # the depth range of the calibration
     far_mm: float = 105.0
     half_width_mm: float = 17.0
     maximum_time_s: float = 600.0
 
 
 def pose_of(xyz_m: list[float], rpy_deg: list[float]) -> RigidTransform:
-    """A pose as written in a scenario."""
+    """The pose of a scenario's position (m) and roll-pitch-yaw (deg)."""
     return RigidTransform(RollPitchYaw(np.deg2rad(rpy_deg)), xyz_m)
 
 
 def edge_as_thought(job: ProfilerJob) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A point (3,) m of the straightedge's edge and its direction (3,), in B."""
+    """The nominal edge: a point (3,) m of the straightedge's edge and its direction (3,), in B."""
     X = pose_of(job.straightedge.xyz_m, job.straightedge.rpy_deg)
     return np.array(X.translation()), X.rotation().matrix()[:, 0].copy()
 
 
 def check_profiler_job(job: ProfilerJob | None, *, has_profiler: bool, has_groove: bool, tool: str) -> None:
-    """Refuse what no profiler's cell could do.
+    """Check the profiler job of a scenario.
 
     Raises:
         InputError: one sentence that says what to change.
     """
     if job is None:
         if has_profiler:
-            raise InputError("A profiler needs something to do: write profiler_job: {} in the scenario.")
+            raise InputError("A profiler needs a job: write profiler_job: {} in the scenario.")
         return
     if not has_profiler:
         raise InputError("profiler_job needs a profiler: write profiler: !RenderedProfiler {} in the scenario.")
     if tool != "none":
-        raise InputError("The profiler's torch takes the tool's place: write tool: none in the scenario.")
+        raise InputError("The profiler's torch replaces the tool: write tool: none in the scenario.")
     order = [stage for stage in STAGES if stage in job.stages]
     if not job.stages or order != job.stages:
         raise InputError(f"profiler_job.stages are some of {', '.join(STAGES)}, in this order, not {job.stages}.")
     if "seam" in job.stages and "sphere" not in job.stages:
-        raise InputError("A seam needs the torch's tip, which the touches find: write stages: [sphere, seam].")
+        raise InputError("A seam needs the torch's tip, which the touches measure: write stages: [sphere, seam].")
     if len(job.torch.tip_m) != 3 or not job.torch.tip_m[2] > 0.03:
         raise InputError("profiler_job.torch.tip_m has three numbers, and the tip is 0.03 m or more before the flange.")
     if "seam" in job.stages and not has_groove:
@@ -134,7 +134,7 @@ def check_profiler_job(job: ProfilerJob | None, *, has_profiler: bool, has_groov
     if job.edge.scans < 8 or job.sphere.scans < 6 or job.sphere.touches < 6:
         raise InputError("Take 8 scans of the edge, 6 of the sphere and 6 touches of it, or more.")
     if min(job.edge.held_out, job.sphere.held_out) < 1:
-        raise InputError("Leave one scan out or more: held_out must be positive.")
+        raise InputError("One scan or more must be held out: held_out must be positive.")
     if not 0.0 < job.near_mm < job.far_mm or min(job.half_width_mm, job.robot_sigma_mm, job.ball.radius_mm) <= 0.0:
         raise InputError("The profiler's field, the sphere's radius and the robot's sigma must be positive.")
     if job.seam.passes < 1:

@@ -1,4 +1,4 @@
-"""From what a profiler's job has measured to what it wanted: X_FS by an edge, X_FS and the torch's tip by a sphere, a seam."""
+"""Estimates of the profiler job from its profiles: X_FS by an edge, X_FS and the torch's tip by a sphere, a seam."""
 
 from __future__ import annotations
 
@@ -24,19 +24,21 @@ from weldcal.systems.messages import Message
 from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
-SMOOTHING_M = 0.004  # waves of a seam shorter than about six times this are taken for noise
-FAR_SIGMAS = 4.0  # of the scatter about the smooth seam: a point beyond is left out
-TRIALS = 3  # rounds of leaving points out
-ARC_SIGMAS = 4.0  # of a sample, within which it is taken for one of the arc
-ARC_COSINE = 0.84  # rms over 60 degrees to both sides: samples are noisy in z alone, and an arc's normals lean from it
-WINDOW_M = 0.012  # beyond the field and the sphere's radius: further away is another thing
-NEAREST_PERCENT = 3.0  # of a profile's depths: spikes towards the sensor are fewer
-WIDER_M = 0.5e-3  # a circle may be larger than the sphere by the noise
+SMOOTHING_M = 0.004  # seam wavelengths below about six times this are treated as noise
+FAR_SIGMAS = 4.0  # times the scatter about the smooth seam; points beyond it are rejected
+TRIALS = 3  # rounds of outlier rejection
+ARC_SIGMAS = 4.0  # largest distance of a sample that counts as part of the arc
+ARC_COSINE = (
+    0.84  # rms over 60 degrees to both sides: samples are noisy in z only, and an arc's normals are inclined to z
+)
+WINDOW_M = 0.012  # beyond the depth range and the sphere's radius; farther samples belong to another object
+NEAREST_PERCENT = 3.0  # of a profile's depths; the share of spikes towards the sensor is smaller
+WIDER_M = 0.5e-3  # noise may make a circle larger than the sphere
 
 
 @dataclass(frozen=True, eq=False)
 class Taken(Message):
-    """One profile with the joints (6,) rad, as the controller said, at the time it was taken."""
+    """One profile with the joints (6,) rad that the controller reported at its capture time."""
 
     kind: str
     q: Array
@@ -45,7 +47,7 @@ class Taken(Message):
 
 @dataclass(frozen=True, eq=False)
 class EdgeFound(Message):
-    """X_FS by the edge; scans without an edge; held-out scans: distance from the edge (n,) mm and whitened (n, 2) residuals."""
+    """X_FS from the edge; scans without an edge; held-out scans: distance from the edge (n,) mm, whitened residuals (n, 2)."""
 
     estimate: EdgeEstimate
     poses: FlangePoses
@@ -57,7 +59,7 @@ class EdgeFound(Message):
 
 @dataclass(frozen=True, eq=False)
 class SphereFound(Message):
-    """X_FS and the tip by the sphere; which model; held-out scans: rms distance (n,) mm of their points from the sphere."""
+    """X_FS and the tip from the sphere; the selected model; held-out scans: rms distance (n,) mm of points from the sphere."""
 
     estimate: SphereEstimate
     data: SphereData
@@ -68,7 +70,7 @@ class SphereFound(Message):
 
 @dataclass(frozen=True, eq=False)
 class SeamFound(Message):
-    """The groove's root as seen (n, 3) m in B, which points were kept (n,), and the smooth curve."""
+    """Measured points of the groove's root (n, 3) m in B, the inlier mask (n,), and the smooth curve."""
 
     points_B: Array
     kept: NDArray[np.bool_]
@@ -77,14 +79,14 @@ class SeamFound(Message):
 
 
 def flange_poses(arm: ArmModel, taken: list[Array]) -> FlangePoses:
-    """X_BF for joints, as arrays."""
+    """X_BF of each joint vector, as arrays."""
     X = [forward_kinematics(arm, q) for q in taken]
     R, p = np.array([x.rotation().matrix() for x in X]), np.array([x.translation() for x in X])
     return FlangePoses(R.reshape(-1, 3, 3), p.reshape(-1, 3))
 
 
 def feature_sigmas(p: RenderedProfiler, z_m: float) -> Array:
-    """Sigma (2,) m of an edge's point [x, z], by the sensor's data sheet."""
+    """Sigma (2,) m of an edge point [x, z], from the sensor's data sheet."""
     x = float(np.hypot(p.pitch_m(z_m) / np.sqrt(12.0), 1e-3 * p.jitter_mm))
     few = np.sqrt(6e-3 / p.pitch_m(z_m))
     z = float(np.hypot(2e-3 * np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0)) / few, 1e-3 * p.jitter_mm))
@@ -92,20 +94,20 @@ def feature_sigmas(p: RenderedProfiler, z_m: float) -> Array:
 
 
 def sphere_sigmas(p: RenderedProfiler, job: ProfilerJob) -> SphereSigmas:
-    """What is known before of the sphere's measurements: what a whole profile is off by counts with the robot's error."""
+    """Prior sigmas of the sphere measurements; the error of a whole profile is added to the robot's error."""
     return SphereSigmas(
         sensor_m=1e-3 * ARC_COSINE * float(np.hypot(p.noise_mm, p.quantum_mm / np.sqrt(12.0))),
-        # what a whole profile is off by lies in its plane, and so do most of the normals
+        # the error of a whole profile lies in its plane, and so do most of the normals
         robot_m=1e-3 * float(np.hypot(job.robot_sigma_mm, p.jitter_mm)),
         touch_m=1e-3 * job.robot_sigma_mm,
     )
 
 
 def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple[Taken, ...]) -> EdgeFound:
-    """X_FS by the scans of kind `scan`, held against those of kind `held_out`.
+    """Estimate X_FS from the scans of kind `scan`, and its errors at those of kind `held_out`.
 
     Raises:
-        WeldcalError: the scans do not show one edge, or do not tell enough; see edge_joint.
+        WeldcalError: the scans do not show one edge, or are not informative enough; see edge_joint.
     """
     sigmas = feature_sigmas(p, 0.5e-3 * (job.near_mm + job.far_mm))
     robot = 1e-3 * job.robot_sigma_mm
@@ -124,11 +126,11 @@ def find_edge(arm: ArmModel, p: RenderedProfiler, job: ProfilerJob, taken: tuple
     e = edge_joint(poses.rotation, poses.translation, points, sigma_robot_m=robot, sigma_xz_m=sigmas)
     others = flange_poses(arm, seen["held_out"][0])
     state = EdgeState(e.rotation, e.translation, e.point, e.direction)
-    foretold, J, by_robot = predicted(state, others)
-    left_out = np.array(seen["held_out"][1]).reshape(-1, 2)
-    off = left_out - foretold
+    expected, J, by_robot = predicted(state, others)
+    held_out = np.array(seen["held_out"][1]).reshape(-1, 2)
+    off = held_out - expected
     r, _ = whitened(measurement_covariance(by_robot, robot, sigmas), off, J)
-    at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, left_out)) + others.translation
+    at = np.einsum("nij,nj->ni", others.rotation, _in_flange(e, held_out)) + others.translation
     away = at - e.point
     away -= np.outer(away @ e.direction, e.direction)
     return EdgeFound(e, poses, points, lost, 1e3 * np.linalg.norm(away, axis=1), r)
@@ -138,12 +140,12 @@ def _enough(found: int, taken: tuple[Taken, ...], what: str) -> None:
     wanted = sum(one.kind == "scan" for one in taken)
     if found < 0.5 * wanted:
         raise FeatureNotFound(
-            f"Only {found} of {wanted} profiles show {what}: check where it stands and how the profiler is mounted."
+            f"Only {found} of {wanted} profiles show {what}: check its position and the profiler's mounting."
         )
 
 
 def _one_background(points: Array, behind_m: float) -> Array:
-    """The profile with all that lies further behind its nearest face put at one depth: of post and table, no edges."""
+    """The profile with all samples far behind its nearest face set to one depth, so that post and table have no edges."""
     p = points[np.isfinite(points).all(axis=1)]
     if not len(p):
         return p
@@ -166,16 +168,16 @@ def find_sphere(
     tip: Array | None = None,
     first: SphereEstimate | None = None,
 ) -> SphereFound:
-    """X_FS by the sphere's profiles; with touches (joints (6,) each) the torch's tip as well, from the first estimate on.
+    """Estimate X_FS from the sphere's profiles; with touches (joints (6,) each) also the torch's tip.
 
     Raises:
-        WeldcalError: the scans do not show the sphere, or do not tell enough; see sphere_joint.
+        WeldcalError: the scans do not show the sphere, or are not informative enough; see sphere_joint.
     """
     radius, sigmas = 1e-3 * job.ball.radius_mm, sphere_sigmas(p, job)
     arcs: dict[str, tuple[list[Array], list[Array]]] = {"scan": ([], []), "held_out": ([], [])}
     lost = 0
     for one in taken:
-        window = one.points[one.points[:, 1] < 1e-3 * job.far_mm + radius + WINDOW_M]  # of what stands behind, nothing
+        window = one.points[one.points[:, 1] < 1e-3 * job.far_mm + radius + WINDOW_M]  # without the background
         try:
             mask, circle, _ = find_arc(window, radius, tolerance_m=ARC_SIGMAS * sigmas.sensor_m)
         except FeatureNotFound:
@@ -183,7 +185,7 @@ def find_sphere(
             continue
         if (
             circle[2] > radius + WIDER_M
-        ):  # a run of samples that is no cut of this sphere: a face, or another thing's edge
+        ):  # a run of samples that is not a section of this sphere: a face, or an edge of another object
             lost += 1
             continue
         arcs[one.kind][0].append(one.q)
@@ -204,7 +206,7 @@ def find_sphere(
 
 
 def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate) -> tuple[Model, SphereEstimate]:
-    """Rigid or affine, whichever foretells scans left out better by more than a fiftieth, and its estimate."""
+    """Select the rigid model, or the affine one where it predicts held-out scans better by more than 2 %; with its estimate."""
     names: tuple[Model, ...] = ("rigid", "affine")
     estimates = {name: sphere_joint(data, name, sigmas, rigid) for name in names}
     errors = {}
@@ -222,9 +224,9 @@ def _better_model(data: SphereData, sigmas: SphereSigmas, rigid: SphereEstimate)
 def find_seam(
     arm: ArmModel, estimate: SphereEstimate, drawn: SeamCurve, taken: tuple[Taken, ...], every_m: float
 ) -> SeamFound:
-    """The groove's root in B by what was calibrated: points of all passes brought together along the drawn seam, smoothed.
+    """Measure the groove's root in B with the calibration: points of all passes, merged along the nominal seam and smoothed.
 
-    Points that lie far from their neighbours are left out.
+    Points far from their neighbours are rejected.
 
     Raises:
         WeldcalError: too few profiles show a groove.
@@ -239,7 +241,7 @@ def find_seam(
         points.append(forward_kinematics(arm, one.q).multiply(estimate.points_F(root)[0]))
     if len(points) < max(8, 0.5 * len(taken)):
         raise FeatureNotFound(
-            f"Only {len(points)} of {len(taken)} profiles show the groove: check where the workpiece lies."
+            f"Only {len(points)} of {len(taken)} profiles show the groove: check the workpiece's pose."
         )
     p = np.array(points)
     place = np.round(drawn.project(p) / every_m).astype(int)
@@ -260,7 +262,7 @@ def find_seam(
 
 
 def _means(p: Array, place: NDArray[np.int_]) -> Array:
-    """The mean point (m, 3) of each place, in their order."""
+    """The mean point (m, 3) of each place, in the order of the places."""
     return np.array([p[place == k].mean(axis=0) for k in np.unique(place)])
 
 

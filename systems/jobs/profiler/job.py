@@ -1,4 +1,4 @@
-"""The profiler job: a laser profiler calibrated by an edge and by a sphere with touches, a seam measured, the torch taken after it."""
+"""The profiler job: calibrates a laser profiler by an edge and by a touched sphere, measures a seam, moves the torch along."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Profiler(Job[PlanningContext]):
     def furnish(
         self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
     ) -> Furnishing:
-        """See Job: what the profiler looks at and what its torch touches."""
+        """See Job: the objects that the profiler scans and the torch touches."""
         p, job = scenario.profiler, scenario.part(ProfilerJob)
         if not isinstance(p, RenderedProfiler) or job is None:
             return Furnishing()
@@ -73,13 +73,13 @@ class Profiler(Job[PlanningContext]):
         return Furnishing(profiler=fixture, time_step_s=fixture.time_step_s, parts=(fixture, fixture.truth))
 
     def position_error(self, scenario: Scenario, arm: ArmModel, seed: int) -> LeafSystem | None:
-        """See Job: a simulated arm is never quite where its controller says; a real one has errors of its own."""
+        """See Job: adds position errors to a simulated arm; a real arm has its own errors."""
         job = scenario.part(ProfilerJob)
         assert job is not None
         return RobotError(arm, 1e-3 * job.robot_sigma_mm, seed) if scenario.robot.SIMULATED else None
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> PlanningContext:
-        """See Job: what the procedure is told before it begins."""
+        """See Job: the nominal data with which the procedure starts."""
         return planning_context(scenario, station)
 
     def add(self, wiring: Wiring, spine: Spine, plan: PlanningContext) -> AddedProfilerJob:
@@ -108,7 +108,7 @@ class Profiler(Job[PlanningContext]):
 
 
 def planning_context(scenario: Scenario, station: Station) -> PlanningContext:
-    """What the procedure is told before it begins: drawings only."""
+    """The nominal data with which the procedure starts, from drawings only."""
     job, profiler, spec = scenario.part(ProfilerJob), scenario.profiler, scenario.workpiece
     if job is None or not isinstance(profiler, RenderedProfiler):
         raise InputError("This scenario has no profiler: write profiler: !RenderedProfiler {} and profiler_job: {}.")

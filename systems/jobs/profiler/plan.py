@@ -1,4 +1,4 @@
-"""Where the profiler's job goes: poses of an edge and of a sphere that tell most, touches, and the passes along a seam."""
+"""Plans the profiler job: informative poses of edge and sphere scans, touches, and passes along a seam."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from weldcal.welding.seam.curve import SeamCurve
 
 Array = NDArray[np.float64]
 CANDIDATES = 160
-FIRST = 5  # poses at random, before the planner has anything to add to
-CAP_RAD = np.radians(55.0)  # of the sphere that is touched, from its top
+FIRST = 5  # random poses with which the planner starts
+CAP_RAD = np.radians(55.0)  # angle from the top of the sphere within which it is touched
 SIDE_RAD = np.radians(62.0)  # largest angle between torch and the sphere's normal at a touch
 LEAN_RAD = np.radians(25.0)
 TURN_RAD = np.radians(60.0)
 STATION_M = 0.004  # between joint positions along a pass
-RAMP_S = 0.5  # to a pass's speed and from it
+RAMP_S = 0.5  # ramps of a pass's speed at both ends
 
 
 @dataclass(frozen=True, eq=False)
 class JointPath(Message):
-    """A way in joint space by its length s: knots (n,) m and joints (n, 6) rad, passed at a speed with ramps at both ends."""
+    """A joint path over its arc length s: knots (n,) m and joints (n, 6) rad, with a speed and ramps at both ends."""
 
     s: Array
     q: Array
@@ -47,11 +47,11 @@ class JointPath(Message):
 
     @property
     def duration(self) -> float:
-        """Seconds from rest to rest."""
+        """Duration from rest to rest, s."""
         return float(self.s[-1] / self.speed + RAMP_S)
 
     def at(self, t: float) -> tuple[Array, Array, float]:
-        """Joints (6,), joint velocity (6,) and s at a time since the start."""
+        """Joints (6,) rad, joint velocity (6,) rad/s and s (m) at a time since the start."""
         T, v = self.duration, self.speed
         t = min(max(t, 0.0), T)
         left = T - t
@@ -65,17 +65,17 @@ class JointPath(Message):
 
     @cached_property
     def curve(self) -> CubicSpline:
-        """q over s."""
+        """The spline q(s)."""
         return CubicSpline(self.s, self.q)
 
     def backwards(self) -> JointPath:
-        """The same way from its end."""
+        """The reversed path."""
         return JointPath(self.s[-1] - self.s[::-1], self.q[::-1].copy(), self.speed)
 
 
 @dataclass(frozen=True, eq=False)
 class Goal(Message):
-    """One thing to do: `via`, `scan`, `touch` (then down along `way`, (3,) unit), or `pass` and `torch` along `path`."""
+    """One goal: `via`, `scan`, `touch` (then descend along `way`, (3,) unit), or `pass` and `torch` along `path`."""
 
     kind: str
     q: Array
@@ -84,10 +84,10 @@ class Goal(Message):
 
 
 def plan_edge(planning: PlanningContext, q_from: Array, seed: int, sigma_xz_m: Array) -> list[Goal]:
-    """Scans of the straightedge: those that make the profiler surest, and the held-out ones among the rest.
+    """Plan the scans of the straightedge: those that minimise the predicted covariance, and held-out ones among the rest.
 
     Raises:
-        InputError: too few poses can be taken.
+        InputError: too few poses are reachable and clear.
     """
     stage, job = planning.job.edge, planning.job
     point, direction = edge_as_thought(job)
@@ -109,7 +109,7 @@ def plan_edge(planning: PlanningContext, q_from: Array, seed: int, sigma_xz_m: A
 
 
 def plan_sphere(planning: PlanningContext, q_from: Array, seed: int, sigmas: SphereSigmas) -> list[Goal]:
-    """The same of the sphere; see plan_edge."""
+    """Plan the scans of the sphere; see plan_edge."""
     stage = planning.job.sphere
     R, t = planning.X_FS.rotation().matrix(), np.array(planning.X_FS.translation())
     candidates = sample_sphere_poses(
@@ -124,7 +124,8 @@ def plan_sphere(planning: PlanningContext, q_from: Array, seed: int, sigmas: Sph
 
 
 def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Goal]:
-    """Above points spread over the sphere's upper part, the torch leaning and turned another way at each.
+    """Plan touches at points spread over the sphere's upper part, with a different inclination and rotation of the torch at
+    each.
 
     Raises:
         InputError: too few of them can be reached.
@@ -133,7 +134,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
     yaw = RollPitchYaw(forward_kinematics(planning.arm, planning.q_home).rotation()).yaw_angle()
     q, normals = [], []
     for k in range(20 * stage.touches):
-        # Fibonacci's lattice: each new point falls into the largest gap of those before
+        # Fibonacci lattice: each new point lies in the largest gap of the previous ones
         cosine = 1.0 - (1.0 - np.cos(CAP_RAD)) * ((k + 0.5) % stage.touches) / stage.touches
         angle = 2.399963 * k
         n = np.array([np.sqrt(1.0 - cosine**2) * np.cos(angle), np.sqrt(1.0 - cosine**2) * np.sin(angle), cosine])
@@ -150,7 +151,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
         if len(q) == stage.touches:
             break
     if len(q) < stage.touches:
-        raise InputError("The arm cannot touch the sphere all around where it is thought to stand: move it nearer.")
+        raise InputError("The arm cannot touch the sphere from all sides at its nominal position: move it nearer.")
     return [
         Goal("via" if k < 0 else "touch", at, None if k < 0 else -normals[k])
         for at, k in planning.route(q_from, np.array(q))
@@ -158,7 +159,7 @@ def plan_touches(planning: PlanningContext, q_from: Array, seed: int) -> list[Go
 
 
 def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
-    """The profiler along the seam of the drawing, square to the plate, its line across the groove."""
+    """Plan the profiler's passes along the nominal seam, perpendicular to the plate, with the laser line across the groove."""
     assert planning.cad is not None
     assert planning.X_BP is not None
     stage = planning.job.seam
@@ -181,7 +182,7 @@ def plan_pass(planning: PlanningContext, q_from: Array) -> list[Goal]:
 
 
 def plan_torch(planning: PlanningContext, q_from: Array, curve: SeamCurve) -> list[Goal]:
-    """The torch's tip along a seam that was found, upright, the profiler ahead of it."""
+    """Plan the torch's path along a measured seam, upright, with the profiler ahead."""
     stage = planning.job.seam
     s = np.arange(0.0, curve.length, STATION_M)
     tips = curve.position(s) + 1e-3 * stage.above_root_mm * curve.up(s)
@@ -197,14 +198,14 @@ def plan_torch(planning: PlanningContext, q_from: Array, curve: SeamCurve) -> li
 def _standing(planning: PlanningContext, candidates: FlangePoses, what: str) -> tuple[Array, FlangePoses]:
     q, which = planning.standing(candidates)
     if not len(q):
-        raise InputError(f"The arm cannot take the profiler over the {what} where it is thought to stand: move it.")
+        raise InputError(f"The arm cannot move the profiler over the {what} at its nominal pose: move it.")
     return q, candidates[which]
 
 
 def _split(poses: FlangePoses, wanted: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     if len(poses) < wanted + FIRST:
         raise InputError(
-            f"Only {len(poses)} poses stand clear and can be reached, too few for {wanted} scans: ask for fewer or for less tilt."
+            f"Only {len(poses)} poses are clear and reachable, too few for {wanted} scans: ask for fewer or for less tilt."
         )
     return np.arange(FIRST), np.arange(FIRST, len(poses))
 
@@ -227,20 +228,20 @@ def _scans(
 
 
 def _stretch(planning: PlanningContext, s: Array) -> NDArray[np.bool_]:
-    """Which of the drawing's seam points are passed."""
+    """Mask of the nominal seam's points that are measured."""
     stage = planning.job.seam
     begin, end = 1e-3 * stage.ends_mm, float(s[-1]) - 1e-3 * stage.ends_mm
     if stage.seam_length_mm is not None:
         end = min(end, begin + 1e-3 * stage.seam_length_mm)
     if end - begin < 0.03:
-        raise InputError("The seam that is passed is shorter than 30 mm: lessen seam.ends_mm.")
+        raise InputError("The measured part of the seam is shorter than 30 mm: reduce seam.ends_mm.")
     return np.asarray((s >= begin) & (s <= end))
 
 
 def _along(
     planning: PlanningContext, q_from: Array, flange: list[RigidTransform], at: Array, speed: float, kind: str
 ) -> list[Goal]:
-    """A goal above the beginning, then the path."""
+    """A goal above the start, then the path."""
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1))])
     even = np.linspace(0.0, length[-1], max(4, int(length[-1] / STATION_M)))
     chosen = np.unique(np.searchsorted(length, even).clip(0, len(at) - 1))
@@ -249,9 +250,9 @@ def _along(
     for k in chosen:
         found = planning.joints(flange[k], q)
         if found is None:
-            raise InputError("The arm cannot follow the seam where it is thought to lie: move the workpiece nearer.")
+            raise InputError("The arm cannot follow the seam at its nominal pose: move the workpiece nearer.")
         if joints and float(np.abs(found - q).max()) > 0.5:
-            raise InputError("The arm would have to turn over while it follows the seam: move the workpiece.")
+            raise InputError("The arm would have to change its configuration along the seam: move the workpiece.")
         joints.append(found)
         q = found
     raised = RigidTransform([0.0, 0.0, 0.05]) @ flange[0]

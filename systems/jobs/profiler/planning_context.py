@@ -1,4 +1,4 @@
-"""What the profiler's planning knows: the arm, the rig on its flange and what stands around, all as thought; and what is clear of what."""
+"""Data of the profiler job's planning: arm, rig on its flange and surrounding objects at their nominal poses; clearances."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIU
 from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 
 Array = NDArray[np.float64]
-STEP_RAD = 0.1  # along a move, between places that are looked at
+STEP_RAD = 0.1  # along a move, between the checked configurations
 
 
 @dataclass(frozen=True, eq=False)
 class PlanningContext:
-    """Poses as drawn or, later, as calibrated: X_FS, the tip in F, the sphere's centre in B; the workpiece's drawing at X_BP."""
+    """Nominal or, later, calibrated poses: X_FS, the tip in F, the sphere's centre in B; the nominal workpiece at X_BP."""
 
     arm: ArmModel
     job: ProfilerJob
@@ -39,12 +39,12 @@ class PlanningContext:
 
     @property
     def radius_m(self) -> float:
-        """Of the sphere."""
+        """Radius of the sphere, m."""
         return 1e-3 * self.job.ball.radius_mm
 
     @property
     def field(self) -> Field:
-        """Where the calibration measures."""
+        """The depth range of the calibration."""
         return Field(1e-3 * self.job.half_width_mm, 1e-3 * self.job.near_mm, 1e-3 * self.job.far_mm)
 
     def bodies(self) -> list[Body]:
@@ -57,7 +57,7 @@ class PlanningContext:
         return arm_bodies(self.arm, capsules)
 
     def gap(self, X_BF: RigidTransform) -> float:
-        """Smallest distance (m) of torch and profiler to what stands around; negative inside."""
+        """Smallest distance (m) of torch and profiler from the surrounding objects; negative inside."""
         points, radii = rig_points(self.p_FTip, self.X_FS)
         p = X_BF.multiply(points.T).T
         e = self.job.straightedge
@@ -74,11 +74,11 @@ class PlanningContext:
         return float((np.min(gaps, axis=0) - radii).min())
 
     def joints(self, X_BF: RigidTransform, q_near: Array) -> Array | None:
-        """The joints nearest to others; None: out of reach."""
+        """The inverse kinematics solution nearest to `q_near`; None: out of reach."""
         return nearest_solution(self.arm, X_BF, q_near)
 
     def clear_way(self, q_a: Array, q_b: Array) -> bool:
-        """Whether a move straight in joint space keeps torch, profiler and arm off everything."""
+        """Whether a straight move in joint space keeps torch, profiler and arm clear of all objects."""
         n = max(2, int(np.ceil(float(np.abs(q_b - q_a).max()) / STEP_RAD)) + 1)
         for u in np.linspace(0.0, 1.0, n):
             if self.gap(forward_kinematics(self.arm, q_a + u * (q_b - q_a))) < 0.5e-3 * self.job.clearance_mm:
@@ -87,7 +87,7 @@ class PlanningContext:
         return lowest > self.table_z_m and gap > 0.0
 
     def standing(self, poses: FlangePoses) -> tuple[Array, NDArray[np.intp]]:
-        """Joints (n, 6) of those poses that can be reached and stand clear, and which these are."""
+        """Joints (n, 6) of the poses that are reachable and clear, and their indices."""
         q, which = [], []
         for k, (R, p) in enumerate(zip(poses.rotation, poses.translation, strict=True)):
             X = RigidTransform(np.vstack([np.column_stack([R, p]), [0.0, 0.0, 0.0, 1.0]]))
@@ -100,10 +100,10 @@ class PlanningContext:
         return np.array(q).reshape(-1, 6), np.array(which, dtype=np.intp)
 
     def route(self, q_from: Array, goals: Array) -> list[tuple[Array, int]]:
-        """A way through all goals (n, 6), each the nearest of the rest: (joints, number of the goal or -1 for home between).
+        """A route through all goals (n, 6), each time to the nearest remaining one: (joints, goal's index or -1 for home).
 
         Raises:
-            InputError: a goal has no clear way, not even from home.
+            InputError: a goal has no clear move, not even from home.
         """
         here, left, way = q_from, list(range(len(goals))), []
         while left:
@@ -117,12 +117,12 @@ class PlanningContext:
             here = goals[k]
         if sum(k >= 0 for _, k in way) < 0.8 * len(goals):
             raise InputError(
-                "Too many of the profiler's poses have no clear way: put the objects further apart in profiler_job."
+                "Too many of the profiler's poses have no clear move: place the objects farther apart in profiler_job."
             )
         return way
 
     def known(self, **changes: object) -> PlanningContext:
-        """The same with what has been found out."""
+        """A copy with updated values."""
         return replace(self, **changes)  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""ProfilerProcedure: scan the edge, scan and touch the sphere, pass along the groove, and take the torch after it."""
+"""ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along it."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ from weldcal.welding.seam.curve import SeamCurve
 Array = NDArray[np.float64]
 ENDS = ("done", "held")
 DWELL_S = 0.1  # at rest before a profile is taken
-FEEDBACK_PER_S = 8.0  # towards the path
-PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # what each stage does, in order
+FEEDBACK_PER_S = 8.0  # feedback gain towards the path
+PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # steps of each stage, in order
 
 
 @dataclass(frozen=True, eq=False)
 class ProfilerState(Message):
-    """Where the procedure stands and what it has; `step` is what is being done: edge, sphere, touch, pass, torch."""
+    """State and data of the procedure; `step` is the present one: edge, sphere, touch, pass, torch."""
 
     phase: str = "start"  # start, move, dwell, await, descend, lift, run, done, held
     since: float = 0.0
     goal_id: int = 0
     step: str = ""
     steps_left: tuple[str, ...] = ()
-    goals: tuple[Goal, ...] = ()  # the first is the one at hand
-    sequence: int = 0  # of the newest profile that was asked for
-    seen: int = 0  # of the newest one that came
-    before: int = 0  # profiles there had been when the pass began
-    felt: int = 0  # touches there had been when the descent began
+    goals: tuple[Goal, ...] = ()  # the first is the present goal
+    sequence: int = 0  # number of the newest requested profile
+    seen: int = 0  # number of the newest received profile
+    before: int = 0  # number of profiles at the start of the pass
+    felt: int = 0  # number of touches at the start of the descent
     taken: tuple[Taken, ...] = ()
     touches: tuple[Array, ...] = ()
     edge: EdgeFound | None = None
@@ -67,7 +67,7 @@ class ProfilerState(Message):
 
 
 class ProfilerProcedure(LeafSystem):
-    """Runs the stages of the job; a fault, a sphere that is not met or profiles that show nothing hold it with a sentence.
+    """Runs the stages of the job; a fault, a missed sphere or profiles without the target hold it with a reason.
 
     .. pydrake_system::
 
@@ -86,8 +86,9 @@ class ProfilerProcedure(LeafSystem):
         - trigger
         - state
 
-    `job` drives the FlangeMover between goals (mode move), or says that `creep` (6) rad/s does (mode weld): the descent to a
-    touch, the profiler's pass, the torch's. `trigger` (1) is the number of the newest profile asked for; `hold` (1) is a person's wish to stop.
+    `job` selects the FlangeMover between goals (mode move), or `creep` (6) rad/s (mode weld): the descent to a touch, the
+    profiler's pass and the torch's. `trigger` (1) is the number of the newest requested profile; `hold` (1) is the
+    operator's stop request.
     """
 
     def __init__(
@@ -116,14 +117,14 @@ class ProfilerProcedure(LeafSystem):
         q = np.array(self._position.Eval(context))
         try:
             new = self._next(old, q, context)
-        except WeldcalError as error:  # planning or estimating: the sentence says what to change
+        except WeldcalError as error:  # planning or estimation failed: the message says what to change
             new = replace(old, phase="held", reason=str(error), since=context.get_time())
         if new is not old:
             state.get_mutable_abstract_state(self._state).set_value(new)
         state.get_mutable_discrete_state().set_value(self._velocity(new, q, context.get_time()))
 
     def _velocity(self, s: ProfilerState, q: Array, now: float) -> Array:
-        """Straight along a touch's way, or along a path with feedback towards it."""
+        """Joint velocity (6,) rad/s: along a touch's line, or along a path with feedback towards it."""
         planning = s.planning or self._planning
         if s.phase == "descend" and s.goals[0].way is not None:
             v = np.concatenate([np.zeros(3), 1e-3 * planning.job.sphere.descent_mm_s * s.goals[0].way])
@@ -178,7 +179,7 @@ class ProfilerProcedure(LeafSystem):
         return self._go_on(s, q, now)
 
     def _collected(self, s: ProfilerState, context: Context) -> ProfilerState:
-        """With the newest profile, once the joints of its time are known."""
+        """The state with the newest profile added, as soon as the joints at its capture time are known."""
         scan: ProfileScan = self._profile.Eval(context)
         if scan.sequence <= s.seen:
             return s
@@ -199,7 +200,7 @@ class ProfilerProcedure(LeafSystem):
             return replace(s, phase="lift", since=now, goal_id=s.goal_id + 1, touches=(*s.touches, q))
         if now - s.since > (stage.gap_mm + stage.deepest_mm) / stage.descent_mm_s:
             number = len(s.touches) + 1
-            reason = f"The torch met no sphere at touch {number}: check where the sphere stands and its radius."
+            reason = f"The torch did not touch the sphere at touch {number}: check the sphere's position and radius."
             return replace(s, phase="held", since=now, reason=reason)
         return s
 
@@ -224,7 +225,7 @@ class ProfilerProcedure(LeafSystem):
         return self._begin(self._concluded(s), q, now)
 
     def _begin(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
-        """Plan the next step and go to its first goal; home at the end."""
+        """Plan the next step and move to its first goal; home at the end."""
         planning = s.planning or self._planning
         if not s.steps_left:
             if s.step == "home":
@@ -259,7 +260,7 @@ class ProfilerProcedure(LeafSystem):
         return planning.q_home if up is None else up
 
     def _concluded(self, s: ProfilerState) -> ProfilerState:
-        """What the step that ended tells, and the planning as it is known now."""
+        """Evaluate the completed step and update the planning data."""
         planning, p = s.planning or self._planning, self._profiler
         if s.step == "edge":
             found = find_edge(planning.arm, p, planning.job, s.taken)

@@ -1,4 +1,4 @@
-"""RobotError: the flange is never quite where the controller says; by how much differs from pose to pose."""
+"""RobotError: adds a random position error of the flange, drawn for each pose, to the simulated arm's joints."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from weldcal.systems.messages import JobCommand
 
 
 class RobotError(LeafSystem):
-    """Adds to the joints what makes the flange, as the controller has it, differ from where it is: anew for each goal.
+    """Adds joint offsets so that the reported flange position differs from the true one, drawn for each goal.
 
     .. pydrake_system::
 
@@ -22,8 +22,8 @@ class RobotError(LeafSystem):
         output_ports:
         - position
 
-    Both positions (6) rad. The error of the flange's place is `sigma_m` per axis, its orientation is right; it stays the same
-    as long as the goal does, for the touch after a move as for the whole of a pass.
+    Both positions (6) rad. The error of the flange's position is `sigma_m` per axis, the orientation has none. It is constant
+    for one goal, including the touch after a move and a whole pass.
     """
 
     def __init__(self, arm: ArmModel, sigma_m: float, seed: int) -> None:

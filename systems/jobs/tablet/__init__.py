@@ -1,1 +1,1 @@
-"""A visit to a tablet: one look, then a touch of each landmark."""
+"""The tablet job: one picture of a tablet, then a touch of each landmark."""

@@ -1,4 +1,4 @@
-"""What a scenario says of a visit to the tablet: pen and tablet as drawn, and how the hand goes about it."""
+"""Configuration of the tablet job: nominal pen and tablet, and the motion."""
 
 import dataclasses as dc
 
@@ -11,7 +11,7 @@ from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.scenario.schema import Scenario
 
 MOST_LANDMARKS = 100
-STEEPEST_DEG = 45.0  # of a pen that still touches with its tip and not with its side
+STEEPEST_DEG = 45.0  # largest tilt at which the pen still touches with its tip and not with its side
 _POSITIVE = (
     *("columns", "rows", "across_mm", "down_mm", "ring_mm", "margin_mm", "px_per_mm"),
     *("look_distance_mm", "clearance_mm", "descent_mm_s", "deepest_mm"),
@@ -20,17 +20,17 @@ _POSITIVE = (
 
 @dc.dataclass
 class PenConfig:
-    """The sprung pen of `tool: pen`: where its tip is drawn in the flange's frame, and how far off the real one may be."""
+    """The sprung pen of `tool: pen`: nominal tip position in the flange frame, and the deviation of the true one."""
 
     tip_m: list[float] = dc.field(default_factory=lambda: [0.0, -0.022, 0.165])
-    mounting_mm: float = 3.0  # the true tip differs from the drawn one by this much, drawn from the seed
+    mounting_mm: float = 3.0  # deviation of the true tip from the nominal one, drawn from the seed
     radius_mm: float = 0.7  # of its round tip
     stiffness_N_per_m: float = 300.0
 
 
 @dc.dataclass
 class TabletConfig:
-    """`tablet:` the page as it is thought to lie (first landmark, x to the right, y down the page, z into it), and the visit."""
+    """`tablet:` nominal pose of the page (first landmark, x to the right, y down the page, z into it), and the motion."""
 
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.60, 0.045, 0.010])
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, 0.0])
@@ -45,12 +45,12 @@ class TabletConfig:
     look_distance_mm: float = 300.0
     clearance_mm: float = 15.0
     descent_mm_s: float = 12.0
-    deepest_mm: float = 12.0  # below where the tablet is thought to be: then the touch is given up
-    turn_deg: float = 22.5  # of the hand from touch to touch
-    tilt_deg: float = 12.0  # of the pen, to all sides in turn; 0: an upright pen
+    deepest_mm: float = 12.0  # below the nominal tablet, at which the touch is abandoned
+    turn_deg: float = 22.5  # rotation of the flange from touch to touch
+    tilt_deg: float = 12.0  # tilt of the pen, in varying directions; 0: an upright pen
 
     def pose(self) -> RigidTransform:
-        """X_BT as it is thought."""
+        """The nominal X_BT."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
 
     def landmarks_m(self) -> NDArray[np.float64]:
@@ -61,7 +61,7 @@ class TabletConfig:
 
 
 def check_tablet(scenario: Scenario) -> None:
-    """Refuse a visit to the tablet that no cell could make; a scenario without one passes.
+    """Check the tablet job of a scenario; a scenario without one passes.
 
     Raises:
         InputError: one sentence that says what to change.
@@ -73,26 +73,28 @@ def check_tablet(scenario: Scenario) -> None:
         return
     if scenario.job.calibrate or scenario.job.weld:
         raise InputError(
-            "A visit to the tablet has no scanner to calibrate and nothing to weld: run it with weldcal demo or weldcal tablet "
+            "The tablet job neither calibrates a scanner nor welds: run it with weldcal demo or weldcal tablet "
             "demo, and write job: {calibrate: false, weld: false} in its scenario."
         )
     if scenario.tool != "pen":
-        raise InputError(f"A visit to the tablet needs tool: pen in the scenario, not tool: {scenario.tool}.")
+        raise InputError(f"The tablet job needs tool: pen in the scenario, not tool: {scenario.tool}.")
     for name in ("wrist_camera", "digitizer"):
         if isinstance(getattr(scenario, name), NoDevice):
             example = "!RenderedWristCamera {}" if name == "wrist_camera" else "!SimulatedTablet {}"
-            raise InputError(f"A visit to the tablet needs a {name}: write {name}: {example} in the scenario.")
+            raise InputError(f"The tablet job needs a {name}: write {name}: {example} in the scenario.")
     for name in _POSITIVE:
         if getattr(tablet, name) <= 0:
             raise InputError(f"tablet.{name} must be a positive number, not {getattr(tablet, name):g}.")
     if tablet.columns < 2 or tablet.rows < 2:
-        raise InputError("tablet.columns and tablet.rows must be at least 2: landmarks on one line fix nothing.")
-    if tablet.columns * tablet.rows > MOST_LANDMARKS:
-        raise InputError(f"tablet.columns by tablet.rows are more than {MOST_LANDMARKS} landmarks; a dozen is plenty.")
-    if tablet.ring_mm >= min(tablet.across_mm, tablet.down_mm):
         raise InputError(
-            "tablet.ring_mm must be smaller than the landmarks' spacing, or the rings run into one another."
+            "tablet.columns and tablet.rows must be at least 2: landmarks on one line do not determine a pose."
         )
+    if tablet.columns * tablet.rows > MOST_LANDMARKS:
+        raise InputError(
+            f"tablet.columns by tablet.rows are more than {MOST_LANDMARKS} landmarks; a dozen is sufficient."
+        )
+    if tablet.ring_mm >= min(tablet.across_mm, tablet.down_mm):
+        raise InputError("tablet.ring_mm must be smaller than the landmarks' spacing, or the rings overlap.")
     if not 0.0 <= tablet.tilt_deg <= STEEPEST_DEG:
         raise InputError(f"tablet.tilt_deg must be from 0 to {STEEPEST_DEG:g}, and it is {tablet.tilt_deg:g}.")
     check_pen(tablet.pen)
@@ -103,6 +105,6 @@ def check_pen(pen: PenConfig) -> None:
     if len(pen.tip_m) != 3:
         raise InputError(f"tablet.pen.tip_m must hold 3 numbers, not {len(pen.tip_m)}.")
     if pen.tip_m[2] < 0.03:
-        raise InputError("tablet.pen.tip_m must stand at least 0.03 m before the flange.")
+        raise InputError("tablet.pen.tip_m must be at least 0.03 m in front of the flange.")
     if pen.radius_mm <= 0.0 or pen.stiffness_N_per_m <= 0.0 or pen.mounting_mm < 0.0:
         raise InputError("tablet.pen: radius_mm and stiffness_N_per_m must be positive, mounting_mm not negative.")

@@ -1,4 +1,4 @@
-"""The tablet job: the camera looks at the tablet once, then the pen touches each of its landmarks."""
+"""The tablet job: the camera takes one picture of the tablet, then the pen touches each of its landmarks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ SAYS = {
 
 @dataclass(eq=False)
 class AddedVisit(AddedJob):
-    """The systems of the visit, tablet and camera as they are thought; `known` is what only a simulation knows."""
+    """The systems of the job, the nominal tablet and camera; `known` is the ground truth of a simulation."""
 
     plan: TabletPlan
     tablet: TabletConfig
@@ -54,7 +54,7 @@ class AddedVisit(AddedJob):
     def truth(self) -> TabletTruth:
         """For reports and tests; raises RuntimeError in a cell that is not simulated."""
         if self.known is None:
-            raise RuntimeError("only a simulated tablet knows where it is")
+            raise RuntimeError("only a simulated tablet has a known true pose")
         return self.known
 
     def picture(self, root: Context) -> WristPicture:
@@ -69,7 +69,7 @@ class AddedVisit(AddedJob):
         return middle + np.array([0.55, -0.35, 0.45]), middle + np.array([0.0, 0.0, 0.08])
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
-        """See AddedJob: the look is a tenth, the touches are nearly all of the rest."""
+        """See AddedJob: the picture is a tenth of the run, the touches are nearly all of the rest."""
         state: TabletState = self.state(root)
         text = SAYS[state.phase].format(state.landmark + 1)
         touched = 0.80 * len(state.touches) / len(self.plan.q_above)
@@ -89,7 +89,7 @@ class Tablet(Job[TabletPlan]):
     def furnish(
         self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
     ) -> Furnishing:
-        """See Job: camera, pen and tablet as they truly are."""
+        """See Job: camera, pen and tablet at their true poses."""
         visit = tablet_fittings(tablet_of(scenario), scenario.wrist_camera, scenario.digitizer, rng)
         return Furnishing(fittings=(visit,), parts=(visit.tablet, visit.truth))
 

@@ -1,4 +1,4 @@
-"""What travels between the tablet's devices and its procedure: a picture of the wrist camera, a touch, and what only a simulation knows."""
+"""Messages of the tablet job: a picture of the wrist camera, a touch, and the ground truth of a simulation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class WristPicture(Message):
 
 @dataclass(frozen=True, eq=False)
 class TabletTouch(Message):
-    """One touch as the page writes it: position (2,) px from the first landmark, to a tenth; `sequence` 0 before the first."""
+    """One touch as the page records it: position (2,) px from the first landmark, to a tenth; `sequence` 0 before the first."""
 
     sequence: int = 0
     time: float = -np.inf
@@ -35,7 +35,7 @@ class TabletTouch(Message):
 
 @dataclass(frozen=True, eq=False)
 class TabletTruth(Message):
-    """What only the simulation knows: camera and pen tip (its centre, at rest) on the flange, tablet in the base."""
+    """Ground truth of the simulation: camera and pen tip (its centre, at rest) on the flange, tablet in the base."""
 
     X_FC: RigidTransform
     p_FP: Array

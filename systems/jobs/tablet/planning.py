@@ -1,4 +1,4 @@
-"""Where a visit to the tablet goes, by the drawing alone: the look, the way above each landmark, and which moves are free."""
+"""Plans the tablet job from nominal poses: the camera pose, the poses above each landmark, and free moves."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 
 Array = NDArray[np.float64]
-PEN_BODY_M = 0.006  # radius of the pen where moves are to keep clear of the table
-_LOOK_ASLANT_RAD = (0.12, -0.10)  # a view that is a little aslant fixes the tablet's tilt better than one square on
-_LEAN_STEP_RAD = 2.4  # between the sides to which the pen leans, touch by touch: the golden angle, so none comes twice
+PEN_BODY_M = 0.006  # radius of the pen in the clearance checks
+_LOOK_ASLANT_RAD = (
+    0.12,
+    -0.10,
+)  # a slightly inclined view determines the tablet's tilt better than a perpendicular one
+_LEAN_STEP_RAD = (
+    2.4  # between the tilt directions of consecutive touches: the golden angle, so that no direction repeats
+)
 
 
 def tablet_of(scenario: Scenario) -> TabletConfig:
-    """The tablet as it is thought; raises InputError where there is none."""
+    """The nominal tablet; raises InputError where there is none."""
     tablet = scenario.part(TabletConfig)
     if tablet is None:
         raise InputError("This scenario has no tablet: write tablet: {} and tool: pen in it, or run scenario 'tablet'.")
@@ -34,19 +39,17 @@ def tablet_of(scenario: Scenario) -> TabletConfig:
 
 
 def camera_of(scenario: Scenario) -> RenderedWristCamera:
-    """The wrist camera as drawn; raises InputError where there is none."""
+    """The nominal wrist camera; raises InputError where there is none."""
     if not isinstance(scenario.wrist_camera, RenderedWristCamera):
-        raise InputError(
-            "A visit to the tablet needs a camera: write wrist_camera: !RenderedWristCamera {} in the scenario."
-        )
+        raise InputError("The tablet job needs a camera: write wrist_camera: !RenderedWristCamera {} in the scenario.")
     return scenario.wrist_camera
 
 
 def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
-    """The joints (6,) for a flange pose that lie nearest to others, whole turns included; raises InputError: no reach."""
+    """The joints (6,) of a flange pose nearest to `q_near`, whole turns included; raises InputError where out of reach."""
     found = inverse_kinematics(arm, X_BF)
     if len(found) == 0:
-        raise InputError("The arm cannot reach the tablet where it is thought to lie; move it nearer in the scenario.")
+        raise InputError("The arm cannot reach the tablet at its nominal pose; move it nearer in the scenario.")
     turns = found + 2.0 * np.pi * np.round((q_near - found) / (2.0 * np.pi))
     inside = np.all((turns >= arm.position_lower) & (turns <= arm.position_upper), axis=1)
     turns = np.where(np.reshape(inside, (-1, 1)), turns, found)
@@ -54,7 +57,7 @@ def nearest_joints(arm: ArmModel, X_BF: RigidTransform, q_near: Array) -> Array:
 
 
 def plan_tablet(scenario: Scenario, arm: ArmModel) -> TabletPlan:
-    """Where to look from and how to come down on each landmark, by the drawing alone.
+    """Plan the camera pose and the descents onto each landmark from nominal poses.
 
     Raises:
         InputError: the scenario has no tablet, or a pose is out of reach.
@@ -90,10 +93,10 @@ def plan_tablet(scenario: Scenario, arm: ArmModel) -> TabletPlan:
 
 
 def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
-    """Every move straight in joint space must keep arm and pen above the table and off the arm.
+    """Check that every straight move in joint space keeps arm and pen above the table and free of self-collision.
 
     Raises:
-        InputError: one would not; nothing has moved.
+        InputError: one does not; nothing has moved.
     """
     pen = Capsule(6, np.zeros(3), plan.p_FP, PEN_BODY_M)
     bodies: list[Body] = arm_bodies(station.arm, (pen,))

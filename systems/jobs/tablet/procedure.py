@@ -1,4 +1,4 @@
-"""TabletProcedure: look at the tablet once, then lower the pen onto each landmark until the tablet feels it."""
+"""TabletProcedure: takes one picture of the tablet, then lowers the pen onto each landmark until the tablet detects it."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ Array = NDArray[np.float64]
 MOVES = ("to_start", "to_look", "to_above", "lift", "to_home")
 ENDS = ("done", "held")
 PICTURE_TIMEOUT_S = 8.0
-# of a descent's longest time: a tablet that is touched at the very end of it still has to say so
+# added to a descent's longest time, so that a touch at its end can still be reported
 LATE_TOUCH_S = 0.2
-_MODES = {**dict.fromkeys(MOVES, "move"), "descend": "weld"}  # the arbiter's word for "the servo drives"
+_MODES = {
+    **dict.fromkeys(MOVES, "move"),
+    "descend": "weld",
+}  # the command mode in which the arbiter selects the servo velocity
 
 
 @dataclass(frozen=True, eq=False)
 class TabletPlan:
-    """Joint goals (rad): where to look from, above each landmark (n, 6), home; descent and when to give up (m/s, s)."""
+    """Joint goals (rad): camera pose, above each landmark (n, 6), home; descent speed (m/s) and time limits (s)."""
 
     q_look: Array
     q_above: Array
     q_home: Array
-    p_FP: Array  # of the pen as drawn: its tip is what goes straight down
+    p_FP: Array  # nominal tip of the pen, which moves straight down
     descent_m_s: float
     longest_descent_s: float
     move_timeout_s: float = 20.0
@@ -41,7 +44,7 @@ class TabletPlan:
 
 @dataclass(frozen=True, eq=False)
 class Touched(Message):
-    """One landmark's touch: what the tablet wrote, and the joints (6,) rad at which it did."""
+    """One landmark's touch: the tablet's record, and the joints (6,) rad at its time."""
 
     landmark: int
     position_px: Array
@@ -51,7 +54,7 @@ class Touched(Message):
 
 @dataclass(frozen=True, eq=False)
 class TabletState(Message):
-    """Where the procedure stands."""
+    """State of the procedure."""
 
     phase: str = "start"  # start, to_start, to_look, look, to_above, descend, lift, to_home, done, held
     since: float = 0.0
@@ -59,7 +62,7 @@ class TabletState(Message):
     q_goal: Array | None = None
     landmark: int = 0
     trigger: int = 0
-    # touches the tablet had felt when this descent began: a bounce on the way up is not the next one
+    # number of touches at the start of this descent, so that a bounce during the lift does not count for the next one
     felt_before: int = 0
     touches: tuple[Touched, ...] = ()
     q_look: Array = field(default_factory=lambda: np.full(6, np.nan))
@@ -67,13 +70,13 @@ class TabletState(Message):
 
     @property
     def finished(self) -> bool:
-        """No more motion will be asked for."""
+        """Whether the procedure commands no more motion."""
         return self.phase in ENDS
 
 
 @dataclass(frozen=True, eq=False)
 class TabletSeen:
-    """What the procedure is told at one tick."""
+    """Inputs of the procedure at one tick."""
 
     time: float
     q: Array
@@ -86,7 +89,7 @@ class TabletSeen:
 
 
 def next_state(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletState:
-    """Where the procedure stands after this tick; the same object where nothing changed."""
+    """The state after this tick; the same object where nothing changed."""
     if s.finished:
         return s
     stop = _why_stop(s, seen, plan)
@@ -107,8 +110,8 @@ def next_state(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletStat
         touches = (*s.touches, Touched(s.landmark, seen.touch.position_px, q, seen.touch.time))
         return _go(replace(s, touches=touches), "lift", plan.q_above[s.landmark], seen.time)
     if seen.time - s.since > plan.longest_descent_s:
-        reason = f"The pen met no tablet at landmark {s.landmark + 1}: check where the tablet lies."
-        # back the way it came, before anything else: home is not straight above
+        reason = f"The pen did not touch the tablet at landmark {s.landmark + 1}: check the tablet's pose."
+        # lift along the descent first: home is not straight above
         return _go(replace(s, reason=reason), "lift", plan.q_above[s.landmark], seen.time)
     return s
 
@@ -128,24 +131,24 @@ def _after_move(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> TabletSta
 
 
 def _why_stop(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> str:
-    """Why the procedure must end where it stands; empty: it need not."""
+    """The reason why the procedure must be held; empty where there is none."""
     if not seen.robot.ready:
         return seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}."
     if seen.hold:
-        return f"A person held the visit, in the phase '{s.phase}'."
+        return f"A person held the job, in the phase '{s.phase}'."
     if seen.time > plan.maximum_time_s:
-        return f"The visit took longer than {plan.maximum_time_s:.0f} s; allow more with job.maximum_time_s."
+        return f"The job took longer than {plan.maximum_time_s:.0f} s; allow more with job.maximum_time_s."
     if s.phase in MOVES and seen.time - s.since > plan.move_timeout_s:
         return f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s."
     if s.phase == "look" and seen.time - s.since > PICTURE_TIMEOUT_S:
         return f"No picture arrived within {PICTURE_TIMEOUT_S:.0f} s of its trigger."
     if s.phase == "descend" and seen.time - s.since > plan.longest_descent_s + LATE_TOUCH_S:
-        return "The tablet felt the pen at a time at which nobody knows where the arm was: check the clocks."
+        return "The arm's pose at the time of a touch is not known: check the clocks."
     return ""
 
 
 class TabletProcedure(LeafSystem):
-    """Runs the procedure; a robot fault, a person, or a descent that meets no tablet, holds it with a sentence.
+    """Runs the procedure; a robot fault, the operator, or a descent without a touch holds it with a reason.
 
     .. pydrake_system::
 
@@ -164,8 +167,8 @@ class TabletProcedure(LeafSystem):
         - trigger
         - state
 
-    `job` drives the FlangeMover between goals and lets `descent` through the CommandArbiter while the pen goes down; `descent`
-    (6) rad/s is the pen's way straight down, zero otherwise; `hold` (1) is a person's wish to stop.
+    `job` drives the FlangeMover between goals and selects `descent` in the CommandArbiter while the pen descends; `descent`
+    (6) rad/s moves the pen straight down, zero otherwise; `hold` (1) is the operator's stop request.
     """
 
     def __init__(self, arm: ArmModel, plan: TabletPlan, period_s: float = 0.004) -> None:
@@ -188,7 +191,7 @@ class TabletProcedure(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def stands(self, context: Context) -> TabletState:
-        """Where the procedure stands in its own context."""
+        """State of the procedure in this system's context."""
         state: TabletState = context.get_abstract_state(self._state).get_value()
         return state
 

@@ -1,1 +1,1 @@
-"""The main job: calibrate, verify, scan the workpiece, plan the seam, weld."""
+"""The weld job: calibrate, verify, scan the workpiece, plan the seam, weld."""

@@ -1,4 +1,4 @@
-"""ArucoDeformationEstimator: finger image in, how far the soft tip stands from its rest out."""
+"""ArucoDeformationEstimator: measures the soft tip's displacement from its rest position in the finger camera's images."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag
 from weldcal.welding.servo.state import DeflectionSample
 
-IMAGES_KEPT = 10  # a third of a second of them: later than that the servo has stopped
+IMAGES_KEPT = 10  # 1/3 s of images; after a longer gap the servo has stopped
 
 
 @dc.dataclass(frozen=True, eq=False)
 class Deformation(Message):
-    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose of its own moment; None before the first."""
+    """The newest deflection of the tip (p_T(tip) - p_T(rest), m, in T) and the pose at its time; None before the first."""
 
     sequence: int = 0
     sample: DeflectionSample | None = None
@@ -32,7 +32,7 @@ class Deformation(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class _Work(Message):
-    """What was found last, and the images that wait for the arm's pose of their own time, oldest first."""
+    """The last result, and the images that wait for the arm's pose at their capture time, oldest first."""
 
     found: Deformation = dc.field(default_factory=Deformation)
     waiting: tuple[Image, ...] = ()
@@ -52,8 +52,8 @@ class ArucoDeformationEstimator(LeafSystem):
         - deflection
 
     `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age s.
-    A frame without a trustworthy tag is passed on as invalid with its reason, never as an old value. An arm whose poses come
-    later than the images has them wait: were only the newest image looked at, its pose would never be known.
+    A frame without a reliable tag is reported as invalid with its reason, not as an old value. Images wait for poses that
+    arrive later than they do; if only the newest image were used, its pose would never be known.
     """
 
     def __init__(self, arm: ArmModel, tool: WeldingTool, camera: FingerCamera, period_s: float = 0.008) -> None:
@@ -77,7 +77,7 @@ class ArucoDeformationEstimator(LeafSystem):
         elif not waiting:
             return
         found, history = work.found, self._history.Eval(context)
-        # The newest of which the pose is known; what is older than that one is not needed any more.
+        # The newest image with a known pose; older ones are discarded.
         for k in reversed(range(len(waiting))):
             X_BF = history.pose_at(self._arm, waiting[k].capture_time)
             if X_BF is not None:

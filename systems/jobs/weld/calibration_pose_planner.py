@@ -1,4 +1,4 @@
-"""CalibrationPosePlanner: says which of the checked poses the flange should visit next."""
+"""CalibrationPosePlanner: outputs the next of the checked calibration poses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class NextPose(Message):
 
 
 class CalibrationPosePlanner(LeafSystem):
-    """Walks through the planned poses, the most telling first, one for each scan the calibrator has digested.
+    """Steps through the planned poses, the most informative first, one for each scan that the calibrator has processed.
 
     .. pydrake_system::
 
@@ -35,8 +35,8 @@ class CalibrationPosePlanner(LeafSystem):
         output_ports:
         - next_pose
 
-    The plan is made (and refused, where the scanner cannot be reached) before anything moves: pose_planning orders it
-    greedily by the information each pose adds, so its beginning is always the best set of that size.
+    The plan is made before any motion (and raises where the scanner cannot be reached). pose_planning orders it greedily by
+    the information that each pose adds, so that each prefix is the greedy set of that size.
     """
 
     def __init__(self, plan: tuple[PlannedPose, ...], period_s: float = 0.02) -> None:
@@ -56,7 +56,7 @@ class CalibrationPosePlanner(LeafSystem):
         newest: NextPose = context.get_abstract_state(self._state).get_value()
         if status.sequence <= newest.after_sequence:
             return
-        index = status.sequence  # one pose a scan
+        index = status.sequence  # one pose per scan
         q = self._plan[index].q if index < len(self._plan) else None
         new = NextPose(status.sequence, index, f"pose{index + 1:02d}", q)
         state.get_mutable_abstract_state(self._state).set_value(new)

@@ -1,4 +1,4 @@
-"""FlangeEstimator: a scan in, the circle of the flange (or of the tool's flange-like ring) out."""
+"""FlangeEstimator: fits the circle of the flange (or of the tool's flange-like ring) in each scan."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
-# The poses are planned so that the whole feature is in sight; where it is not, something stands in between and the rim ends wrongly.
+# The poses are planned with the whole feature visible; otherwise an object occludes it and the rim's ends are wrong.
 LIVE_FIT = FlangeFitConfig(min_coverage=0.85)
 
 
 class FlangeEstimator(LeafSystem):
-    """Fits the flange in each calibration scan, near where the present belief expects it.
+    """Fits the flange in each calibration scan, near its predicted position.
 
     .. pydrake_system::
 
@@ -36,8 +36,8 @@ class FlangeEstimator(LeafSystem):
         output_ports:
         - flange_estimate
 
-    The search ball is centred where the newest X_BC (at first the tape-measure guess) and the arm's pose at the capture
-    time put the feature.
+    The search sphere is centred at the feature's position predicted from the newest X_BC (at first the nominal one) and the
+    arm's pose at the capture time.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ def estimate_flange(
     X_BC: RigidTransform,
     guess_radius_m: float,
 ) -> FlangeEstimate:
-    """Fit the feature in one scan; a scan that cannot be used comes back with its reason, never as an exception."""
+    """Fit the feature in one scan; for an unusable scan the result holds the reason, and no exception is raised."""
     base = FlangeEstimate(scan.sequence, scan.capture_time, job.scan_purpose, job.scan_label)
     if X_BF is None:
         return dc.replace(base, reason="the arm's pose at the time of the scan is not known")

@@ -1,4 +1,4 @@
-"""IterativeCalibrator: one flange estimate after the other into X_BC, until its own error is small enough."""
+"""IterativeCalibrator: estimates X_BC from the flange estimates until its expected error is small enough."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from weldcal.systems.motion.pose_recorder import PoseHistory
 
 @dc.dataclass(frozen=True)
 class CalibratorConfig:
-    """When the live calibration may stop (m), and where its error counts: the work point p_BWork (3,) in B; what Algorithm 1 takes
-    for its cost (section 4.2: work radius, m, and axes)."""
+    """The stop criterion of the live calibration (m) and the work point p_BWork (3,) in B at which the error is evaluated; the
+    cost of Algorithm 1 (section 4.2: work radius, m, and axes)."""
 
     required_error_m: float
     minimum_scans: int
@@ -43,7 +43,7 @@ class CalibratorConfig:
 
 
 class IterativeCalibrator(LeafSystem):
-    """Keeps Algorithm 1's pool of four and, beside it, the robust estimate from all scans, which is the one that is used.
+    """Computes Algorithm 1 with its pool of four, and the robust estimate from all scans, which is the result.
 
     .. pydrake_system::
 
@@ -54,8 +54,8 @@ class IterativeCalibrator(LeafSystem):
         output_ports:
         - calibration_status
 
-    It is done when the estimate's own expected error at the work point is within what is required; Algorithm 1's figure is
-    kept to be shown, because it cannot see the error it leaves (docs/calibration.md).
+    It is done when the estimate's expected error at the work point is within the required one. Algorithm 1's figure is kept
+    for display only, because it does not measure the remaining error (docs/calibration.md).
     """
 
     def __init__(
@@ -106,7 +106,7 @@ def digest(
     standard: FlangeStandard,
     config: CalibratorConfig,
 ) -> CalibrationStatus:
-    """The status after one more flange estimate; a scan that cannot be used is refused by name with its reason."""
+    """Compute the status after one more flange estimate; an unusable scan is listed as refused with its label and the reason."""
     counts = seen.purpose == "calibrate"
     status = dc.replace(status, sequence=seen.sequence, calibration_scans=status.calibration_scans + int(counts))
     if seen.fit is None or X_BR is None:
@@ -142,7 +142,7 @@ def expected_error(estimate: CalibrationEstimate, p_BWork: NDArray[np.float64]) 
 
 
 def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransform) -> VerificationResult:
-    """Position error (m) and tilt (rad) of the calibration at one scan it never saw."""
+    """Position error (m) and tilt (rad) of the calibration at one held-out scan."""
     if status.estimate is None or seen.fit is None:
         return VerificationResult(seen.label, np.inf, np.inf)
     X_BC = status.estimate.X_BC
@@ -154,7 +154,7 @@ def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransf
 def _algorithm_1(
     status: CalibrationStatus, observation: Observation, config: CalibratorConfig
 ) -> Algorithm1State | None:
-    """One step of the published algorithm, where its verification cloud was seen."""
+    """One step of the published algorithm, where its verification cloud is available."""
     if status.verification_cloud is None:
         return None
     cost = named_cost(config.cost, config.work_radius_m, config.cost_axes)

@@ -1,4 +1,4 @@
-"""The weld job: calibrate, verify, scan the workpiece, plan the seam, follow it; or its calibration alone."""
+"""The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.settings import ServoConfig
 
-# How much of a run lies behind when a phase begins, for a progress bar: calibration, planning, weld.
+# Completed share of a run at the start of a phase, for the progress bar: calibration, planning, weld.
 SHARES = {
     "start": 0.0,
     "move_home": 0.0,
@@ -52,12 +52,12 @@ SHARES = {
     "done": 0.98,
     "held": 0.98,
 }
-WHOLE_SEAM_M = 0.3  # what the progress bar takes a seam for whose length is not limited
+WHOLE_SEAM_M = 0.3  # assumed length of a seam without a length limit, for the progress bar
 
 
 @dataclass(frozen=True, eq=False)
 class WeldingPorts:
-    """Where the rest of the job finds its welding half; `logged` holds vector ports by their name in the log."""
+    """Ports of the job's welding part; `logged` holds vector ports by their name in the log."""
 
     seam: OutputPort
     report: OutputPort
@@ -69,7 +69,7 @@ class WeldingPorts:
 
 @dataclass(eq=False)
 class WeldJob(AddedJob):
-    """The systems of the job and what they were built from."""
+    """The systems of the job and the data that they were built from."""
 
     scenario: Scenario
     poses: tuple[PlannedPose, ...]
@@ -86,7 +86,7 @@ class WeldJob(AddedJob):
         return self.calibrator.status(self.calibrator.GetMyContextFromRoot(root))
 
     def planned_seam(self, root: Context) -> PlannedSeam:
-        """The seam planner's newest plan, empty in a job that does not weld."""
+        """The seam planner's newest plan; empty in a job that does not weld."""
         plan: PlannedSeam = self.welding.seam.Eval(self.welding.seam.get_system().GetMyContextFromRoot(root))
         return plan
 
@@ -112,10 +112,10 @@ class WeldJob(AddedJob):
 
 
 class Weld(Job[tuple[PlannedPose, ...]]):
-    """The job of a scenario that names no other."""
+    """The default job: that of a scenario without another job's part."""
 
     def check(self, scenario: Scenario) -> None:
-        """See Job; the scenario's own checks are this job's."""
+        """See Job; check_scenario contains this job's checks."""
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
         """See Job: every calibration and verification pose."""
@@ -178,7 +178,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
 def _add_welding(
     wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
 ) -> WeldingPorts:
-    """Seam planner, deformation estimator, servo and guard; constants stand in for them in a cell without a tool."""
+    """Add seam planner, deformation estimator, servo and guard; constant sources replace them in a cell without a tool."""
     station, scenario = wiring.station, wiring.scenario
     tool, spec = station.tool, scenario.workpiece
     if (

@@ -1,4 +1,4 @@
-"""Which of the planned poses a live calibration of a scanner beside the arm should add next, and what it would be worth."""
+"""Selects the planned pose that a live eye-to-hand calibration should add next, with its predicted benefit."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ class NextScan(Message):
     error_then_m: float
 
     def sentence(self) -> str:
-        """What to do, for a person."""
+        """The proposal as one sentence for the operator."""
         joints = ", ".join(f"{v:.0f}" for v in np.degrees(self.pose.q))
         p = 1e3 * self.pose.X_BF.translation()
         return (
-            f"joints [{joints}] deg (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would take the expected "
+            f"joints [{joints}] deg (flange at {p[0]:.0f}, {p[1]:.0f}, {p[2]:.0f} mm in the base): it would reduce the expected "
             f"error at the work point from {1e3 * self.error_now_m:.3f} to {1e3 * self.error_then_m:.3f} mm."
         )
 
 
 def next_scan(status: CalibrationStatus, poses: tuple[PlannedPose, ...], p_BWork: np.ndarray) -> NextScan | None:
-    """The pose, of those planned (within reach, in sight and clear) and not yet visited, that would shrink the expected error
-    at the work point most; None before there is an estimate, or where all were visited.
+    """The unvisited planned pose (all are reachable, visible and clear) that reduces the expected error at the work point
+    most; None before the first estimate, or where all were visited.
 
-    The gain is the planner's; the error now is the estimate's own.
+    The gain is computed by the planner; the present error is the estimate's.
     """
     left = poses[status.sequence :]
     if status.estimate is None or not left or not status.observations:

@@ -1,4 +1,4 @@
-"""SeamPlanner: a scan of the workpiece in, the planned seam in the base out, with the arm's way to its beginning."""
+"""SeamPlanner: plans the seam in the base, and the arm's approach, from a scan of the workpiece."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from weldcal.welding.servo.touch import touch_start_pose
 
 
 class SeamPlanner(LeafSystem):
-    """Plans the seam from the workpiece's scan, by its CAD or from the cloud alone, in the base by the calibrated X_BC.
+    """Plans the seam from the workpiece's scan, with its CAD or from the cloud only, and maps it to the base by X_BC.
 
     .. pydrake_system::
 
@@ -37,7 +37,7 @@ class SeamPlanner(LeafSystem):
         output_ports:
         - planned_seam
 
-    Without calibration in the job, `X_BC_known` stands in for it.
+    Without calibration in the job, `X_BC_known` is used.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SeamPlanner(LeafSystem):
     def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
         if X_BC is None:
             return PlannedSeam(
-                sequence=scan.sequence, reason="The seam cannot be taken into the base: the scanner is not calibrated."
+                sequence=scan.sequence, reason="The seam cannot be computed in the base: the scanner is not calibrated."
             )
         points_C = scan.points_C.reshape(-1, 3).astype(float)
         points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
@@ -108,7 +108,7 @@ class SeamPlanner(LeafSystem):
             q_retract,
             points_B,
             sigma_m=found.sigma_m,
-            words=found.summary,
+            summary=found.summary,
         )
 
     def _output(self, context: Context, output: Any) -> None:
@@ -120,7 +120,7 @@ class SeamOutOfReach(WeldcalError):
 
 
 def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The line on which the seated tip's centre runs, in B, cut to `length_m` of arc where given."""
+    """The path of the seated tip's centre, in B, cut to `length_m` of arc where given."""
     line = workpiece.tip_line_P(tool.tip_radius_m) - tool.seat_sink_m * workpiece.up_P
     ups = np.broadcast_to(workpiece.up_P, line.shape)
     if length_m is not None:
@@ -130,7 +130,7 @@ def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, leng
 
 
 def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The same line over a root that was planned by either method: the tip sits as high as the groove's angle lets it.
+    """The path of the seated tip's centre over a planned root; its height follows from the groove's angle.
 
     Raises:
         InputError: for a root too short for a seam.
@@ -177,7 +177,7 @@ def arm_waypoints(
 
 
 class DrawnSeamPlanner(SeamPlanner):
-    """A SeamPlanner that goes by the fixture's drawing: for parts whose shape a plate's registration does not know.
+    """A SeamPlanner that uses the fixture's drawing, for parts whose shape the plate's registration does not support.
 
     .. pydrake_system::
 
@@ -210,5 +210,5 @@ class DrawnSeamPlanner(SeamPlanner):
             q_above,
             q_retract,
             points_B,
-            words="the fixture's drawing is believed: nothing in the scan was asked where the part lies",
+            summary="the pose of the part is from the fixture's drawing; the scan was not used",
         )

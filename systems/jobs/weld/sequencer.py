@@ -1,4 +1,4 @@
-"""JobSequencer: go home, calibrate, verify, scan, plan, approach, weld, retract; or hold, and say why."""
+"""JobSequencer: the state machine of the weld job: home, calibrate, verify, scan, plan, approach, weld, retract, hold."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from weldcal.systems.motion.goals import stands_at
 
 @dc.dataclass(frozen=True)
 class JobPlan:
-    """What the job is to do, in plain numbers (mm where a person reads them in a reason)."""
+    """Parameters of the job (mm where a reason text shows them)."""
 
     calibrate: bool
     weld: bool
@@ -36,7 +36,7 @@ class JobPlan:
 
 @dc.dataclass(frozen=True, eq=False)
 class Seen(Message):
-    """Everything the sequencer looks at in one tick."""
+    """Inputs of the sequencer at one tick."""
 
     time: float
     robot: UrStatus
@@ -52,7 +52,7 @@ class Seen(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class JobState(Message):
-    """The command that stands, when its phase began, where the phase goes next and the log of all phases."""
+    """The present command, the start time of its phase, the next phase and the log of all phases."""
 
     command: JobCommand = dc.field(default_factory=JobCommand)
     since: float = 0.0
@@ -82,14 +82,14 @@ def _scan(state: JobState, seen: Seen, phase: str, purpose: str, label: str) -> 
 
 
 def hold(state: JobState, seen: Seen, reason: str) -> JobState:
-    """Process off and arm at rest, latched; nothing leaves this state but a person's reset."""
+    """Turn the process off and stop the arm, latched; only a reset by a person ends this state."""
     return _enter(
         state, seen, "held", mode="hold", process_on=False, streaming=False, held=True, finished=True, reason=reason
     )
 
 
 def _arrived(state: JobState, seen: Seen, plan: JobPlan) -> tuple[JobState, bool]:
-    """Settled at the goal for the dwell time."""
+    """Whether the arm has settled at the goal for the dwell time; holds the job on a timeout."""
     if seen.time - state.since > plan.move_timeout_s:
         return hold(state, seen, f"The arm did not come to rest at its goal within {plan.move_timeout_s:.0f} s."), False
     if seen.settled_goal != state.command.goal_id:
@@ -117,7 +117,7 @@ def _begin(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
 
 def _to_next_pose(state: JobState, seen: Seen, phase: str) -> JobState:
     if seen.next_pose.after_sequence < seen.calibration.sequence:
-        return state  # the planner has not looked at the newest status yet
+        return state  # the planner has not processed the newest status yet
     if seen.next_pose.q is None:
         return hold(
             state, seen, "The planned calibration poses are used up: plan more of them or free more of the workspace."
@@ -136,7 +136,7 @@ def _arrive_and_scan(purpose: str, phase: str) -> Callable[[JobState, Seen, JobP
 
 
 def _digested(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
-    """After each calibration scan: more poses, verification, or an honest end."""
+    """Continue after each calibration scan: more poses, verification, or hold where the required error is not reached."""
     status = seen.calibration
     if status.sequence < state.command.scan_sequence:
         if seen.time - state.since > plan.scan_timeout_s:
@@ -175,7 +175,7 @@ def _verified(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
         return hold(
             state,
             seen,
-            f"The calibration is {worst.error_m * 1e3:.2f} mm off at the unseen pose '{worst.label}' (limit {limit:.2f} mm).",
+            f"The calibration is {worst.error_m * 1e3:.2f} mm off at the held-out pose '{worst.label}' (limit {limit:.2f} mm).",
         )
     return _move(state, seen, "park", plan.q_home)
 
@@ -260,7 +260,7 @@ PHASES: dict[str, Callable[[JobState, Seen, JobPlan], JobState]] = {
 
 
 def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
-    """One tick of the job; `held` and `done` are final."""
+    """Compute the state after one tick; `held` and `done` are final."""
     if state.command.finished:
         return state
     if not seen.robot.ready:
@@ -298,7 +298,7 @@ class JobSequencer(LeafSystem):
         - scan_trigger
         - streaming
 
-    `hold` (1) is a person's wish to stop, `arm_stopped` (1) the ProcessSwitch's word that the guard stopped a weld.
+    `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is 1 after the guard stopped a weld.
     `job` carries the `JobCommand`, `job_state` the whole
     `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station.
     """

@@ -1,4 +1,4 @@
-"""The numbers of the weld job, from scenario and station: what is looked at, where from, when it ends, how the servo moves."""
+"""Computes the weld job's settings from scenario and station: feature, poses, stop criterion, servo."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
 
-SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two against refused scans
-ZERO_FRAMES = 10  # of the tag while the tip hangs free: a third of a second before it comes down
-TORCH_ABOVE_ROOT_M = 0.002  # where the wire point runs: this far above the root of the groove
+SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
+ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
+TORCH_ABOVE_ROOT_M = 0.002  # height of the wire point above the root of the groove
 
 
 def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
-    """X_FR of the feature that the scanner looks at."""
+    """X_FR of the feature that the scanner observes."""
     if scenario.calibration.feature == "flange" or station.tool is None:
         return RigidTransform()
     return station.tool.X_FR
@@ -34,7 +34,7 @@ def feature_standard(scenario: Scenario) -> FlangeStandard:
 
 
 def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
-    """The servo's numbers from scenario and tool."""
+    """The servo's settings from scenario and tool."""
     tool, welding = station.tool, scenario.welding
     if tool is None or station.cad is None:
         return ServoConfig()
@@ -58,10 +58,10 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
 
 
 def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
-    """Every calibration and verification pose, best first, checked for reach, sight and clearance before anything moves.
+    """Plan all calibration and verification poses, best first, checked for reach, visibility and clearance.
 
     Raises:
-        UnreachableScanner: no such set of poses exists for the scanner where the scenario says it stands.
+        UnreachableScanner: no such set of poses exists for the scanner at its nominal pose.
     """
     c, tool = scenario.calibration, station.tool
     scanner = scenario.scanner_config()
@@ -90,14 +90,14 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
 
 
 def work_point(scenario: Scenario) -> np.ndarray:
-    """p_BWork (3,) m: where the calibration's error counts."""
+    """p_BWork (3,) m: the point at which the calibration's error is evaluated."""
     if scenario.workpiece is not None:
         return np.array(scenario.workpiece.pose_guess.pose().translation())
     return np.array(scenario.calibration.work_point_m)
 
 
 def job_plan(scenario: Scenario) -> JobPlan:
-    """The job's numbers in SI units; slower moves may take longer."""
+    """The job's parameters; time limits are longer for slower moves."""
     c, job = scenario.calibration, scenario.job
     slower = 1.0 / job.speed_factor
     return JobPlan(
@@ -114,7 +114,7 @@ def job_plan(scenario: Scenario) -> JobPlan:
 
 
 def calibrator_config(scenario: Scenario) -> CalibratorConfig:
-    """When the calibration may stop."""
+    """The stop criterion of the calibration."""
     c = scenario.calibration
     return CalibratorConfig(
         required_error_m=c.required_error_mm * 1e-3,

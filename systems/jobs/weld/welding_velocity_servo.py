@@ -1,4 +1,4 @@
-"""WeldingVelocityServo: planned seam and felt deformation in, the tip's spatial velocity and the torch switch out."""
+"""WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip deformation."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PHASE_CODES = {phase: float(k) for k, phase in enumerate(Phase)}
 
 @dc.dataclass(frozen=True, eq=False)
 class ServoReport(Message):
-    """What the servo says of itself to the sequencer, the viewer and the log; phase is IDLE outside a weld."""
+    """The servo's state for the sequencer, the viewer and the log; phase is IDLE outside a weld."""
 
     phase: str = "IDLE"
     torch_on: bool = False
@@ -39,11 +39,11 @@ class ServoReport(Message):
     command: WeldingCommand | None = None
     state: WeldingState | None = None
     time: float = np.nan  # of the tick, on the robot's clock
-    X_BT: RigidTransform | None = None  # as measured, at that tick
+    X_BT: RigidTransform | None = None  # measured at that tick
 
 
 class WeldingVelocityServo(LeafSystem):
-    """Algorithm 2 with the mended equations, at 125 Hz, while the job's mode is `weld`.
+    """Algorithm 2 with the corrected equations, at 125 Hz, while the job's mode is `weld`.
 
     .. pydrake_system::
 
@@ -61,7 +61,7 @@ class WeldingVelocityServo(LeafSystem):
         - torch_on
 
     `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
-    (1) is the wish for the process: it needs the job's consent as well as the servo's, and passes the ProcessSwitch.
+    (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch.
     """
 
     def __init__(self, arm: ArmModel, tool: WeldingTool, config: ServoConfig) -> None:

@@ -208,12 +208,12 @@ def test_an_arm_without_power_has_no_kinematics_yet() -> None:
 @pytest.mark.parametrize(
     ("said", "words"),
     [
-        (b"", "says nothing"),
-        (package(20, b"only messages"), "says nothing"),
-        (package(16, part(5, body(nominal_info())))[:100], "says nothing"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "no UR controller"),
-        (package(16, part(5, b"too short")), "no UR controller"),
-        (package(16, struct.pack(">IB", 0, 0) * 3), "no UR controller"),
+        (b"", "sends no data"),
+        (package(20, b"only messages"), "sends no data"),
+        (package(16, part(5, body(nominal_info())))[:100], "sends no data"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "not a UR controller"),
+        (package(16, part(5, b"too short")), "not a UR controller"),
+        (package(16, struct.pack(">IB", 0, 0) * 3), "not a UR controller"),
     ],
 )
 def test_nonsense_and_silence_end_in_a_sentence_and_in_time(said: bytes, words: str) -> None:
@@ -231,5 +231,5 @@ def test_a_controller_that_drips_for_ever_is_left_in_time() -> None:
             visitor.sendall(package(20, b"again"))
             time.sleep(0.01)
 
-    with listener(drip) as port, pytest.raises(RobotUnreachable, match="says nothing"):
+    with listener(drip) as port, pytest.raises(RobotUnreachable, match="sends no data"):
         read_kinematics("127.0.0.1", 0.3, port)

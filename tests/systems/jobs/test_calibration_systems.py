@@ -137,7 +137,7 @@ def test_the_estimator_answers_the_scan_that_was_asked_for_and_leaves_the_workpi
     assert (answer.reason is not None) == answered  # the empty history knows no pose
 
 
-def test_exact_sightings_give_the_exact_camera() -> None:
+def test_exact_observations_give_the_exact_camera() -> None:
     status = digested(6)
     assert status.estimate is not None
     assert status.X_BC is not None

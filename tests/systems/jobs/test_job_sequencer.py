@@ -235,7 +235,7 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         {"calibration": status(calibration_scans=8, message="they lie in one plane")},
         "No calibration after 8 scans: they lie in one plane",
     ),
-    "off at the unseen pose": (
+    "off at the held-out pose": (
         "scan_verify",
         0.1,
         {
@@ -243,13 +243,13 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
                 verifications=(VerificationResult("pose08", 0.9e-3, 0.0), VerificationResult("pose09", 0.1e-3, 0.0))
             )
         },
-        r"0\.90 mm off at the unseen pose 'pose08' \(limit 0\.50 mm\)",
+        r"0\.90 mm off at the held-out pose 'pose08' \(limit 0\.50 mm\)",
     ),
     "no calibration to verify": (
         "scan_verify",
         0.1,
         {"calibration": status(verifications=(VerificationResult("pose08", np.inf, np.inf),) * 2)},
-        "inf mm off at the unseen pose",
+        "inf mm off at the held-out pose",
     ),
     "workpiece not found": (
         "scan_workpiece",

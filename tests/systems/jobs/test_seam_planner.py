@@ -180,7 +180,7 @@ def test_the_plate_is_found_from_anywhere_when_the_fixture_is_not_to_be_trusted(
     assert anywhere.X_BP is not None
     assert plan.X_BP is not None
     assert anywhere.X_BP.translation() == pytest.approx(plan.X_BP.translation(), abs=0.2e-3)
-    assert "confidence" in anywhere.words
+    assert "confidence" in anywhere.summary
 
 
 def test_a_scan_too_coarse_for_the_groove_is_a_reason_of_the_cloud_method(

@@ -19,7 +19,7 @@ X_CB = RigidTransform(RollPitchYaw(3.1, 0.05, -1.5), [0.0, 0.6, 0.9])
 WORK = np.array([0.65, 0.0, 0.05])
 
 
-def _sightings(n: int, center_sigma_m: float = 1e-5) -> tuple[Observation, ...]:
+def _observations(n: int, center_sigma_m: float = 1e-5) -> tuple[Observation, ...]:
     arm, rng = load_arm("ur10e"), np.random.default_rng(0)
     out = []
     for k in range(n):
@@ -41,7 +41,7 @@ def _bound(observations: tuple[Observation, ...], repeatability_m: float) -> tup
 
 
 def test_the_bound_falls_with_the_number_of_scans_and_with_the_arms_repeatability() -> None:
-    eight = _sightings(8)
+    eight = _observations(8)
     at_work, turn = _bound(eight, 5e-5)
     # eight independent offsets of 0.05 mm: their mean is known to 0.018 mm, a point beside them a little worse
     assert 5e-5 / np.sqrt(8) < at_work < 4.0 * 5e-5 / np.sqrt(8)
@@ -50,12 +50,12 @@ def test_the_bound_falls_with_the_number_of_scans_and_with_the_arms_repeatabilit
     assert _bound(twice, 5e-5)[0] == pytest.approx(at_work / np.sqrt(2.0), rel=1e-6)
     # the scanner's own noise is small beside the arm's here: what is left scales with the arm
     assert _bound(eight, 1e-4)[0] == pytest.approx(2.0 * at_work, rel=0.1)
-    assert _bound(_sightings(8, 1e-4), 5e-5)[0] > 1.3 * at_work
+    assert _bound(_observations(8, 1e-4), 5e-5)[0] > 1.3 * at_work
     assert np.degrees(turn) < 0.02
 
 
 def test_calibrations_with_noise_drawn_anew_err_a_little_more_than_the_bound_and_never_less() -> None:
-    eight = _sightings(8, 2e-5)
+    eight = _observations(8, 2e-5)
     found = redraw(eight, _station(eight, 5e-5), 60, seed=1)
     at_work, turn = _bound(eight, 5e-5)
     # the rms of 60 draws of three numbers each is known to 6 %; estimated weights cost a part of the information

@@ -1,4 +1,4 @@
-"""weldcal profiler live: run the profiler's job, write its measurements as files, its calibrations and a report; over seeds, a table."""
+"""Runs `weldcal profiler live`: the profiler job, its measurement files, calibrations and report; for several seeds, a table."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 
 
 def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progress) -> ProfilerLive:
-    """Build, run, measure, write.
+    """Build and run the cell, evaluate the run and write its results.
 
     Raises:
-        InputError, RobotRefused: see run_job; nothing has been written or moved. A run that was held is a result too.
+        InputError, RobotRefused: see run_job; nothing has been written or moved. A held run also returns a result.
     """
     finished = run_job(scenario, options, progress, "profiler_job")
     progress("measure and write", 0.97)
@@ -69,7 +69,7 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
 
 
 def _npz(arm: ArmModel, taken: Sequence[Taken], more: Mapping[str, Any]) -> bytes:
-    """Flange poses, joints and raw profiles."""
+    """The bytes of an npz file with flange poses, joints and raw profiles."""
     T = np.array([forward_kinematics(arm, t.q).GetAsMatrix4() for t in taken])
     out = io.BytesIO()
     np.savez_compressed(
@@ -93,7 +93,7 @@ def _touched(arm: ArmModel, touches: Sequence[Array], tip: Sequence[float], radi
 
 
 def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progress: Progress) -> dict[str, object]:
-    """The same over seeds, each in a folder of its own; seeds.csv grows row by row, report.html shows all."""
+    """Run several seeds, each in its own folder; seeds.csv is updated after each run, report.html shows all runs."""
     rows: list[dict[str, object]] = []
     outcomes: list[LiveOutcome] = []
     for k in range(runs):
@@ -126,7 +126,7 @@ def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progr
 
 
 def _flat(summary: Mapping[str, object]) -> dict[str, object]:
-    """One row: nested figures by their full name, lists left out."""
+    """One row: nested values under their full name, without lists."""
     row: dict[str, object] = {}
     for name, value in summary.items():
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""A visit to the tablet in a scenario: run, files that weldcal tablet calibrate reads, the calibration, held against the truth."""
+"""Runs the tablet job of a scenario: files for `weldcal tablet calibrate`, the calibration, and its errors against the truth."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import visit_report
 
 Array = NDArray[np.float64]
-MOST_LEAN_RAD = 0.15  # of the pen at them
+MOST_LEAN_RAD = 0.15  # tilt of the pen at the unseen points
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
 
 
 @dataclass(frozen=True, eq=False)
 class TabletDemo:
-    """What a visit came to; `found` are the figures of its JSON object."""
+    """The result of a tablet run; `found` are values of its JSON object."""
 
     options: RunOptions
     run: Run[AddedVisit]
@@ -40,7 +40,7 @@ class TabletDemo:
 
     @property
     def folder(self) -> Path:
-        """Where everything was written."""
+        """The result folder."""
         return self.options.out
 
     def summary(self) -> dict[str, object]:
@@ -58,11 +58,11 @@ class TabletDemo:
 
 
 def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress) -> TabletDemo:
-    """Run the visit, write its files, the calibration from them and a report.
+    """Run the job, write its files, the calibration from them and a report.
 
     Raises:
-        InputError, RobotRefused: the scenario or the options cannot be done; nothing has been written or moved.
-        LandmarksNotFound: the picture does not show the page. A visit that was held is a result too.
+        InputError, RobotRefused: the scenario or the options cannot be run; nothing has been written or moved.
+        LandmarksNotFound: the picture does not show the page. A held run also returns a result.
     """
     finished = run_job(scenario, options, progress, "tablet")
     run = finished.run
@@ -81,7 +81,7 @@ def run_tablet_demo(scenario: Scenario, options: RunOptions, progress: Progress)
 
 
 def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCalibration, dict[str, object]]:
-    """Write the visit's files, calibrate from them as `weldcal tablet calibrate` does, and hold it against the truth."""
+    """Write the run's files, calibrate from them as `weldcal tablet calibrate` does, and compare with the ground truth."""
     folder, tablet = options.out, run.cell.job.tablet
     write_visit(run, folder)
     done = calibrate_tablet(
@@ -95,7 +95,7 @@ def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCa
         folder,
     )
     if not isinstance(done, TabletCalibration) or done.wrist is None:
-        raise RuntimeError("the files of a visit hold full poses")
+        raise RuntimeError("the files of a tablet run must contain full poses")
     uv = find_landmarks(run.cell.job.picture(run.root).grey, tablet.columns, tablet.rows)
     told, summary = ("leave_one_out_mm", "parameters", "X_FC", "p_FP_mm", "unobservable", "warnings"), done.summary()
     compared = {**compare(run, done.wrist, options.seed), **depth_error(run, uv)}
@@ -103,11 +103,11 @@ def calibrate_visit(run: Run[AddedVisit], options: RunOptions) -> tuple[TabletCa
 
 
 def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]:
-    """The fit against the truth that only the simulation knows: camera, pen, and touches of points never seen before.
+    """Errors of the fit against the ground truth: camera, pen, and touches of points not used in the fit.
 
-    An unseen touch: the camera sees a point of the tablet from where the picture was taken, the hand is sent to where the
-    fit puts the pen on it, in any turn and leaning no more than the visit's touches did; what counts is where the true pen then
-    is, in the tablet's plane.
+    An unseen touch: the camera observes a point of the tablet from the pose of the picture, and the flange moves to where the
+    fit predicts that the pen touches it, with any rotation and no more tilt than the run's touches. The error is the true
+    pen's distance from the point, in the tablet's plane.
     """
     job = run.cell.job
     lean = min(MOST_LEAN_RAD, float(np.deg2rad(job.tablet.tilt_deg)))
@@ -134,7 +134,7 @@ def compare(run: Run[AddedVisit], fit: WristFit, seed: int) -> dict[str, object]
 
 
 def depth_error(run: Run[AddedVisit], uv: Array) -> dict[str, object]:
-    """Depth of the landmarks off the truth, scale apart: by the tablet's plane, and by each landmark's own pixel (rms)."""
+    """Depth errors (rms) of the landmarks, apart from the scale: from the tablet's plane, and from each landmark's pixel."""
     job = run.cell.job
     K, truth, depth_m = job.camera.camera_matrix(), job.truth, job.picture(run.root).depth_m
     X_CT = (forward_kinematics(run.cell.station.arm, job.state(run.root).q_look) @ truth.X_FC).inverse() @ truth.X_BT

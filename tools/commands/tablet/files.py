@@ -1,4 +1,4 @@
-"""A visit to the tablet as the files of a real one: touches.csv as the page writes it, poses.csv, camera.yaml and picture.png."""
+"""Writes a simulated tablet run in the files of a real one: touches.csv, poses.csv, camera.yaml and picture.png."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from weldcal.tools.report.render import write_atomic
 
 
 def write_visit(run: Run[AddedVisit], folder: Path) -> None:
-    """Write the four files, each whole or not at all."""
+    """Write the four files, each atomically."""
     job, arm = run.cell.job, run.cell.station.arm
     tablet, state = job.tablet, job.state(run.root)
     shown = 1e3 * tablet.px_per_mm * tablet.landmarks_m()

@@ -92,10 +92,12 @@ def judge(world: World, config: HandEyeConfig | None = None) -> Verdict:
     if not whole:
         return Verdict("NAN", result.method, float("nan"))
     nees = result.normalised_error("X", as_transform(world.X)) / result.region(_SURE)
-    doubts = [w for w in result.warnings if "left out" not in w]
+    other_warnings = [w for w in result.warnings if "left out" not in w]
     if nees > _SLACK:
-        return Verdict("warning" if doubts else "WRONG", "; ".join(result.warnings), nees)
-    return Verdict("open" if result.unobservable else "warning" if doubts else "answer", "; ".join(doubts), nees)
+        return Verdict("warning" if other_warnings else "WRONG", "; ".join(result.warnings), nees)
+    return Verdict(
+        "open" if result.unobservable else "warning" if other_warnings else "answer", "; ".join(other_warnings), nees
+    )
 
 
 def fuzz(n: int, seed: int = 0, progress: Progress = no_progress) -> dict[str, Counter[str]]:

@@ -70,7 +70,7 @@ def _row(name: str, reports: list[MountingReport], failed: list[str]) -> dict[st
     if not reports:
         return {"scenario": name, "runs": 0, "failed": failed}
     work = np.array([r.work_error_mm() or np.nan for r in reports])
-    held_out = np.array([1e3 * k.error_m for r in reports for k in r.status.kept_aside])
+    held_out = np.array([1e3 * k.error_m for r in reports for k in r.status.held_out])
     errors = [e for r in reports for e in r.truth_errors().values()]
     return {
         "scenario": name,

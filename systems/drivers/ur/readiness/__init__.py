@@ -1,1 +1,1 @@
-"""What a UR controller must show before the first motion, and what a person does about it."""
+"""Checks of a UR controller before the first motion, with the operator action for each failure."""

@@ -1,4 +1,4 @@
-"""A robot's factory kinematics, read from its primary port, and the check that it is what the controller computes with."""
+"""Reads a robot's factory kinematics from its primary port and checks it against the controller's flange pose."""
 
 from __future__ import annotations
 
@@ -34,8 +34,9 @@ _EXACT = 1e-9
 class KinematicsInfo:
     """Denavit-Hartenberg numbers (6,) rad and m: link i is RotZ(q_i + theta_i) Tz(d_i) Tx(a_i) RotX(alpha_i).
 
-    calibrated says that they are one robot's own; checksum names them. Nearly parallel axes make d_2 and d_3 hundreds
-    of metres that cancel: multiply the plain chain, or use `calibrated_arm`, whose link frames stay where the links are.
+    `calibrated`: the numbers are a factory calibration of one robot; `checksum` identifies them. Nearly parallel axes make d_2
+    and d_3 hundreds of metres that cancel. Multiply the plain chain, or use `calibrated_arm`, whose link frames lie in the
+    links.
     """
 
     theta: Array
@@ -51,7 +52,7 @@ def read_kinematics(host: str, timeout_s: float = 2.0, port: int = PRIMARY_PORT)
 
     Raises:
         RobotUnreachable: nothing answers in time, or what answers is not the primary interface.
-        RobotRefused: the controller does not know its arm yet, because the arm has no power.
+        RobotRefused: the controller does not report its arm yet, because the arm has no power.
     """
     with Line(host, port, "Primary Client Interface", timeout_s) as line:
         until = line.deadline()
@@ -67,7 +68,7 @@ def read_kinematics(host: str, timeout_s: float = 2.0, port: int = PRIMARY_PORT)
 
 
 def _part(package: bytes, wanted: int, line: Line) -> bytes | None:
-    """The body of one sub-package of a robot state; None where this state comes without it."""
+    """The body of one sub-package of a robot state; None where the state does not contain it."""
     at = 0
     while at + _PART.size <= len(package):
         size, kind = _PART.unpack_from(package, at)
@@ -80,14 +81,14 @@ def _part(package: bytes, wanted: int, line: Line) -> bytes | None:
 
 
 def _parse(body: bytes) -> KinematicsInfo:
-    # The status word at the end is not published; what is calibrated is told by the numbers themselves.
+    # The status word at the end is not documented; the numbers themselves show whether the arm is calibrated.
     numbers = _BODY.unpack_from(body)
     theta, a, d, alpha = (np.array(numbers[i : i + 6]) for i in range(6, 30, 6))
     for values in (theta, a, d, alpha):
         values.setflags(write=False)
     if not np.isfinite([theta, a, d, alpha]).all() or not (np.any(a) and np.any(d)):
         raise RobotRefused(
-            "The controller does not tell the arm's kinematics yet: switch the arm on (Initialize at the lower left of "
+            "The controller does not report the arm's kinematics yet: switch the arm on (Initialize at the lower left of "
             "the pendant, ON) and try again."
         )
     square = alpha / (np.pi / 2.0)
@@ -111,7 +112,7 @@ def calibrated_arm(nominal: ArmModel, info: KinematicsInfo) -> ArmModel:
         )
     stack = np.tile(np.eye(4), (6, 1, 1))
     for i in range(6):
-        # Tx(a) RotX(alpha) of the link before, then Tz(d) RotZ(theta) of this one, which commutes with the joint angle
+        # Tx(a) RotX(alpha) of the previous link, then Tz(d) RotZ(theta) of this one, which commutes with the joint angle
         a, alpha = (info.a[i - 1], info.alpha[i - 1]) if i else (0.0, 0.0)
         before = RigidTransform(RotationMatrix.MakeXRotation(alpha), [a, 0.0, 0.0])
         turn = RigidTransform(RotationMatrix.MakeZRotation(info.theta[i]), [0.0, 0.0, info.d[i]])
@@ -121,7 +122,7 @@ def calibrated_arm(nominal: ArmModel, info: KinematicsInfo) -> ArmModel:
 
 
 def cross_check(arm: ArmModel, q: ArrayLike, tcp_pose: ArrayLike, tcp_offset: ArrayLike) -> tuple[float, float]:
-    """How far our flange pose at q (6,) rad is from the controller's own: (m, rad).
+    """Distance of the flange pose computed here at q (6,) rad from the controller's: (m, rad).
 
     Args:
         arm: the arm in use.

@@ -1,4 +1,4 @@
-"""What to press: one sentence for each thing that keeps a robot from starting, in the words of PolyScope 5's menus."""
+"""Operator actions, one sentence for each condition that prevents a start, with the menu names of PolyScope 5."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SAFETY_MODES = {
 RUNTIME_STATES = {0: "STOPPING", 1: "STOPPED", 2: "PLAYING", 3: "PAUSING", 4: "PAUSED", 5: "RESUMING"}
 
 VERSION = "The controller's software is not supported: install PolyScope 5.12 or newer, or PolyScope X 10.10 or newer."
-DASHBOARD = "The dashboard gives an answer that no PolyScope 5 gives: restart the control box."
+DASHBOARD = "The dashboard's answer does not follow the PolyScope 5 protocol: restart the control box."
 LOCAL = (
     "The robot is in local control: tap the Local icon at the upper right of the pendant and choose Remote Control "
     "(where there is none, enable it first under Settings > System > Remote Control)."
@@ -58,10 +58,10 @@ _ON_START = f"{_INITIALIZE}, then ON, then START"
 
 
 def power(robot_mode: int) -> str:
-    """What to do where the arm is not RUNNING."""
+    """The operator action where the arm is not RUNNING."""
     match robot_mode:
         case 1:
-            return "The safety configuration waits for you: confirm it in the pop-up on the pendant."
+            return "The safety configuration is not confirmed: confirm it in the pop-up on the pendant."
         case 4 | 5:
             return f"The brakes are on: {_INITIALIZE}, then START."
         case 6:
@@ -74,7 +74,7 @@ def power(robot_mode: int) -> str:
 
 
 def safety(safety_mode: int) -> str:
-    """What to do where the safety system has stopped the arm."""
+    """The operator action where the safety system has stopped the arm."""
     match safety_mode:
         case 3:
             return (
@@ -98,20 +98,20 @@ def safety(safety_mode: int) -> str:
                 f"release it, and {_ON_START}."
             )
     return (
-        f"The safety system reports {SAFETY_MODES.get(safety_mode, safety_mode)}: read the Log tab of the pendant, mend "
-        "what it names, and press Restart Safety in the pop-up."
+        f"The safety system reports {SAFETY_MODES.get(safety_mode, safety_mode)}: read the Log tab of the pendant, correct "
+        "the error that it shows, and press Restart Safety in the pop-up."
     )
 
 
 def limits(joint: str) -> str:
-    """What to do where a joint is too near its limit."""
+    """The operator action where a joint is too near its limit."""
     return f"The {joint} joint is less than 5 degrees from its limit: turn it back with the Move tab of the pendant."
 
 
 def program(state: str, name: str) -> str:
-    """What to do where a program that is not ours runs or waits."""
+    """The operator action where another program runs or is paused."""
     which = f"the program {name}" if name and not name.startswith("<") else "a program"
     return (
-        f"The robot is busy with {which} ({state}): press Stop at the bottom of the pendant's screen, for nothing is "
-        "stopped from here that somebody else may need."
+        f"The robot is busy with {which} ({state}): press Stop at the bottom of the pendant's screen; weldcal "
+        "does not stop other programs."
     )

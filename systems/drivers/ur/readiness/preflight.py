@@ -1,7 +1,7 @@
-"""Is this robot ready? Every check before the first motion, in the order in which a person at the pendant mends them.
+"""Checks before the first motion whether a robot is ready, in the order in which an operator corrects the failures.
 
-Nothing moves, nothing is written, nothing is uploaded: outputs are read, and input registers are asked for and given
-back. The remedies use the words of PolyScope 5's menus.
+Nothing moves, nothing is written, nothing is uploaded: outputs are read, and input registers are claimed and released.
+The operator actions use the menu names of PolyScope 5.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.readiness import operator_actions as remedies
+from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KINEMATICS_TOLERANCE_M,
     KINEMATICS_TOLERANCE_RAD,
@@ -67,7 +67,7 @@ CHECKS = (
     "remote control",
 )
 
-# Without power the arm's encoders and its kinematics say nothing; without a dashboard nobody knows about remote control.
+# Without power there are no joint positions and no kinematics; without a dashboard remote control cannot be checked.
 WAITS_FOR = {
     "standstill": ("power",),
     "joint limits": ("power",),
@@ -79,23 +79,23 @@ WAITS_FOR = {
 
 @dataclass(frozen=True)
 class Check:
-    """One thing looked at: what was found, and what to press where it is not right.
+    """One check: what was found, and the operator action where it failed.
 
-    checked is False where an earlier problem kept it from being made; then ok is False too and there is no remedy.
+    `checked` is False where an earlier failure prevented the check; then `ok` is False and `operator_action` is empty.
     """
 
     name: str
     ok: bool
     found: str
-    remedy: str = ""
+    operator_action: str = ""
     checked: bool = True
 
 
 @dataclass(frozen=True, eq=False)
 class Preflight:
-    """All checks, and what was read on the way (None where it was not): arm_q (6,) rad, tcp_pose and tcp_offset (6,) as
-    x, y, z (m) and a rotation vector (rad), the controller's version, the robot's own kinematics and the arm with them,
-    how far our flange pose is from the controller's, and which register range the driver is to use.
+    """All checks, and the values read for them (None where not read): arm_q (6,) rad, tcp_pose and tcp_offset (6,) as
+    x, y, z (m) and a rotation vector (rad), the controller's version, the robot's kinematics and the arm with it,
+    the distance of the computed flange pose from the controller's, and the register range for the driver.
     """
 
     host: str
@@ -117,24 +117,24 @@ class Preflight:
 
     @property
     def first_problem(self) -> Check | None:
-        """The check to mend first."""
+        """The first check that failed."""
         return next((check for check in self.checks if check.checked and not check.ok), None)
 
 
 def preflight(
     host: str, *, upper_registers: bool | None = None, timeout_s: float = 2.0, nominal: ArmModel | None = None
 ) -> Preflight:
-    """Looks at the robot at `host` without touching it.
+    """Check the robot at `host` without changing anything on it.
 
     Args:
         host: name or address of the controller.
-        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses leave alone; None: where
-            the client can.
-        timeout_s: each question to the controller takes at most this long.
-        nominal: the arm that is expected there; a UR10e where None.
+        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses do not use; None: where
+            the client supports them.
+        timeout_s: longest time of each request to the controller.
+        nominal: the expected arm; a UR10e where None.
 
     Raises:
-        InputError: the host name is empty. Everything else is a check that is not ok.
+        InputError: the host name is empty. All other problems are failed checks.
     """
     look = _Look(host, timeout_s, nominal or load_arm("ur10e"))
     look.run(upper_registers)
@@ -142,19 +142,19 @@ def preflight(
 
 
 def require_ready(report: Preflight) -> None:
-    """Refuses a robot that is not ready.
+    """Raise for a robot that is not ready.
 
     Raises:
-        RobotUnreachable: nothing answers there.
-        RobotRefused: the first check that is not ok; the text is its remedy.
+        RobotUnreachable: nothing answers at the address.
+        RobotRefused: a check failed; the message is the operator action of the first one.
     """
     problem = report.first_problem
     if problem is not None:
-        raise (RobotUnreachable if problem.name == "answer" else RobotRefused)(problem.remedy)
+        raise (RobotUnreachable if problem.name == "answer" else RobotRefused)(problem.operator_action)
 
 
 class _Look:
-    """The checks as they are made, one method each; each leaves its finding in `_done`."""
+    """Performs the checks, one method each; each stores its result in `_done`."""
 
     def __init__(self, host: str, timeout_s: float, nominal: ArmModel) -> None:
         self._host, self._timeout_s, self._nominal = host, timeout_s, nominal
@@ -168,7 +168,7 @@ class _Look:
         self._upper: bool | None = None
 
     def report(self) -> Preflight:
-        """Every check in its place, those not made included."""
+        """All checks in their order, including those not made."""
         checks = tuple(self._done.get(name) or self._waiting(name) for name in CHECKS)
         error_m, error_rad = self._error or (None, None)
         return Preflight(
@@ -186,18 +186,18 @@ class _Look:
         )
 
     def _waiting(self, name: str) -> Check:
-        """A check that could not be made, and which one has to be right first."""
+        """A check that could not be made, with the check that must pass first."""
         blockers = ("answer", "version", *WAITS_FOR.get(name, ()))
         first = next(blocker for blocker in blockers if blocker in self._done and not self._done[blocker].ok)
         return Check(name, False, f"needs {first}", checked=False)
 
     def run(self, upper: bool | None) -> None:
-        """All checks that can be made."""
+        """Make all checks that can be made."""
         self._upper = upper
         try:
             claims = self._ask_rtde()
         except RobotUnreachable as problem:
-            # whatever broke down on the way, the robot does not answer as it should
+            # any failure here means that the robot does not answer as specified
             self._done.clear()
             self._bad("answer", f"none on port {RTDE_PORT}", str(problem))
             return
@@ -221,7 +221,7 @@ class _Look:
         return UPPER_OFFSET if self._upper else 0
 
     def _ask_rtde(self) -> dict[str, str]:
-        """Reads what all checks look at, and what became of asking for the driver's registers; gives them back at once."""
+        """Read the values for all checks, and the result of claiming the driver's registers; releases them at once."""
         with RtdeProbe(self._host, self._timeout_s) as rtde:
             self._version = rtde.version
             if not self._check_version(rtde.version):
@@ -231,17 +231,17 @@ class _Look:
             claims = rtde.claim(_registers(self._offset))
             self._seen = rtde.read((*OUTPUTS, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
-            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", remedies.VERSION)
+            self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
         return claims
 
     def _ok(self, name: str, found: str) -> None:
         self._done[name] = Check(name, True, found)
 
-    def _bad(self, name: str, found: str, remedy: str) -> None:
-        self._done[name] = Check(name, False, found, remedy)
+    def _bad(self, name: str, found: str, action: str) -> None:
+        self._done[name] = Check(name, False, found, action)
 
-    def _state(self, name: str, ok: bool, found: str, remedy: str) -> None:
-        self._done[name] = Check(name, ok, found, "" if ok else remedy)
+    def _state(self, name: str, ok: bool, found: str, action: str) -> None:
+        self._done[name] = Check(name, ok, found, "" if ok else action)
 
     def _number(self, name: str) -> float:
         return float(cast(float, self._seen[name]))
@@ -258,23 +258,23 @@ class _Look:
 
     def _check_version(self, version: tuple[int, ...]) -> bool:
         good = is_supported(version)
-        self._state("version", good, self._version_text, remedies.VERSION)
+        self._state("version", good, self._version_text, actions.VERSION)
         return good
 
     def _check_safety(self) -> None:
         mode = int(self._number("safety_mode"))
-        found = remedies.SAFETY_MODES.get(mode, f"mode {mode}")
+        found = actions.SAFETY_MODES.get(mode, f"mode {mode}")
         if mode == REDUCED:
             found += " (the robot itself limits speed and force)"
-        self._state("safety", mode in (NORMAL, REDUCED), found, remedies.safety(mode))
+        self._state("safety", mode in (NORMAL, REDUCED), found, actions.safety(mode))
 
     def _check_power(self) -> None:
         mode = int(self._number("robot_mode"))
-        self._state("power", mode == RUNNING, remedies.ROBOT_MODES.get(mode, f"mode {mode}"), remedies.power(mode))
+        self._state("power", mode == RUNNING, actions.ROBOT_MODES.get(mode, f"mode {mode}"), actions.power(mode))
 
     def _check_program(self) -> None:
         state = int(self._number("runtime_state"))
-        found = remedies.RUNTIME_STATES.get(state, f"state {state}")
+        found = actions.RUNTIME_STATES.get(state, f"state {state}")
         name = ""
         if not self._is_x():
             try:
@@ -286,16 +286,16 @@ class _Look:
             if told in ("PLAYING", "PAUSED", "STOPPED"):
                 found = told if state == STOPPED else found
             elif told != LOCAL:
-                self._bad("program", f"the dashboard says {told} {name}".strip(), remedies.DASHBOARD)
+                self._bad("program", f"the dashboard says {told} {name}".strip(), actions.DASHBOARD)
                 return
         ready = found == "STOPPED"
         label = f"{found} {name}".strip() if not ready else "none runs"
-        self._state("program", ready, label, remedies.program(found, name))
+        self._state("program", ready, label, actions.program(found, name))
 
     def _check_standstill(self) -> None:
         speed = float(np.abs(self._vector("actual_qd")).max())
         found = "at rest" if speed <= REST_RAD_S else f"a joint turns at {np.rad2deg(speed):.1f} deg/s"
-        self._state("standstill", speed <= REST_RAD_S, found, remedies.STANDSTILL)
+        self._state("standstill", speed <= REST_RAD_S, found, actions.STANDSTILL)
 
     def _check_limits(self) -> None:
         q, arm = self._vector("actual_q"), self._nominal
@@ -304,30 +304,30 @@ class _Look:
         joint = arm.joint_names[worst].removesuffix("_joint").replace("_", " ")
         degrees = np.rad2deg(room[worst])
         found = f"{degrees:.0f} deg of room ({joint})" if degrees >= 0.0 else f"{joint} {-degrees:.0f} deg beyond"
-        self._state("joint limits", bool(room[worst] >= LIMIT_MARGIN_RAD), found, remedies.limits(joint))
+        self._state("joint limits", bool(room[worst] >= LIMIT_MARGIN_RAD), found, actions.limits(joint))
 
     def _check_tcp(self) -> None:
         offset = self._vector("tcp_offset")
         zero = bool(np.abs(offset).max() <= TCP_ZERO)
         found = "zero" if zero else f"{_triple(1e3 * offset[:3])} mm, {_triple(np.rad2deg(offset[3:]))} deg"
-        self._state("TCP", zero, found, remedies.TCP)
+        self._state("TCP", zero, found, actions.TCP)
 
     def _check_speed(self) -> None:
         slider, scaling = self._number("target_speed_fraction"), self._number("speed_scaling")
-        # what the trajectory limiter says while no program runs is not published: it is shown, and judged once we move
+        # the trajectory limiter's value while no program runs is not documented: it is shown here and checked during motion
         found = f"{100 * slider:.0f} %" + (f" (scaling {100 * scaling:.0f} %)" if scaling < FULL_SPEED else "")
-        self._state("speed slider", slider >= FULL_SPEED, found, remedies.SLIDER)
+        self._state("speed slider", slider >= FULL_SPEED, found, actions.SLIDER)
 
     def _check_registers(self, claims: Mapping[str, str], command: Value | None) -> None:
-        for answer, word, remedy in (
-            (IN_USE, "in use", remedies.REGISTERS),
-            (NOT_FOUND, "unknown", remedies.NO_REGISTERS),
+        for answer, word, action in (
+            (IN_USE, "in use", actions.REGISTERS),
+            (NOT_FOUND, "unknown", actions.NO_REGISTERS),
         ):
             if names := [name for name, kind in claims.items() if kind == answer]:
-                self._bad("registers", f"{_ranges(names)} {word}", remedy)
+                self._bad("registers", f"{_ranges(names)} {word}", action)
                 return
-        # A command register that still holds an old command is no reason to refuse: nobody can clear it at the pendant,
-        # the driver does, and the guard script obeys nothing until it has read zero there.
+        # An old command in the command register does not fail the check: it cannot be cleared at the pendant, the
+        # driver clears it, and the guard script ignores all commands until it has read zero there.
         stale = f"; command {command} is left over, the driver clears it" if command else ""
         self._ok("registers", f"{_ranges(list(claims))} free{stale}")
 
@@ -348,13 +348,13 @@ class _Look:
         error_m, error_rad = self._error = cross_check(self._arm, self._vector("actual_q"), pose, offset)
         agrees = error_m <= KINEMATICS_TOLERANCE_M and error_rad <= KINEMATICS_TOLERANCE_RAD
         found = f"{1e3 * error_m:.3f} mm, {np.rad2deg(error_rad):.4f} deg from the controller's"
-        self._state("flange pose", agrees, found, remedies.POSE)
+        self._state("flange pose", agrees, found, actions.POSE)
 
     def _check_remote(self) -> None:
         if self._is_x():
-            # PolyScope X has no dashboard to ask; in local control it ignores scripts, and the driver refuses a guard
-            # script that does not come up
-            self._ok("remote control", "cannot be asked on PolyScope X; seen when the guard script starts")
+            # PolyScope X has no dashboard; in local control it ignores scripts, and the driver refuses a guard script
+            # that does not start
+            self._ok("remote control", "not readable on PolyScope X; checked when the guard script starts")
             return
         if not self._dashboard:
             return
@@ -364,12 +364,12 @@ class _Look:
             self._bad("remote control", "the dashboard does not answer", str(problem))
             return
         if told not in ("true", "false", LOCAL):
-            self._bad("remote control", f"the dashboard says {told}", remedies.DASHBOARD)
+            self._bad("remote control", f"the dashboard says {told}", actions.DASHBOARD)
             return
-        self._state("remote control", told == "true", "on" if told == "true" else "local control", remedies.LOCAL)
+        self._state("remote control", told == "true", "on" if told == "true" else "local control", actions.LOCAL)
 
     def _ask(self, command: str) -> str:
-        """The dashboard's answer, or LOCAL where it refuses because the robot is in local control."""
+        """The dashboard's answer; LOCAL where it refuses because the robot is in local control."""
         answer = ask(self._host, command, self._timeout_s)
         return LOCAL if "remote control mode" in answer.lower() else answer
 
@@ -383,7 +383,7 @@ def _registers(offset: int) -> list[str]:
 
 
 def _ranges(names: list[str]) -> str:
-    """Registers as a person writes them: int 24-31, double 24-41."""
+    """Register names as ranges, such as: int 24-31, double 24-41."""
     parts = []
     for kind in ("int", "double"):
         numbers = sorted(int(name.rpartition("_")[2]) for name in names if name.startswith(f"input_{kind}_"))

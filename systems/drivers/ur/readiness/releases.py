@@ -1,4 +1,4 @@
-"""Which controller software is supported, what ur_rtde 1.6 can do with it, and whether ur_rtde is installed."""
+"""Supported controller software, the limits of ur_rtde 1.6 with it, and the check that ur_rtde is installed."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ OLDEST_5, OLDEST_X = (5, 12), (10, 10)
 
 
 def is_supported(version: tuple[int, ...]) -> bool:
-    """PolyScope 5.12 or newer, PolyScope X 10.10 or newer: to an older X ur_rtde uploads nothing (seen on the wire)."""
+    """Whether it is PolyScope 5.12 or newer, or PolyScope X 10.10 or newer; ur_rtde uploads nothing to an older X (observed on
+    the wire)."""
     return OLDEST_X <= version[:2] < (11, 0) or OLDEST_5 <= version[:2] < (6, 0)
 
 
 def upper_range_works(version: tuple[int, ...]) -> bool:
-    """Whether ur_rtde 1.6 can be told to use the upper registers of this controller.
+    """Whether ur_rtde 1.6 can use the upper registers of this controller.
 
-    From PolyScope 5.23 and 10.9 on it subscribes to output_int_register_0 and then looks for the answer of a command in
-    register 24, which never comes (seen on the wire).
+    From PolyScope 5.23 and 10.9 on it subscribes to output_int_register_0 but expects the answer of a command in register
+    24, which never arrives (observed on the wire).
     """
     return version[:2] < ((10, 9) if version[0] >= POLYSCOPE_X else (5, 23))
 
 
 def require_ur_rtde() -> None:
-    """Refuses a job on a robot where ur_rtde is not installed; everything else works without it.
+    """Check that ur_rtde is installed, which only jobs on a robot need.
 
     Raises:
-        RobotRefused: one sentence that says what to install.
+        RobotRefused: it is not installed; the message says what to install.
     """
     if importlib.util.find_spec("rtde_control") is None:
         raise RobotRefused(
