@@ -19,6 +19,7 @@ LIBRARIES = {
     "libEGL.so.1": "libegl1",
     "libgomp.so.1": "libgomp1",
     "libusb-1.0.so.0": "libusb-1.0-0",
+    "libidn2.so.0": "libidn2-0",
 }
 
 # Stands in for a Python: logs how it is called; `-m venv` copies it; pip fails while a file `no-network` is there, and the
