@@ -25,10 +25,7 @@ class WallClock:
     """
 
     def __init__(
-        self,
-        pace: float,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        self, pace: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
     ) -> None:
         self._pace, self._clock, self._sleep = pace, clock, sleep
         self._anchor: tuple[float, float] | None = None  # wall clock, Diagram

@@ -244,8 +244,7 @@ def live(
 
 @command("benchmark flange-ingredients")
 def ingredients(
-    call: Call,
-    dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least twelve scans.")],
+    call: Call, dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least twelve scans.")]
 ) -> Outcome:
     """Measure what normals, hole circle, gradient and bends each contribute on recorded scans, and the lower limit."""
     import numpy as np

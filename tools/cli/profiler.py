@@ -51,8 +51,7 @@ def edge(
     ] = "",
     side: Annotated[str, typer.Option("--side", metavar="S", help="End of the near face: left or right.")] = "left",
     sigma_robot: Annotated[
-        float | None,
-        typer.Option("--sigma-robot", metavar="MM", help=ROBOT_SIGMA, show_default=ESTIMATED.format(0.03)),
+        float | None, typer.Option("--sigma-robot", metavar="MM", help=ROBOT_SIGMA, show_default=ESTIMATED.format(0.03))
     ] = None,
     sigma_x: Annotated[
         float | None,

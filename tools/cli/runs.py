@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from weldcal.tools.cli.options import (
-    LIVE,
-    Call,
-    Outcome,
-    RecordOption,
-    ScenarioArgument,
-    ScenarioOption,
-    command,
-)
+from weldcal.tools.cli.options import LIVE, Call, Outcome, RecordOption, ScenarioArgument, ScenarioOption, command
 
 if TYPE_CHECKING:
     from weldcal.tools.outcomes.options import RunOptions

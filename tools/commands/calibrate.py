@@ -14,26 +14,14 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import load_dataset
-from weldcal.calibration.data.results import (
-    CalibrationResult,
-    PoseRecord,
-    export_all,
-    save_result,
-    software_version,
-)
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.self_calibration import (
-    apply_self_calibration,
-    calibrate_corrected,
-)
+from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration, calibrate_corrected
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import (
-    convergence,
-    k_fold,
-)
+from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg

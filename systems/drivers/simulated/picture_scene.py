@@ -44,10 +44,7 @@ class PicturePoses(LeafSystem):
         self._frames = frames
         self._body_poses = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
         self.DeclareAbstractOutputPort(
-            "frame_poses",
-            lambda: AbstractValue.Make(FramePoseVector()),
-            self._calculate,
-            {self._body_poses.ticket()},
+            "frame_poses", lambda: AbstractValue.Make(FramePoseVector()), self._calculate, {self._body_poses.ticket()}
         )
 
     def _calculate(self, context: Context, output: Any) -> None:

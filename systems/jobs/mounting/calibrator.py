@@ -65,11 +65,7 @@ class MountingCalibrator(LeafSystem):
     """
 
     def __init__(
-        self,
-        scene: MountingScene,
-        config: MountingFitConfig,
-        plan: Sequence[MountingPose],
-        period_s: float = 0.02,
+        self, scene: MountingScene, config: MountingFitConfig, plan: Sequence[MountingPose], period_s: float = 0.02
     ) -> None:
         super().__init__()
         warm_up()

@@ -12,12 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.plan import (
-    plan_edge_poses,
-    plan_sphere_poses,
-    sample_edge_poses,
-    sample_sphere_poses,
-)
+from weldcal.calibration.profiler.plan import plan_edge_poses, plan_sphere_poses, sample_edge_poses, sample_sphere_poses
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError

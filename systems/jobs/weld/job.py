@@ -188,8 +188,7 @@ def _add_welding(
         or not isinstance(scenario.finger_camera, FingerCameraConfig)
     ):
         return WeldingPorts(
-            seam=wiring.constant("no_seam", PlannedSeam()),
-            report=wiring.constant("no_servo", ServoReport()),
+            seam=wiring.constant("no_seam", PlannedSeam()), report=wiring.constant("no_servo", ServoReport())
         )
     out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
     position, welding = spine.arm.position, scenario.welding

@@ -163,9 +163,7 @@ def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str
             touches, delta_px=-touches.delta_px
         ),
         "tablet_px counted up the page: y goes down it, as the image's does": dc.replace(
-            touches,
-            landmark_px=touches.landmark_px * flip + [0.0, extent[1]],
-            delta_px=touches.delta_px * flip,
+            touches, landmark_px=touches.landmark_px * flip + [0.0, extent[1]], delta_px=touches.delta_px * flip
         ),
     }
     found = []

@@ -45,10 +45,7 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     results = all_worlds(made, worlds, lambda name, share: progress(f"sphere, {name}", 0.4 + 0.4 * share))
     fixed: list[Target] = []
     if whole is not None:
-        fixed = [
-            *published_lines(results),
-            *fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share)),
-        ]
+        fixed = [*published_lines(results), *fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share))]
     first = next(iter(trials_of(names[0])))
     e = first.joint()
     cloud = ball_points(first, e.rotation, e.translation)

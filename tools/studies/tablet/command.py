@@ -11,13 +11,7 @@ from weldcal.tools.studies.output import write_json
 from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.report import tablet_report
 from weldcal.tools.studies.tablet.results import TabletOptions, TabletStudy
-from weldcal.tools.studies.tablet.study import (
-    compare_models,
-    compare_signs,
-    dh_by_eq_20,
-    held_out,
-    reproduce_stages,
-)
+from weldcal.tools.studies.tablet.study import compare_models, compare_signs, dh_by_eq_20, held_out, reproduce_stages
 
 PUBLISHED_TRIALS = 20
 

@@ -9,15 +9,7 @@ from weldcal.tools.emulators.ur.script.lexer import Token, tokenize
 from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
 
 # Loosest first, as the URScript manual orders them; `not` binds tighter than `and`.
-_BINARY = (
-    ("or",),
-    ("xor",),
-    ("and",),
-    ("==", "!="),
-    ("<", ">", "<=", ">="),
-    ("+", "-"),
-    ("*", "/", "%"),
-)
+_BINARY = (("or",), ("xor",), ("and",), ("==", "!="), ("<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
 
 
 def parse_program(source: str) -> Routine:
