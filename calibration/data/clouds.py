@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 _TEXT = (".csv", ".txt", ".xyz")
 SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *_TEXT)

@@ -12,8 +12,8 @@ from scipy.stats import f as f_distribution
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.geometry.se3 import skew
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from weldcal.calibration.flange.rays import RayModel
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SMOOTHING_PX = 1.0  # of the face mask before its edge is located

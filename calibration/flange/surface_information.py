@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-
-Array = NDArray[np.float64]
 
 COMPONENTS = (
     "tilt about x",

@@ -26,9 +26,9 @@ from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
 from weldcal.calibration.geometry.robust import TUKEY
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]

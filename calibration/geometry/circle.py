@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _STEPS = 7  # of Gauss-Newton in the compiled fit
 

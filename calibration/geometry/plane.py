@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from weldcal.calibration.errors import PlaneFitError
 from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 _FEW = 1200  # points that find the plane, before all of them make it precise

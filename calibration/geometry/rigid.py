@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidTransform:

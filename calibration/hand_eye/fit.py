@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.hand_eye.linearisation import TINY, Loss, Noise, Scaled, pull
 from weldcal.calibration.hand_eye.problem import Linearised, Problem, State, gram, linearise, residuals
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _NEAR = 1e-3  # changes (rad, or share of the extent) up to which derivatives taken once still predict

@@ -21,9 +21,9 @@ from weldcal.calibration.hand_eye.determinacy import (
     without_drift,
 )
 from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, residuals
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _SPARE = 2.5  # numbers per unknown below which an answer cannot be checked

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
@@ -16,10 +15,9 @@ from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_poin
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
 from weldcal.calibration.geometry.se3 import rotation_vector, skew
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 SAME_PLACE_M = 0.002
 MIN_DEPTH_M = 0.002

@@ -6,15 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-Array = NDArray[np.float64]
 Cost = Callable[[Array], float]
 
 POOL_SIZE = 4

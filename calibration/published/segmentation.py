@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FlangeNotFound
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import LandmarksNotFound
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 Ellipse = tuple[Sequence[float], Sequence[float], float]
 """Centre, axes (px) and angle (deg), as OpenCV has them."""

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.tablet.errors import LandmarksNotFound
 from weldcal.calibration.tablet.touches import check_layout
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def tablet_pose(rays: Array, landmark_m: Array) -> RigidTransform:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.results import IcpRecord
@@ -22,10 +21,9 @@ from weldcal.calibration.published.icp import (
     make_verification,
     sight,
 )
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.outcomes.calibration import Algorithm1Outcome, error_summary
-
-Array = NDArray[np.float64]
 
 
 def compare_algorithm1(

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import load_dataset
@@ -32,7 +31,6 @@ from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.report.calibration import calibration_report
 from weldcal.tools.report.render import write_atomic
 
-Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
 Progress = Callable[[str, float], None]
 """Called with the stage and the completed fraction (0 to 1)."""

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
@@ -22,7 +21,6 @@ from weldcal.tools.outcomes.calibration import PoseError, VerifyReport
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.verify import verify_report
 
-Array = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 _FEW = 4

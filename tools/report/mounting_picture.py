@@ -20,9 +20,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
+from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.mounting import MountingReport
-
-Array = NDArray[np.float64]
 
 WIDTH, HEIGHT, FOCAL = 1000, 640, 900.0
 AXES_M = 0.10

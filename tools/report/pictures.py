@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.observation import Observation
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
 _GROSS = 10.0  # times the median: a gross outlier

@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.profiler import PathOutcome, PoseOutcome
 from weldcal.tools.report.pictures import OURS, svg
 
-Array = NDArray[np.float64]
 RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
 PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 _COLOURS = {"edge": OURS, "sphere": RUST}

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, Array, svg
+from weldcal.models.arrays import Array
+from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, svg
 
 __all__ = [
     "OURS",

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render
 
-Array = NDArray[np.float64]
 LIMIT_MM = 0.3
 
 

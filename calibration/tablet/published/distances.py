@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
+
 Residuals = Callable[[Array], Array]
 """Parameter sets (k, p) to differences (k, 2 n, 2), mm."""
 

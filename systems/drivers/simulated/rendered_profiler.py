@@ -5,13 +5,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
 from weldcal.systems.drivers.config import DriverConfig
@@ -21,7 +21,6 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.profiler.config import pose_of
 from weldcal.systems.messages import ProfileScan, TorchTouch
 
-Array = NDArray[np.float64]
 FORCE_N = 0.02  # from here on a touch is felt
 
 

@@ -7,9 +7,8 @@ import struct
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _COUNT_BYTES = 8
 _CHECK = struct.Struct("<I")

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
@@ -22,14 +21,13 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, sol
 from weldcal.calibration.hand_eye.stated_noise import information_of, with_stated_noise
 from weldcal.calibration.planning.mounting_poses import MountingPose, information, prior, work_point
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.jobs.mounting.messages import KeptAside, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
-
-Array = NDArray[np.float64]
 
 FIT_SHARE = (
     1.25  # errors of the fits over their own sigma (which takes a scan's noise for independent), rms in simulated scans

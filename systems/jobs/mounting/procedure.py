@@ -7,16 +7,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.calibration.planning.mounting_poses import MountingPose
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.motion.goals import stands_at
 
-Array = NDArray[np.float64]
 ENDS = ("done", "held")
 
 

@@ -18,12 +18,12 @@ from weldcal.calibration.profiler.sphere.arc import find_arc
 from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arrays import Array
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
 from weldcal.welding.seam.curve import SeamCurve
 
-Array = NDArray[np.float64]
 SMOOTHING_M = 0.004  # waves of a seam shorter than about six times this are taken for noise
 FAR_SIGMAS = 4.0  # of the scatter about the smooth seam: a point beyond is left out
 TRIALS = 3  # rounds of leaving points out

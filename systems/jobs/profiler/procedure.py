@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.jobs.profiler.estimates import (
@@ -31,7 +31,6 @@ from weldcal.systems.messages import JobCommand, Message, ProfileScan, TorchTouc
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.seam.curve import SeamCurve
 
-Array = NDArray[np.float64]
 ENDS = ("done", "held")
 DWELL_S = 0.1  # at rest before a profile is taken
 FEEDBACK_PER_S = 8.0  # towards the path

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.models.arrays import Array
 from weldcal.systems.messages import Message
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.planning.clearance import Body, arm_bodies
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.jobs.tablet.config import TabletConfig
@@ -19,7 +19,6 @@ from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 
-Array = NDArray[np.float64]
 PEN_BODY_M = 0.006  # radius of the pen where moves are to keep clear of the table
 _LOOK_ASLANT_RAD = (0.12, -0.10)  # a view that is a little aslant fixes the tablet's tilt better than one square on
 _LEAN_STEP_RAD = 2.4  # between the sides to which the pen leans, touch by touch: the golden angle, so none comes twice

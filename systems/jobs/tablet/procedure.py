@@ -6,16 +6,14 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-
-Array = NDArray[np.float64]
 
 MOVES = ("to_start", "to_look", "to_above", "lift", "to_home")
 ENDS = ("done", "held")

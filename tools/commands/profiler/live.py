@@ -10,10 +10,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
@@ -22,8 +22,6 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.profiler import WITHIN_MM, LiveOutcome, ProfilerLive, live_outcome
 from weldcal.tools.report.profiler_live import live_report, seeds_report
 from weldcal.tools.report.render import write_atomic
-
-Array = NDArray[np.float64]
 
 
 def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progress) -> ProfilerLive:

@@ -6,16 +6,15 @@ import dataclasses as dc
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.planar.files import PlanarVisit
 from weldcal.calibration.tablet.planar.fit import PLANAR_NAMES, PlanarConfig, PlanarFit, fit_planar
 from weldcal.calibration.tablet.planar.linear import LINEAR_NAMES, LinearFit, fit_linear
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 
-Array = NDArray[np.float64]
 PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"
 NAMES = {PNP: PLANAR_NAMES, FREE: PLANAR_NAMES, LINEAR: LINEAR_NAMES}
 

@@ -11,19 +11,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import software_version
 from weldcal.calibration.tablet.planar.files import PlanarFile
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.wrist.files import file_hash
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.outcomes.calibration import error_summary
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.tablet import Page
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

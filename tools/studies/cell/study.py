@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.runner import Progress, no_progress, run_cell
@@ -23,7 +23,6 @@ from weldcal.tools.studies.output import print_note, print_table, records_csv, w
 from weldcal.tools.studies.targets import Target, print_targets
 from weldcal.welding.servo.laws import get_law
 
-Array = NDArray[np.float64]
 # (figure, worst or mean over the runs, limit, unit); a real-time factor is a lower bound
 TARGETS = (
     ("point_sd_mm", "worst", 0.02, "mm"),

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.stats import binom, chi2
 
@@ -20,11 +19,11 @@ from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
+from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.studies.flange.frames import facing
 
-Array = NDArray[np.float64]
 LEVEL = 0.95
 WORK_C = np.array([0.02, -0.05, 0.72])
 """The work point (3,) m in the camera."""

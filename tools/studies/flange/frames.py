@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard, flange_mesh, flange_ring
 from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
-
-Array = NDArray[np.float64]
 
 _THICK_M = 0.012
 _SEGMENTS = 96  # of bodies that are no flange

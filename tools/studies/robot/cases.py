@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.tools.studies.robot.bench import Array, Bench
+from weldcal.tools.studies.robot.bench import Bench
 
 STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3

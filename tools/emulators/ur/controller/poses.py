@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def rotation_matrix(vector: Sequence[float] | Array) -> Array:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, link_frames
-from weldcal.tools.emulators.ur.controller.motions import Array
+from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.poses import matrix
 from weldcal.tools.emulators.ur.script.answers import Answers, six
 

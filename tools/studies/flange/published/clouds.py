@@ -30,11 +30,10 @@ from weldcal.calibration.published.pipeline import (
     published_model,
     published_pairs,
 )
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress
-
-Array = NDArray[np.float64]
 
 ICP_POINTS = 2_500
 """Points of a face that the repeated registrations use, of some 12 000: they differ by less than what they cannot see."""

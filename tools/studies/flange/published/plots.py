@@ -8,12 +8,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.tools.report.plots_weld import OURS, PLANNED, THEIRS, TRUTH, svg
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Simulation
-
-Array = NDArray[np.float64]
 
 # the paper's order and grouping: x, y, z above roll, pitch, yaw
 PANELS = (

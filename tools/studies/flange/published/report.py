@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.arrays import Array
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.flange.published import plots
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
-from weldcal.tools.studies.flange.published.results import TABLE1, Array, Study, statistics
+from weldcal.tools.studies.flange.published.results import TABLE1, Study, statistics
 from weldcal.tools.studies.flange.published.simulation import COSTS
 from weldcal.tools.studies.output import print_note, print_table
 
