@@ -1,7 +1,5 @@
 """The touch-based welding tool (paper, Fig. 7): plate with flange ring, finger camera, soft tip with tag, torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

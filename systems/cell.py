@@ -1,7 +1,5 @@
 """The ONE builder: the station that a scenario describes, the spine that every job shares, and the scenario's job."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 

@@ -1,7 +1,5 @@
 """Keeping the Diagram to the wall clock: wait while it is ahead; where it is late, say so and never catch up in a rush."""
 
-from __future__ import annotations
-
 import gc
 import os
 import threading

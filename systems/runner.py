@@ -1,7 +1,5 @@
 """The one run loop: advance a cell's Diagram until its job ends, keep to the wall clock where the robot is real, keep every scan."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import ExitStack

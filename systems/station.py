@@ -1,7 +1,5 @@
 """The station: arms, sensors and tools behind fixed ports; the scenario's driver configs say what is real."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 import inspect
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The builder of a cell with what each of its parts needs, and short ways to add and connect systems."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Reads point clouds from PLY, PCD, NPZ, NPY and text files; refuses damaged ones with a reason."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 import zlib

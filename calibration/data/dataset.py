@@ -1,7 +1,5 @@
 """Reads, checks and writes a calibration dataset folder: poses, clouds and pairs."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

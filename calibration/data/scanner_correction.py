@@ -1,7 +1,5 @@
 """Correction of a scanner's scale error: a polynomial factor over the image that multiplies every point."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

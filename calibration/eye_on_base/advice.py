@@ -1,7 +1,5 @@
 """Advises which poses to add and when to stop, from what the poses so far leave uncertain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

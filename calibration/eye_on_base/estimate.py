@@ -1,7 +1,5 @@
 """The estimate of X_BC with its covariance, residuals and held-out errors, and the error of a scanned point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Estimates X_BC from one, two or three scans, from normals or from whole poses by the hole pattern."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Fits the flange in every cloud of a dataset; returns observations and the reasons of refused scans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Fits a scanner correction to observations of the flange, from the robot's motion and from the hole circles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 

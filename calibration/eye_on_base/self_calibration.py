@@ -1,7 +1,5 @@
 """Decides whether to correct the scanner, by comparing robot motion, hole circles and held-out errors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Held-out errors of a calibration: k-fold cross-validation and convergence over the number of scans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Fits the circle of a robot's base mounting in a scan that shows only an arc of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

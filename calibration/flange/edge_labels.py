@@ -1,7 +1,5 @@
 """Maximum-likelihood circle fit to pixels labelled on or off a face; missing pixels are ignored."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Fits the concentric edges of a flat face and tests whether it is a flange."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Finds a flange in a scan: the plane of its face and the centre of its concentric edges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Finds the hole pattern of a flange: its rotation about the flange axis and the scale of its pitch circle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

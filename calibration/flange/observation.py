@@ -1,7 +1,5 @@
 """One observation of the flange: its pose in the base from the robot, and its centre and normal from the scanner."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Models the viewing rays of an organised scan over its pixels: quadratic, or pinhole where that fits."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

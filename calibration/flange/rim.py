@@ -1,7 +1,5 @@
 """Locates the edges of a flat face: mask crossings in organised clouds, extreme points per sector in unordered ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

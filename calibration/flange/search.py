@@ -1,7 +1,5 @@
 """Searches an organised scan for the flange: flat parts on a thinned grid, then a fit at full resolution."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache

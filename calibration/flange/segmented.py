@@ -1,7 +1,5 @@
 """Fits plane and both edges to a cloud that shows little but the flange; returns None where it does not."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

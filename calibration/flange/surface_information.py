@@ -1,7 +1,5 @@
 """Information of a patch of the flange's surface on an error of its pose, and the components it leaves unobservable."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from weldcal.models.arrays import Array

@@ -1,7 +1,5 @@
 """Fits plane and both edges of a flange within 3 mm of a given pose; returns None where it is not found there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

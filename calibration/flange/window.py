@@ -1,7 +1,5 @@
 """Fits a flange face in a window of an organised scan: plane, edge crossings, and both circles from pixel labels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

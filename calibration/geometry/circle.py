@@ -1,7 +1,5 @@
 """Robust geometric circle fit in the plane, with the covariance of centre and radius."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

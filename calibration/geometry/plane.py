@@ -1,7 +1,5 @@
 """Robust plane fits: seeded local hypotheses, Tukey-weighted least squares, and compiled fits for many points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

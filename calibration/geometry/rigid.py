@@ -1,7 +1,5 @@
 """Closed-form rigid registration of two point sets or direction sets: the paper's Eq. (10) to (12)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix

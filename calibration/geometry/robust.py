@@ -1,7 +1,5 @@
 """Robust statistics for compiled loops: Tukey's and the MAD's constants, a median, a small Cholesky solution."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from weldcal.calibration.geometry.compiled import compiled

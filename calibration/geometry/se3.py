@@ -1,7 +1,5 @@
 """SE(3) on arrays: inverse, logarithm and exponential of rotations, small changes and means of 4 x 4 poses."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RotationMatrix
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """Solves one hand-eye problem: starts, outlier rejection, candidate weightings, and the choice by held-out errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 

@@ -1,7 +1,5 @@
 """Refines a hand-eye calibration by reprojection of board corners, with an optional shift of the principal point."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Checks what the motion determines: diversity before the solution, unobservable directions after it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reads pose pairs from npz, CSV and JSON files and from the samples of easy_handeye2 and MoveIt."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 import zlib

@@ -1,7 +1,5 @@
 """Robust weighted least squares on SE(3); variances of rotation and translation come from the residuals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Detects usual mistakes in pose files: applies each correction and names the one that makes the poses agree."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The supported mountings: the frames of each equation, the names of its unknowns, and a sketch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

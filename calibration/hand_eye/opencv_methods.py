@@ -1,7 +1,5 @@
 """Runs OpenCV's hand-eye methods on the same observations, for comparison."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

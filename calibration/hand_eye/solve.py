@@ -1,7 +1,5 @@
 """Solves AX = XB, AX = YB and AXB = YCZ, with covariance, held-out errors and unobservable directions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Closed-form initial estimates: quaternions, Kronecker products, dual quaternions, logarithms, a rotation grid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

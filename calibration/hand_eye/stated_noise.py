@@ -1,7 +1,5 @@
 """Covariance of a hand-eye result whose observations state their own covariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

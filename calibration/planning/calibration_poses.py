@@ -1,7 +1,5 @@
 """Plans flange poses for eye-on-base calibration: reachable, clear, visible and D-optimal."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Clearance of the arm's capsules from the table, from itself and from the scanner's line of sight."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Plans poses for calibration in any mounting: reachable, visible, clear and D-optimal in the unknowns."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Chooses the next hand-eye pose: the reachable, visible one that reduces the uncertainty at the work point most."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

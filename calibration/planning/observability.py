@@ -1,7 +1,5 @@
 """Checks the diversity of a set of poses and names the errors that they cannot show."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform

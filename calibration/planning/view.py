@@ -1,7 +1,5 @@
 """Field of view, working distance and largest viewing angle of a camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Algorithm 1 of the flange paper: a pool of four pairs, improved scan by scan by its verification figure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 

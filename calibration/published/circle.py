@@ -1,7 +1,5 @@
 """The paper's circle search: of 10 000 random triples of face points the one with the most points at its radius."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

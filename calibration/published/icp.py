@@ -1,7 +1,5 @@
 """Algorithm 1's verification figure: ICP of a flange against its model (Eq. 13), and the share of an error it shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, Protocol
 

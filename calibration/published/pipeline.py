@@ -1,7 +1,5 @@
 """The paper's calibration pipeline: segmentation, circle, Eq. (9)-(12), Algorithm 1 with the ICP of Eq. (13)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal

@@ -1,7 +1,5 @@
 """The paper's segmentation of a flange face: pass-through, statistical outlier removal, clustering, dominant plane."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

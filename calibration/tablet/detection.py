@@ -1,7 +1,5 @@
 """Detects the tablet's landmarks in a camera image, rings or single-pixel dots, in the order of the page."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Literal

@@ -1,7 +1,5 @@
 """Reads camera intrinsics from YAML: fx, fy, cx, cy, or the camera matrix as ROS and OpenCV write it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Depth of the landmarks from a plane fitted to the tablet's pixels of a depth image."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

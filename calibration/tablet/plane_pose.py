@@ -1,7 +1,5 @@
 """Pose of the tablet in the camera (PnP with intrinsics), and the tablet point that a pixel shows."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix

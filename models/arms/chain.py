@@ -1,7 +1,5 @@
 """A serial arm of revolute joints: forward kinematics, Jacobian, and iterative inverse kinematics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

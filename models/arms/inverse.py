@@ -1,7 +1,5 @@
 """Inverse kinematics of UR arms: all closed-form branches, refined on the robot's calibrated kinematics."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -6,8 +6,6 @@ in link i-1 at zero angle, and the chain is their plain product: X_BF = prod_i X
 factory calibration has the same schema as the nominal numbers, so nothing else changes when one is given.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ Shapes are drawn in the link frames from the nominal lengths and stop 6 mm short
 itself is a mesh of its own, because calibration measures it. They are visual only; the capsules serve planning.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A flat board that carries a picture: the print of the tag, the sign of a phase."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

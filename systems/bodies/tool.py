@@ -1,7 +1,5 @@
 """The bodies of flange and welding tool in a plant, as they are seen and as they touch."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from pydrake.common import MemoryFile

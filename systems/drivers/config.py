@@ -1,7 +1,5 @@
 """What every driver's configuration says of itself: which devices it may be, and whether it needs the simulated world."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import ClassVar
 

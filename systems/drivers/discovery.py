@@ -1,7 +1,5 @@
 """Finds the drivers: modules of weldcal.systems.drivers, and what installed packages offer in the entry-point group."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil

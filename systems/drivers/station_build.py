@@ -1,7 +1,5 @@
 """What a driver is given while the station is built: the builder, what else the station holds, and where to export ports."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar

@@ -1,7 +1,5 @@
 """Finds the jobs: modules in weldcal.systems.jobs, and what installed packages offer beside their drivers."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from functools import cache

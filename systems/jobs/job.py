@@ -1,7 +1,5 @@
 """What a kind of job is: its part of the scenario, what it asks of it, and how it adds its systems to a cell."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar

@@ -1,7 +1,5 @@
 """Moves straight in joint space are made only where the arm stays clear of the table and of itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CommandArbiter: one motion channel, so one of mover and servo drives, or neither."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem

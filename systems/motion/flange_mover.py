@@ -1,7 +1,5 @@
 """FlangeMover: takes the arm to a goal on a smooth synchronised joint path, as a stream of joint velocities."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,7 +1,5 @@
 """When an arm counts as standing at a joint goal."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

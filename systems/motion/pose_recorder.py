@@ -1,7 +1,5 @@
 """PoseRecorder: remembers the arm's last joint positions, so that a sensor's datum meets the pose of its own time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any
 

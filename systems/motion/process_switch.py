@@ -1,7 +1,5 @@
 """ProcessSwitch: the process output; whatever is about to stop the arm turns the torch off first, and it stays off."""
 
-from __future__ import annotations
-
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 

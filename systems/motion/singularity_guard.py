@@ -1,7 +1,5 @@
 """SingularityGuard: the wanted twist of the tip becomes joint velocity, slowed and stopped before the arm's singularities."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem

@@ -1,7 +1,5 @@
 """SlewLimiter: the last word before the station; finite, and bounded in speed, acceleration and jerk."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The spine that every job shares: pose recorder, mover, arbiter and limiter for each arm, the operator's hold, the process switch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Reads scenarios: the ones that ship with weldcal by name, a user's own by path; unknown keys are errors."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 import re
 from functools import cache, partial, reduce

@@ -1,7 +1,5 @@
 """The numbers of a scenario: finite, in number and in sign what the cell can work with."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 import math
 from typing import Any

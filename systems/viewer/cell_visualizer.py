@@ -1,7 +1,5 @@
 """CellVisualizer: what the cell believes, in Meshcat: clouds, fitted circle, camera, seams, torch and the phase of the job."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The arm of a station without a simulated world: kinematics only, drawn where it is measured."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform

@@ -1,7 +1,5 @@
 """The phase of the job as a sign behind the cell: a textured board per phase, shown in its time."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The weld's gauge: torch speed and n_d . n_t along the seam so far, as a picture for a board in the viewer."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The weld as it goes on, in Meshcat: CAD over the cloud, planned and felt seam, torch, the deflection's arrow, the gauge."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
 from pydrake.math import RigidTransform, RotationMatrix

@@ -1,7 +1,5 @@
 """weldcal benchmark: speed and accuracy of each part but the flange fit, in simulation and on recorded data."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """weldcal calibrate: a scanner's pose from a dataset, or live in a scenario."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

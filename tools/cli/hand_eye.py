@@ -1,7 +1,5 @@
 """weldcal hand-eye: cameras calibrated from files of robot and camera poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 

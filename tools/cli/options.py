@@ -1,7 +1,5 @@
 """What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """weldcal reproduce: the published studies repeated, with every figure compared with its target."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """weldcal tablet serve and calibrate: a tablet as the calibration target."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """weldcal view: the report and the 3D recording of a finished run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

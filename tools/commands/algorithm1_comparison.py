@@ -1,7 +1,5 @@
 """Runs Algorithm 1 on the scans of a calibration and compares its reported figure with its error at unused poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

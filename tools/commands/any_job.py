@@ -1,7 +1,5 @@
 """Runs a job that has no command of its own, such as one of an installed package: state, timing and recording."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

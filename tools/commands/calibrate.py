@@ -1,7 +1,5 @@
 """`weldcal calibrate DATASET`: estimates X_BC and its uncertainty from a folder of scans and writes exports and a report."""
 
-from __future__ import annotations
-
 import csv
 import io
 import time

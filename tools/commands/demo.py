@@ -1,7 +1,5 @@
 """The main job: build the cell of a scenario, run it, write what came of it; demo, live calibration and weld are cuts of it."""
 
-from __future__ import annotations
-
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point

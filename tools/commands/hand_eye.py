@@ -1,7 +1,5 @@
 """weldcal hand-eye: solves for the unknown poses from a file of pose pairs, compares all methods and writes exports."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace

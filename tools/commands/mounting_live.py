@@ -1,7 +1,5 @@
 """weldcal hand-eye live: a calibration in any mounting, from the first pose to the report, against the truth where it is known."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

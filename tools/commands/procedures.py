@@ -1,7 +1,5 @@
 """Which command runs which job: by the key of the job that a scenario describes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol

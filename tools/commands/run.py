@@ -1,7 +1,5 @@
 """One run of a scenario's job, whichever it is: choose the robot, build the cell, show it, run it; for every command that runs one."""
 
-from __future__ import annotations
-
 import time
 import webbrowser
 from contextlib import closing

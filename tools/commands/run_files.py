@@ -1,7 +1,5 @@
 """What a run leaves on disk: calibration.yaml, the weld log and the scans as a dataset that `weldcal calibrate` reads again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`weldcal verify RESULT DATASET`: measures the errors of a calibration at the flange on scans that it did not use."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

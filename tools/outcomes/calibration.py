@@ -1,7 +1,5 @@
 """The results that the reports of `calibrate` and `verify` show, and their JSON objects."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

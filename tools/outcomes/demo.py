@@ -1,7 +1,5 @@
 """What a run of the weld job came to: its state, its calibration and weld, and the JSON object of `demo` and `weld`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

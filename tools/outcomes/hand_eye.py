@@ -1,7 +1,5 @@
 """The outcome of `weldcal hand-eye`: poses with their uncertainty, the comparison of methods, the next pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

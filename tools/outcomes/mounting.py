@@ -1,7 +1,5 @@
 """What a live calibration in any mounting came to, against the truth where a simulation knows it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a person may choose for a run of a cell."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

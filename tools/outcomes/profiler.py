@@ -1,7 +1,5 @@
 """A live run of the profiler's cell against the truth that only its simulation knows: poses in sigmas of their prediction, seam, torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a run came to: the weld and the calibration measured against the truth that only a simulation knows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

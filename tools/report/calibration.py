@@ -1,7 +1,5 @@
 """The report page of `weldcal calibrate`, with its plots and tables."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -1,7 +1,5 @@
 """The map of the uncertainty of a scanned point, with the poses taken and the most informative next place."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure

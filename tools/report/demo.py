@@ -1,7 +1,5 @@
 """The report of a run, for someone who was not there: did it work, how well, what it looked like, where the numbers are from."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

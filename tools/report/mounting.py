@@ -1,7 +1,5 @@
 """The report of a live calibration in any mounting: the station, what was found in which direction, and how sure it is."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

@@ -1,7 +1,5 @@
 """A picture of a mounting as it stands in simulation, with its frames drawn into it."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np

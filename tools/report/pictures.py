@@ -1,7 +1,5 @@
 """Plots that several reports share: errors as bars, errors as arrows across the scanner's field of view."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 

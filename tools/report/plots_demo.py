@@ -1,7 +1,5 @@
 """The pictures of a run: how the calibration converged, and its weld in the form that the weld's pictures take."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

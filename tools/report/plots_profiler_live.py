@@ -1,7 +1,5 @@
 """Pictures of a live profiler run: pose errors in sigmas of their prediction, the seam and the torch against the truth, raw profiles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plots of a weld: the paths over the seam (the paper's Fig. 13) and the quantities along it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 

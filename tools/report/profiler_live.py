@@ -1,7 +1,5 @@
 """The report pages of a live profiler run and of many: what was found, how far from the truth, in pictures and a table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

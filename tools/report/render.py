@@ -1,7 +1,5 @@
 """Renders report templates to self-contained HTML, formats numbers, and writes files atomically."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """The report page of a tablet calibration, from files or from a simulated visit, with its plots and tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """The report page of `weldcal verify`: errors per scan against the stated ones, and over the field of view."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from weldcal.calibration.data.results import software_version

@@ -1,7 +1,5 @@
 """Files and tables of the studies: JSON, CSV, Markdown, and tables for a terminal."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """Reads planar touches from an npz file: one visit or many of one rig, with optional queries that no fit uses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

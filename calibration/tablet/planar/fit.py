@@ -1,7 +1,5 @@
 """Fits camera and pen by the tablet's known size: PnP, then a planar rigid motion and the pen offset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fits camera and pen by linear least squares in six unknowns: an image-plane similarity and the pen offset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tablet paper's two-stage calibration: chain, affine pair, and the hand position for a pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The tablet paper's two chains to the base: homogeneous transforms (HTM) and Denavit-Hartenberg (DH)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

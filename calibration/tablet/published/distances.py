@@ -1,7 +1,5 @@
 """Minimises the sum of mean distances: least squares, then smoothed distances of growing sharpness by SLSQP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Differential evolution with the settings of the paper's Table 4: DE/rand/1, binomial crossover, CR 0.9, F 0.5."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The tablet paper's two fitness functions: mean distances after the chain (stage 1) and the affine pair (stage 2)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

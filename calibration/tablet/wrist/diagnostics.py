@@ -1,7 +1,5 @@
 """Diagnoses touches from full robot poses: scale, single wrong landmarks and wrong order; changes nothing."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reads a tablet visit: the page's CSV, robot poses and an image."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Derives the page's grid from the touched landmarks: columns, rows and spacing."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """What a job puts into the simulated world, as it truly is; drawn from the run's seed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What a camera looks at: a scene of its own, in which nothing is moved until a picture is taken."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures drawn in a thread of their own, while the Diagram goes on to the moment at which they arrive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 

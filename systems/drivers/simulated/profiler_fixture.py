@@ -1,7 +1,5 @@
 """How the profiler's fixture really is: pose of the sensor, torch, straightedge and sphere, each off its drawing by the seed."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 

@@ -1,7 +1,5 @@
 """What a profiler's cell has beside the arm: torch and profiler on the flange, a straightedge and a sphere on posts, as they really are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

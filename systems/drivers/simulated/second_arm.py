@@ -1,7 +1,5 @@
 """A second arm in the simulated world: another model in the one plant, where its base truly stands"""
 
-from __future__ import annotations
-
 import dataclasses as dc
 
 import numpy as np

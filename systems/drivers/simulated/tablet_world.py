@@ -1,7 +1,5 @@
 """What a visit to the tablet adds to the simulated world: plate, camera body and sprung pen on the flange, a tablet on the table."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

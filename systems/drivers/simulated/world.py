@@ -1,7 +1,5 @@
 """The simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant, with what its cameras see."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol

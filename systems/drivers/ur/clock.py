@@ -1,7 +1,5 @@
 """Robot time on the host's clock: the earliest arrivals of many packages, with a straight line for the drift."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

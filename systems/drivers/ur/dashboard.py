@@ -1,7 +1,5 @@
 """The dashboard of PolyScope 5: one line in, one line out, on a fresh connection each time."""
 
-from __future__ import annotations
-
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
 from weldcal.systems.drivers.ur.line import Line
 

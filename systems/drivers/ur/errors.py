@@ -1,7 +1,5 @@
 """Why a robot is not started: one sentence each, with what to press."""
 
-from __future__ import annotations
-
 from weldcal.models.errors import WeldcalError
 
 

@@ -1,7 +1,5 @@
 """Every reason for which the hardware interface stops the arm, each with what a person does about it."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

@@ -1,7 +1,5 @@
 """Turns a digital output off over an RTDE connection of its own, whatever program runs or stands still on the controller."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 

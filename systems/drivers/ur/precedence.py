@@ -1,7 +1,5 @@
 """Who runs before whom on the cell's computer: the cell, the worker's loop, and the threads that ur_rtde polls the robot with."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -1,7 +1,5 @@
 """The robot through ur_rtde: connect, upload the guard, one coherent sample, one numbered velocity. For the worker process only."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

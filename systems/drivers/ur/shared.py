@@ -1,7 +1,5 @@
 """The memory that two processes share: blocks with one writer each, read whole or not at all, and a ring of joint positions."""
 
-from __future__ import annotations
-
 import mmap
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """MountingCalibrator: scan after scan of a circle into the unknown poses of any mounting, and which pose to add next."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Sequence
 from typing import Any

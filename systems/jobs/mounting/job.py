@@ -1,7 +1,5 @@
 """The mounting job: a scanner in any mounting calibrates itself by the robot's own flange or base circle, with one arm or two."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

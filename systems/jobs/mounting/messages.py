@@ -1,7 +1,5 @@
 """What travels in a mounting cell: where the procedure stands, and what the calibration has come to."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MountingProcedure: visit the planned poses with one arm or two, scan at each, keep some aside, come home."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """From what a profiler's job has measured to what it wanted: X_FS by an edge, X_FS and the torch's tip by a sphere, a seam."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The profiler job: a laser profiler calibrated by an edge and by a sphere with touches, a seam measured, the torch taken after it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """ProfilerProcedure: scan the edge, scan and touch the sphere, pass along the groove, and take the torch after it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

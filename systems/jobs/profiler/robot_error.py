@@ -1,7 +1,5 @@
 """RobotError: the flange is never quite where the controller says; by how much differs from pose to pose."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem

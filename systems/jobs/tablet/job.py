@@ -1,7 +1,5 @@
 """The tablet job: the camera looks at the tablet once, then the pen touches each of its landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What travels between the tablet's devices and its procedure: a picture of the wrist camera, a touch, and what only a simulation knows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

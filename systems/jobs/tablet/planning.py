@@ -1,7 +1,5 @@
 """Where a visit to the tablet goes, by the drawing alone: the look, the way above each landmark, and which moves are free."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 

@@ -1,7 +1,5 @@
 """TabletProcedure: look at the tablet once, then lower the pen onto each landmark until the tablet feels it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """ArucoDeformationEstimator: finger image in, how far the soft tip stands from its rest out."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,7 +1,5 @@
 """CalibrationPosePlanner: says which of the checked poses the flange should visit next."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,7 +1,5 @@
 """FlangeEstimator: a scan in, the circle of the flange (or of the tool's flange-like ring) out."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

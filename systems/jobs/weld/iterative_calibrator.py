@@ -1,7 +1,5 @@
 """IterativeCalibrator: one flange estimate after the other into X_BC, until its own error is small enough."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

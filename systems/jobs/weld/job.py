@@ -1,7 +1,5 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, follow it; or its calibration alone."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which of the planned poses a live calibration of a scanner beside the arm should add next, and what it would be worth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """SeamPlanner: a scan of the workpiece in, the planned seam in the base out, with the arm's way to its beginning."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

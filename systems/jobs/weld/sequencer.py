@@ -1,7 +1,5 @@
 """JobSequencer: go home, calibrate, verify, scan, plan, approach, weld, retract; or hold, and say why."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Callable
 from typing import Any

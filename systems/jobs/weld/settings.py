@@ -1,7 +1,5 @@
 """The numbers of the weld job, from scenario and station: what is looked at, where from, when it ends, how the servo moves."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 

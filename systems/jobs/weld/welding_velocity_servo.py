@@ -1,7 +1,5 @@
 """WeldingVelocityServo: planned seam and felt deformation in, the tip's spatial velocity and the torch switch out."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`weldcal profiler`: calibrates from a file by an edge or a sphere, maps a seam and writes the result."""
 
-from __future__ import annotations
-
 import csv
 import io
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """weldcal profiler live: run the profiler's job, write its measurements as files, its calibrations and a report; over seeds, a table."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

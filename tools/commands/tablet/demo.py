@@ -1,7 +1,5 @@
 """A visit to the tablet in a scenario: run, files that weldcal tablet calibrate reads, the calibration, held against the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 

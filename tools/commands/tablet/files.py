@@ -1,7 +1,5 @@
 """A visit to the tablet as the files of a real one: touches.csv as the page writes it, poses.csv, camera.yaml and picture.png."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Fits every model to planar touches, selects the one with the smallest held-out error, and detects mistakes in the data."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Mapping, Sequence
 

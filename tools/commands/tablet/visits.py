@@ -1,7 +1,5 @@
 """Calibrates each visit of a file by itself, with the model that has the smallest held-out error over all of them."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

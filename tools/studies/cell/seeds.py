@@ -1,7 +1,5 @@
 """Runs the demo over many seeds: how many runs end done, and the worst errors of calibration and torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

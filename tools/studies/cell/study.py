@@ -1,7 +1,5 @@
 """Runs the weld in the whole simulated cell over seeds: seam points and torch against the truth, and speed."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from pathlib import Path

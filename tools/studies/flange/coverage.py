@@ -1,7 +1,5 @@
 """Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Detection rate of the flange in ray-cast frames: with clutter, without a flange, and half hidden."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

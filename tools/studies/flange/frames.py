@@ -1,7 +1,5 @@
 """Ray-cast scanner frames with a flange at a known pose, or with objects that resemble one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

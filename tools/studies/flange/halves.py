@@ -1,7 +1,5 @@
 """Difference between the flange's centres from two parts of one cloud, and its Cramer-Rao bound."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Live calibrations with few scans: errors, the Cramer-Rao bound, and repeats with redrawn noise."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import dataclass, replace
 

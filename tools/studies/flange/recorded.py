@@ -1,7 +1,5 @@
 """Calibrations of recorded scans: the worth of each ingredient, and the errors with few scans."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Times the detection of the flange: weldcal, the paper's loop, an Open3D chain and a PCL-style random search."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

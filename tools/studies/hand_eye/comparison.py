@@ -1,7 +1,5 @@
 """Benchmark of the hand-eye solvers: public data against OpenCV, outliers, invariance, uncertainty, AXB = YCZ, speed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Random worlds for the hand-eye solver: no NaN, no confident wrong answer, mistakes are named."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

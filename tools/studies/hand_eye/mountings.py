@@ -1,7 +1,5 @@
 """Benchmark of the mountings: every mounting scenario live over several seeds, as the table of docs/hand_eye.md."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

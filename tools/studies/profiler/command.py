@@ -1,7 +1,5 @@
 """Runs the profiler study: both papers' tables and the joint method; writes table.json and report.html."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 

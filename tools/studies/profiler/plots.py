@@ -1,7 +1,5 @@
 """Pictures of the profiler study: Fig. 6 to 8 of the edge paper, the seam's deviations and the frustum."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

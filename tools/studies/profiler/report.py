@@ -1,7 +1,5 @@
 """Report page of the profiler study: targets, both papers' tables compared with ours, and pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from weldcal.calibration.data.results import software_version

@@ -1,7 +1,5 @@
 """Every target of the profiler study over many seeds: figures, their Cramer-Rao bounds, and the fixed files."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Times the calibration of a profiler by an edge without a guess, the paper's method and a grid search."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass

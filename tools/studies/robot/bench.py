@@ -1,7 +1,5 @@
 """Test bench of the hardware link: an emulated controller, the link, and an arm that moves at 0.05 m/s."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

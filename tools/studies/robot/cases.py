@@ -1,7 +1,5 @@
 """The faults that are injected into the hardware link: how, what must follow, and the repair."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Benchmark of the hardware link under faults: a matrix of faults, and random sequences of them."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable

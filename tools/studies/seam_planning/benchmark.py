@@ -1,7 +1,5 @@
 """Benchmark of seam planning from one scan, by drawing and from the cloud alone, for each scanner and hard case."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

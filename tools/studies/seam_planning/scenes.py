@@ -1,7 +1,5 @@
 """Simulated scans of workpieces: a part on a table with other objects, ray-cast for any scanner preset."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

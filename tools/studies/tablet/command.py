@@ -1,7 +1,5 @@
 """Runs the tablet study: the paper's tables, the signs, the models; writes table.json and report.html."""
 
-from __future__ import annotations
-
 import time
 
 from weldcal.calibration.tablet.planar.linear import fit_linear

@@ -4,8 +4,6 @@ J. Sato, "Hand-Eye Calibration Using a Tablet Computer", Math. Comput. Appl. 202
 The tablet's grid and the turn at the first landmark are not printed; both are inferred from the printed results.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

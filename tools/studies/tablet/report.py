@@ -1,7 +1,5 @@
 """Report page and pictures of the tablet study: targets, the paper's tables and ours, the sign, the models."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 

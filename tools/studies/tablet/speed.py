@@ -1,7 +1,5 @@
 """Times each tablet calibration: closed form, PnP, the paper's stages, and the published search."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reproduces the tablet paper's tables: every stage, sign and model, their cost, and their prediction errors."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Simulated tablet, camera and pen: touches with the paper's noise, and queries for validation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

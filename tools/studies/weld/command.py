@@ -1,7 +1,5 @@
 """Runs the weld study: rows, turns and laws; writes table.json, CSV files and report.html."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from dataclasses import astuple, fields

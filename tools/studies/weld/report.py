@@ -1,7 +1,5 @@
 """Tables and report page of the weld study: targets, turns, pictures of every seam, and the laws."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Runs every case of the weld study over its seeds and compares the figures with the targets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

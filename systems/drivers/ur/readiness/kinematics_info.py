@@ -1,7 +1,5 @@
 """A robot's factory kinematics, read from its primary port, and the check that it is what the controller computes with."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

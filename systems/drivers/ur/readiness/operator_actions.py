@@ -1,7 +1,5 @@
 """What to press: one sentence for each thing that keeps a robot from starting, in the words of PolyScope 5's menus."""
 
-from __future__ import annotations
-
 ROBOT_MODES = {
     -1: "NO_CONTROLLER",
     0: "DISCONNECTED",

@@ -4,8 +4,6 @@ Nothing moves, nothing is written, nothing is uploaded: outputs are read, and in
 back. The remedies use the words of PolyScope 5's menus.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast

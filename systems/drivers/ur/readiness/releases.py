@@ -1,7 +1,5 @@
 """Which controller software is supported, what ur_rtde 1.6 can do with it, and whether ur_rtde is installed."""
 
-from __future__ import annotations
-
 import importlib.util
 
 from weldcal.systems.drivers.ur.errors import RobotRefused

@@ -1,7 +1,5 @@
 """Arm of the emulated controller: integrates the kinematic model in steps of 2 ms."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

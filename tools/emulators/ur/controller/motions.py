@@ -4,8 +4,6 @@ Marked [M] in docs/ur_emulator.md: profiles are trapezoids without jerk limit, b
 chase, and the reaction to limits is a protective stop.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Protocol

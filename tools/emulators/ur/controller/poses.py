@@ -1,7 +1,5 @@
 """UR poses [x, y, z, rx, ry, rz] with a rotation vector, and their conversions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

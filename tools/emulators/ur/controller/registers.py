@@ -1,7 +1,5 @@
 """Registers and terminals that RTDE and scripts read and write; values outlive programs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from weldcal.tools.emulators.ur.script.syntax import ScriptError

@@ -1,7 +1,5 @@
 """URScript functions that return at once: registers, states, kinematics, poses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -1,7 +1,5 @@
 """URScript functions of the arm's mechanics (PolyScope 5.23, 10.9): Jacobian, mass matrix."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

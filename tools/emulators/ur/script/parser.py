@@ -1,7 +1,5 @@
 """Parses URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.script import syntax

@@ -1,7 +1,5 @@
 """Control channel: a line of JSON injects a fault or asks a question, a line of JSON answers."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

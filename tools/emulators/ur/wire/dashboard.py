@@ -1,7 +1,5 @@
 """Dashboard server on port 29999: one reply per command line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.controller.core import Controller

@@ -1,7 +1,5 @@
 """Sockets of the emulator in one loop, with injected network faults per connection."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket

@@ -1,7 +1,5 @@
 """RTDE fields, their types and their values, as in Universal Robots' RTDE guide."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Compares both methods on the same real scans: circles, registrations, Algorithm 1, and errors on held-out scans."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal

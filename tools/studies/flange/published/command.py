@@ -1,7 +1,5 @@
 """Runs the flange study: simulation, the authors' runs, both methods on real scans; writes tables, pictures and report."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Calibrations from centre pairs: the authors' runs of Algorithm 1, all pairs, and the time-of-flight camera."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from pathlib import Path

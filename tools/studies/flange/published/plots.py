@@ -1,7 +1,5 @@
 """Pictures of the flange study: the paper's Fig. 9, 10 and 11 with the true errors, circles and held-out errors."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -1,7 +1,5 @@
 """Tables and report page of the flange study: the paper's numbers, ours, and the true errors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import numpy as np

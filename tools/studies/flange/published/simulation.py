@@ -1,7 +1,5 @@
 """Simulates section 3.1 of the paper: the effect of Algorithm 1's cost on the errors that it is judged by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
