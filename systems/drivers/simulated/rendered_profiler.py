@@ -1,7 +1,7 @@
 """A laser profiler in simulation: a fan of rays from the wrist, cast at the real geometry, then noise, rounding and lost returns."""
 
 import dataclasses as dc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import open3d as o3d
@@ -189,12 +189,7 @@ class ProfilerSensor(LeafSystem):
         self._poses = self.DeclareAbstractInputPort("body_poses", AbstractValue.Make([RigidTransform()]))
         self._shown = self.DeclareAbstractState(AbstractValue.Make(ProfileScan()))
         self._pending = self.DeclareAbstractState(AbstractValue.Make(ProfileScan()))
-        self.DeclareAbstractOutputPort(
-            "profile",
-            lambda: AbstractValue.Make(ProfileScan()),
-            self._output,
-            {self.abstract_state_ticket(self._shown)},
-        )
+        self.DeclareStateOutputPort("profile", self._shown)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -211,9 +206,6 @@ class ProfilerSensor(LeafSystem):
         points = measured_profile(self._config, clean, cosine, dark, np.random.default_rng([self._seed, wanted]))
         scan = ProfileScan(wanted, last_step(now, self._step), points)
         state.get_mutable_abstract_state(self._pending).set_value(scan)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
 class TouchSensor(LeafSystem):
@@ -233,9 +225,7 @@ class TouchSensor(LeafSystem):
         self._pair, self._step = {pair.tip, pair.ball}, plant_period_s
         self._contacts = self.DeclareAbstractInputPort("contact_results", AbstractValue.Make(ContactResults()))
         self._touch = self.DeclareAbstractState(AbstractValue.Make(TorchTouch()))
-        self.DeclareAbstractOutputPort(
-            "touch", lambda: AbstractValue.Make(TorchTouch()), self._output, {self.abstract_state_ticket(self._touch)}
-        )
+        self.DeclareStateOutputPort("touch", self._touch)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -253,9 +243,6 @@ class TouchSensor(LeafSystem):
         info = results.point_pair_contact_info(k)
         pair = info.point_pair()
         return {pair.id_A, pair.id_B} == self._pair and float(np.linalg.norm(info.contact_force())) > FORCE_N
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._touch).get_value())
 
 
 class CheatTorch(LeafSystem):

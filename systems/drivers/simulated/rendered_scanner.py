@@ -1,7 +1,7 @@
 """A structured-light scanner in simulation: depth rendering at the real geometry, then the scanner's own noise."""
 
 import dataclasses as dc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,9 +109,7 @@ class DepthSensor(LeafSystem):
         )
         self._shown = self.DeclareAbstractState(AbstractValue.Make(Scan()))
         self._pending = self.DeclareAbstractState(AbstractValue.Make(Scan()))
-        self.DeclareAbstractOutputPort(
-            "scan", lambda: AbstractValue.Make(Scan()), self._output, {self.abstract_state_ticket(self._shown)}
-        )
+        self.DeclareStateOutputPort("scan", self._shown)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -136,9 +134,6 @@ class DepthSensor(LeafSystem):
             return None
         rgb = np.asarray(self._color.Eval(context).data[:, :, :3], dtype=np.float32)
         return darkness(rgb)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
 def _carrier(world: SimulatedWorld, mounted_on: str) -> RigidBody | None:

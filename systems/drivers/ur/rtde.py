@@ -1,7 +1,7 @@
 """A real UR behind the station's ports: reads the link in an update event, sends in a publish event, computes nothing else."""
 
 import dataclasses as dc
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -13,11 +13,10 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
-from weldcal.systems.drivers.ur.link import LinkState, UrLink
+from weldcal.systems.drivers.ur.link import UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import Limits
-from weldcal.systems.messages import UrStatus
 
 FULL_PACE = 1.0
 STILL_RAD_S = 1e-9
@@ -44,16 +43,6 @@ class UrRtde(DriverConfig):
         return Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
-
-
-class ArmLink(Protocol):
-    """What the arm needs of its link; neither call blocks."""
-
-    def state(self) -> LinkState:
-        """The newest state."""
-
-    def command(self, qd: np.ndarray, process: bool = False) -> int:
-        """Hand over the newest joint velocity (6,) rad/s, and whether the process may run."""
 
 
 class UrRtdeArm(LeafSystem):
@@ -97,8 +86,7 @@ class UrRtdeArm(LeafSystem):
         self.DeclareVectorOutputPort("velocity_measured", 6, self._velocity, ticket)
         self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
         self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
-        said = {self.abstract_state_ticket(self._said)}
-        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(UrStatus()), self._status, said)
+        self.DeclareStateOutputPort("status", self._said)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._read)
         self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
 
@@ -134,9 +122,6 @@ class UrRtdeArm(LeafSystem):
 
     def _time(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
-
-    def _status(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._said).get_value())
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:

@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -71,12 +70,7 @@ class MountingCalibrator(LeafSystem):
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._history_2 = self.DeclareAbstractInputPort("history_2", AbstractValue.Make(PoseHistory()))
         self._status = self.DeclareAbstractState(AbstractValue.Make(MountingStatus()))
-        self.DeclareAbstractOutputPort(
-            "status",
-            lambda: AbstractValue.Make(MountingStatus()),
-            self._output,
-            {self.abstract_state_ticket(self._status)},
-        )
+        self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -89,9 +83,6 @@ class MountingCalibrator(LeafSystem):
         q_2 = self._history_2.Eval(context).joints_at(scan.capture_time) if self._scene.two else None
         new = digest(status, scan, job, (q, q_2), self._scene, self._config, self._plan)
         state.get_mutable_abstract_state(self._status).set_value(new)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._status).get_value())
 
 
 def digest(

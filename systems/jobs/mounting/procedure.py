@@ -69,7 +69,7 @@ class MountingProcedure(LeafSystem):
                 name, lambda: AbstractValue.Make(JobCommand()), lambda c, o, arm=arm: self._job(c, o, arm), ticket
             )
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
-        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(MountingState()), self._show, ticket)
+        self.DeclareStateOutputPort("state", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -154,9 +154,6 @@ class MountingProcedure(LeafSystem):
 
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().trigger))
-
-    def _show(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
 
 
 def _go(s: MountingState, route: tuple[tuple[int, Array], ...], label: str, now: float) -> MountingState:

@@ -103,9 +103,9 @@ class ProfilerProcedure(LeafSystem):
         out = self.DeclareDiscreteState(np.zeros(6))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
-        self.DeclareVectorOutputPort("creep", 6, self._creep, {self.discrete_state_ticket(out)})
+        self.DeclareStateOutputPort("creep", out)
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
-        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(ProfilerState()), self._show, ticket)
+        self.DeclareStateOutputPort("state", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -300,11 +300,5 @@ class ProfilerProcedure(LeafSystem):
             )
         )
 
-    def _creep(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value())
-
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().sequence))
-
-    def _show(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())

@@ -178,7 +178,7 @@ class TabletProcedure(LeafSystem):
         out = self.DeclareDiscreteState(np.zeros(6))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
-        self.DeclareVectorOutputPort("descent", 6, self._descent, {self.discrete_state_ticket(out)})
+        self.DeclareStateOutputPort("descent", out)
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
         self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(TabletState()), self._show, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
@@ -222,9 +222,6 @@ class TabletProcedure(LeafSystem):
                 reason=s.reason or None,
             )
         )
-
-    def _descent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value())
 
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(self.stands(context).trigger))

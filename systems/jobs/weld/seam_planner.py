@@ -1,7 +1,6 @@
 """SeamPlanner: a scan of the workpiece in, the planned seam in the base out, with the arm's way to its beginning."""
 
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,12 +60,7 @@ class SeamPlanner(LeafSystem):
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(PlannedSeam()))
-        self.DeclareAbstractOutputPort(
-            "planned_seam",
-            lambda: AbstractValue.Make(PlannedSeam()),
-            self._output,
-            {self.abstract_state_ticket(self._state)},
-        )
+        self.DeclareStateOutputPort("planned_seam", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -108,9 +102,6 @@ class SeamPlanner(LeafSystem):
             sigma_m=found.sigma_m,
             words=found.summary,
         )
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
 
 
 class SeamOutOfReach(WeldcalError):
