@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, command
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-WidthOption = Annotated[
-    int, typer.Option("--width", metavar="PX", min=200, help="Width of the PhoXi M images; 2064 is the full width.")
-]
-FlangeName = Annotated[str, typer.Option("--flange", metavar="NAME", help="Flange standard.")]
+WidthOption = Annotated[int, option("--width", "PX", "Width of the PhoXi M images; 2064 is the full width.", min=200)]
+FlangeName = Annotated[str, option("--flange", "NAME", "Flange standard.")]
 FLANGE = "iso9409-1-50-4-m6"
 
 
@@ -23,7 +21,7 @@ FLANGE = "iso9409-1-50-4-m6"
 def speed(
     call: Call,
     loop: Annotated[
-        bool, typer.Option("--loop/--no-loop", help="Also run the paper's search as a Python loop; takes seconds.")
+        bool, switch("--loop/--no-loop", "Also run the paper's search as a Python loop; takes seconds.")
     ] = True,
 ) -> Outcome:
     """Time the detection of the flange in a scan and compare with the paper's loop, an Open3D chain and a PCL-style search."""
@@ -47,9 +45,7 @@ def speed(
 @command("benchmark flange-frames")
 def frames(
     call: Call,
-    count: Annotated[
-        int, typer.Option("--frames", metavar="N", min=1, help="Number of frames with a flange, and without.")
-    ] = 500,
+    count: Annotated[int, option("--frames", "N", "Number of frames with a flange, and without.", min=1)] = 500,
     width: WidthOption = 824,
     flange: FlangeName = FLANGE,
 ) -> Outcome:
@@ -82,12 +78,8 @@ def frames(
 @command("benchmark flange-hidden")
 def hidden(
     call: Call,
-    count: Annotated[
-        int, typer.Option("--frames", metavar="N", min=1, help="Number of frames for each kind of occlusion.")
-    ] = 30,
-    share: Annotated[
-        float, typer.Option("--share", metavar="S", min=0.0, max=0.9, help="Hidden share of the flange's width.")
-    ] = 0.5,
+    count: Annotated[int, option("--frames", "N", "Number of frames for each kind of occlusion.", min=1)] = 30,
+    share: Annotated[float, option("--share", "S", "Hidden share of the flange's width.", min=0.0, max=0.9)] = 0.5,
     width: WidthOption = 824,
     flange: FlangeName = FLANGE,
 ) -> Outcome:
@@ -137,10 +129,7 @@ def parts(
 
 @command("benchmark flange-honesty")
 def honesty(
-    call: Call,
-    runs: Annotated[
-        int, typer.Option("--runs", metavar="N", min=10, help="Number of calibrations of each size.")
-    ] = 500,
+    call: Call, runs: Annotated[int, option("--runs", "N", "Number of calibrations of each size.", min=10)] = 500
 ) -> Outcome:
     """Measure how often the stated 95 % regions contain the truth, and the ratio of held-out to true errors."""
     from weldcal.tools.report.render import write_atomic
@@ -162,21 +151,13 @@ def honesty(
 @command("benchmark flange-live")
 def live(
     call: Call,
-    seeds: Annotated[
-        int, typer.Option("--seeds", metavar="N", min=1, help="Number of calibrations, each in its own world.")
-    ] = 10,
-    scans: Annotated[int, typer.Option("--scans", metavar="N", min=4, max=8, help="Scans of each calibration.")] = 8,
+    seeds: Annotated[int, option("--seeds", "N", "Number of calibrations, each in its own world.", min=1)] = 10,
+    scans: Annotated[int, option("--scans", "N", "Scans of each calibration.", min=4, max=8)] = 8,
     repeatability: Annotated[
-        float,
-        typer.Option(
-            "--repeatability", metavar="MM", min=0.0, help="Repeatability of the arm: rms distance of the flange."
-        ),
+        float, option("--repeatability", "MM", "Repeatability of the arm: rms distance of the flange.", min=0.0)
     ] = 0.05,
     redraws: Annotated[
-        int,
-        typer.Option(
-            "--redraws", metavar="N", min=0, help="Further calibrations from the poses of each, with new noise."
-        ),
+        int, option("--redraws", "N", "Further calibrations from the poses of each, with new noise.", min=0)
     ] = 50,
 ) -> Outcome:
     """Measure the error of the live calibration in simulation and compare with the Cramer-Rao bound."""
@@ -273,9 +254,7 @@ def ingredients(
 def few(
     call: Call,
     dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least eight scans.")],
-    draws: Annotated[
-        int, typer.Option("--draws", metavar="N", min=2, help="Number of random draws of each size.")
-    ] = 60,
+    draws: Annotated[int, option("--draws", "N", "Number of random draws of each size.", min=2)] = 60,
 ) -> Outcome:
     """Calibrate from 1, 2, 3, 4, 6, 8 or 12 of the scans and measure the error on the scans that were not used."""
     import numpy as np
