@@ -1,7 +1,5 @@
 """weldcal hand-eye live: a calibration in any mounting, from the first pose to the report, against the truth where it is known."""
 
-import csv
-import io
 import json
 import time
 from hashlib import sha256
@@ -16,6 +14,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import FinishedRun, run_job
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.mounting import mounting_report
 from weldcal.tools.report.mounting_picture import station_picture
 from weldcal.tools.report.render import write_atomic
@@ -59,13 +58,12 @@ def write_mounting(report: MountingReport, finished: FinishedRun) -> None:
 def _sightings(report: MountingReport) -> str:
     """One row a scan: joints (deg), centre (mm) and normal in the camera frame, share of the edge that was seen."""
     two = report.job.scene.two
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     joints = [f"q{i}_deg" for i in range(1, 7)] + ([f"second_q{i}_deg" for i in range(1, 7)] if two else [])
-    writer.writerow(["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"])
+    columns = ["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"]
+    rows = []
     for s in report.status.seen:
         q = np.degrees(s.pose.q if s.pose.q_2 is None else np.concatenate([s.pose.q, s.pose.q_2]))
         normal = np.zeros(3) if s.sighting.n_CM is None else s.sighting.n_CM
         values = [*q, *(1e3 * s.sighting.p_CM), *normal, s.coverage]
-        writer.writerow([s.label, *(json.dumps(round(float(v), 6)) for v in values)])
-    return text.getvalue()
+        rows.append([s.label, *(json.dumps(round(float(v), 6)) for v in values)])
+    return csv_text(columns, rows)

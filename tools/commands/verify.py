@@ -1,7 +1,6 @@
 """`weldcal verify RESULT DATASET`: measures the errors of a calibration at the flange on scans that it did not use."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +14,10 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import PoseError, VerifyReport
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.verify import verify_report
-
-Progress = Callable[[str, float], None]
 
 _FEW = 4
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a verification

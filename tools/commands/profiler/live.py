@@ -1,6 +1,5 @@
 """weldcal profiler live: run the profiler's job, write its measurements as files, its calibrations and a report; over seeds, a table."""
 
-import csv
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
@@ -18,6 +17,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import FinishedRun, run_job
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.profiler import WITHIN_MM, LiveOutcome, ProfilerLive, live_outcome
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.profiler_live import live_report, seeds_report
 from weldcal.tools.report.render import write_atomic
 
@@ -57,7 +57,7 @@ def write_live(live: ProfilerLive, finished: FinishedRun) -> None:
             )
     if s.seam is not None:
         rows = [dict(zip(("x_mm", "y_mm", "z_mm"), (f"{1e3 * v:.4f}" for v in p), strict=True)) for p in s.seam.points_B]  # fmt: skip
-        write_atomic(folder / "seam.csv", _csv(rows))
+        write_atomic(folder / "seam.csv", mappings_csv(rows))
     finished.write_recording(folder)
     write_atomic(
         folder / "report.html", live_report(live.summary(), live.outcome, s, recording=finished.meshcat is not None)
@@ -99,7 +99,7 @@ def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progr
         rows.append(_flat(live.summary()))
         outcomes.append(live.outcome)
         columns = list(dict.fromkeys(name for row in rows for name in row))
-        write_atomic(options.out / "seeds.csv", _csv([{c: row.get(c, "") for c in columns} for row in rows]))
+        write_atomic(options.out / "seeds.csv", mappings_csv([{c: row.get(c, "") for c in columns} for row in rows]))
     done = [row for row in rows if row["state"] == "done"]
     found: dict[str, object] = {"state": "done" if len(done) == runs else "held", "scenario": options.scenario}
     found |= {"runs": runs, "runs_done": len(done)}
@@ -130,11 +130,3 @@ def _flat(summary: Mapping[str, object]) -> dict[str, object]:
         else:
             row[name] = value
     return row
-
-
-def _csv(rows: Sequence[Mapping[str, object]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

@@ -16,8 +16,9 @@ from weldcal.tools.commands.demo import known_camera, measure
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
+from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import fixed, write_atomic
-from weldcal.tools.studies.output import print_note, print_table, records_csv, write_json
+from weldcal.tools.studies.output import print_note, print_table
 from weldcal.tools.studies.targets import Target, print_targets
 from weldcal.welding.servo.laws import get_law
 

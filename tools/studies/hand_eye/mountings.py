@@ -12,8 +12,9 @@ from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import markdown_table, write_json
+from weldcal.tools.studies.output import markdown_table
 
 HEADER = (
     "scenario", "runs", "scans", "point at best distance, mm: expected / true median / worst",

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import write_json
 from weldcal.tools.studies.profiler.edge import all_sets, ball_points
 from weldcal.tools.studies.profiler.fixed import fixed_lines, published_lines, require_files
 from weldcal.tools.studies.profiler.report import profiler_report

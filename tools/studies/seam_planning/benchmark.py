@@ -5,8 +5,8 @@ from pathlib import Path
 
 from weldcal.models.scanners import SCANNERS
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.report.files import records_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import records_csv
 from weldcal.tools.studies.seam_planning.trials import (
     COLUMNS,
     FIRST_HELD_OUT,

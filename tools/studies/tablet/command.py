@@ -4,8 +4,8 @@ import time
 
 from weldcal.calibration.tablet.planar.linear import fit_linear
 from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import write_json
 from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.report import tablet_report
 from weldcal.tools.studies.tablet.results import TabletOptions, TabletStudy
