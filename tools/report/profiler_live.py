@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
@@ -36,7 +35,6 @@ def live_report(summary: Mapping[str, object], outcome: LiveOutcome, state: Prof
         header=(),
         tip_mm=outcome.tip_mm,
         recording=recording,
-        software=software_version(),
     )
 
 
@@ -61,7 +59,6 @@ def seeds_report(
         header=tuple(_COLUMNS[c] for c in columns),
         tip_mm=None,
         recording=False,
-        software=software_version(),
     )
 
 

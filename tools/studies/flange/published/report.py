@@ -4,7 +4,6 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
 from weldcal.models.arrays import Array
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.flange.published import plots
@@ -178,7 +177,6 @@ def study_report(study: Study, drawn: Mapping[str, bytes]) -> str:
         },
         statistics=statistics,
         circle_sentences={c.name: circle_sentence(c) for c in study.clouds},
-        software=software_version(),
         degrees=np.degrees,
     )
 
