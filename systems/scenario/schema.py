@@ -67,9 +67,8 @@ class WorkpieceConfig:
     located_by: str = "scan"  # scan: registered to its CAD; drawing: the fixture's drawing is believed
     placement_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the plate on the fixture
     groove_error: ErrorConfig = dc.field(default_factory=ErrorConfig)  # of the groove against the plate's datums
-    hole_from_mm: float | None = (
-        None  # from this arc length on the real groove has no walls, unseen by the scan: contact is lost
-    )
+    # from this arc length on the real groove has no walls, unseen by the scan: contact is lost
+    hole_from_mm: float | None = None
 
 
 @dc.dataclass

@@ -41,9 +41,8 @@ class RenderedFingerCamera(FingerCameraConfig):
     rate_hz: float = 30.0
     latency_s: float = 0.040
     noise_grey: float = 2.0
-    hidden_from_s: float | None = (
-        None  # spatter on the lens: from this time after the camera started, the tag is not seen
-    )
+    # spatter on the lens: from this time after the camera started, the tag is not seen
+    hidden_from_s: float | None = None
 
     def camera(self) -> FingerCamera:
         """The camera as numbers."""

@@ -48,9 +48,8 @@ class RenderedProfiler(DriverConfig):
     quantum_mm: float = 0.1
     share_missing: float = 0.01
     share_spikes: float = 0.005
-    grazing_deg: float = (
-        78.0  # a surface this steep to the ray returns half of what it should, one 8 degrees steeper nothing
-    )
+    # a surface this steep to the ray returns half of what it should, one 8 degrees steeper nothing
+    grazing_deg: float = 78.0
     exposure_s: float = 0.004
 
     @property

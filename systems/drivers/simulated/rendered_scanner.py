@@ -42,15 +42,13 @@ class RenderedScanner(ScannerConfig):
     height: int | None = 616
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.95])  # nominal X_BC
     rpy_deg: list[float] = dc.field(default_factory=lambda: [180.0, 0.0, -90.0])
-    mounting_translation_mm: float = (
-        15.0  # the true pose differs from the nominal one by this much, drawn from the seed
-    )
+    # the true pose differs from the nominal one by this much, drawn from the seed
+    mounting_translation_mm: float = 15.0
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
     field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
-    mounted_on: str = (
-        "base"  # or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
-    )
+    # base, or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
+    mounted_on: str = "base"
 
     def scanner(self) -> ScannerPreset:
         """The scanner with the resolution and the field of view that are asked for; pixels stay as square as they were."""

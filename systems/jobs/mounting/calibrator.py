@@ -26,9 +26,8 @@ from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
-FIT_SHARE = (
-    1.25  # errors of the fits over their own sigma (which takes a scan's noise for independent), rms in simulated scans
-)
+# errors of the fits over their own sigma (which takes a scan's noise for independent), rms in simulated scans
+FIT_SHARE = 1.25
 
 
 @dc.dataclass(frozen=True)

@@ -87,9 +87,8 @@ class ProfilerJob:
     edge: EdgeStage = dc.field(default_factory=EdgeStage)
     sphere: SphereStage = dc.field(default_factory=SphereStage)
     seam: SeamStage = dc.field(default_factory=SeamStage)
-    robot_sigma_mm: float = (
-        0.06  # per axis, of where the flange is against where the controller says, anew at each pose
-    )
+    # per axis, of where the flange is against where the controller says, anew at each pose
+    robot_sigma_mm: float = 0.06
     clearance_mm: float = 6.0  # between torch or profiler and what is scanned, as thought
     near_mm: float = 72.0  # the field in which the calibration measures
     far_mm: float = 105.0
