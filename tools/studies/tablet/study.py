@@ -115,7 +115,7 @@ def _evolved(touches: TabletTouches, model: Model, stage: int, seed: int) -> Sta
     )
 
 
-def evaluation_seconds(touches: TabletTouches, repeats: int = 300) -> tuple[float, float]:
+def evaluation_seconds(touches: TabletTouches) -> tuple[float, float]:
     """Seconds of one evaluation of Eq. 17, alone and as one of 10,000 at once (medians)."""
     x = STAGE_1["htm"].parameters[None]
     crowd = np.repeat(x, PUBLISHED_POPULATION, axis=0)
@@ -124,7 +124,7 @@ def evaluation_seconds(touches: TabletTouches, repeats: int = 300) -> tuple[floa
         r = stage1_residuals(touches, parameters, "htm", Sign.PRINTED)
         return np.asarray(np.sqrt((r**2).sum(axis=2)).sum(axis=1) / 9.0)
 
-    return median_seconds(lambda: objective(x), repeats), median_seconds(lambda: objective(crowd), 5) / len(crowd)
+    return median_seconds(lambda: objective(x), 300), median_seconds(lambda: objective(crowd), 5) / len(crowd)
 
 
 def median_seconds(work: Callable[[], object], repeats: int) -> float:
