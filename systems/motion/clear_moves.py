@@ -1,7 +1,5 @@
 """Checks that moves on straight lines in joint space keep the arm clear of the table and of itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
