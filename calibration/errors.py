@@ -1,7 +1,5 @@
 """Exceptions of the calibration package; each message names what to change."""
 
-from __future__ import annotations
-
 from weldcal.models.errors import InputError, WeldcalError
 
 

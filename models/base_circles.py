@@ -1,7 +1,5 @@
 """The circle of a robot's base mounting: its standard and its pose in the base."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pydrake.math import RigidTransform

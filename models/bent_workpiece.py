@@ -1,7 +1,5 @@
 """Bends a grooved plate over a cylinder: the same seam in space, with an up-normal that turns along it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Applies a scanner's errors to a perfect depth map: noise, warp, flying pixels, dropouts and quantisation; seeded."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Base classes of all named exceptions."""
 
-from __future__ import annotations
-
 
 class WeldcalError(Exception):
     """A problem that the user can put right; its text is one clear sentence that says what to change."""

@@ -8,8 +8,6 @@ the 31,5, 40 and 50 sizes agree with vendors' manuals (Universal Robots, Robotiq
 the bore depths and the hole angles of the six-hole sizes are not confirmed: measure before relying on them.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

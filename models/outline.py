@@ -1,7 +1,5 @@
 """Extracts the feature edges of a mesh: creases and open boundaries."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

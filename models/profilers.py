@@ -3,8 +3,6 @@
 Frame S: x along the laser line, z away from the sensor, y across the plane of light; a profile point [x, z] is (x, 0, z).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

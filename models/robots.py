@@ -1,7 +1,5 @@
 """Supported robots: flange, payload, reach, and the sources of their numbers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

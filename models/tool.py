@@ -1,20 +1,17 @@
 """The touch-based welding tool (paper, Fig. 7): plate with flange ring, finger camera, soft tip with tag, torch."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.optimize import brentq
 
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-Array = NDArray[np.float64]
 LAST_LINK = len(LINKS)  # the flange's link, counted as in kinematics.link_frames (0 is the base)
 
 # z_F points out of the flange (down while welding); the ring, the tip frame and the torch all have their z up, against z_F.

@@ -1,7 +1,5 @@
 """Builds the cell Diagram of a scenario: the station, the spine shared by all jobs, and the scenario's job."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 

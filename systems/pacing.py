@@ -1,7 +1,5 @@
 """Paces the Diagram by the wall clock: waits while it is ahead; reports lateness and does not catch up."""
 
-from __future__ import annotations
-
 import gc
 import os
 import threading
@@ -26,10 +24,7 @@ class WallClock:
     """
 
     def __init__(
-        self,
-        pace: float,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        self, pace: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
     ) -> None:
         self._pace, self._clock, self._sleep = pace, clock, sleep
         self._anchor: tuple[float, float] | None = None  # wall clock, Diagram

@@ -1,7 +1,5 @@
 """Runs a cell: advances its Diagram until the job ends, in real time for a real robot, and stores every scan."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import ExitStack

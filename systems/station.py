@@ -1,7 +1,5 @@
 """Builds the station: arms, sensors and tools with fixed ports; the scenario's driver configs select real or simulated."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 import inspect
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A DiagramBuilder of a cell with the objects that its parts share, and methods to add and connect systems."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Output of the commands: progress, summary, JSON and the error boundary."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import json

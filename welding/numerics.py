@@ -3,8 +3,6 @@
 A product of two 3-vectors costs a microsecond here and twenty in `numpy.cross`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Reads point clouds from PLY, PCD, NPZ, NPY and text files; refuses damaged ones with a reason."""
 
-from __future__ import annotations
-
 import re
 import zipfile
 import zlib
@@ -11,11 +9,9 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 _TEXT = (".csv", ".txt", ".xyz")
 SUFFIXES = (".ply", ".pcd", ".npz", ".npy", *_TEXT)

@@ -1,7 +1,5 @@
 """Reads, checks and writes a calibration dataset folder: poses, clouds and pairs."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 from collections.abc import Mapping
@@ -9,7 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load_typed
 from pydrake.math import RigidTransform, RotationMatrix
@@ -18,9 +15,8 @@ from weldcal.calibration.data.clouds import NO_NOTES, CloudError, find_cloud, re
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 CONFIGURATIONS = ("eye_on_base",)

@@ -1,7 +1,5 @@
 """Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile
@@ -11,16 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump, yaml_load
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 RESULT_FILE = "calibration.yaml"
 

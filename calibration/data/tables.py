@@ -1,7 +1,5 @@
 """Reads CSV tables with any usual separator, decimal commas, comments and headers in any case."""
 
-from __future__ import annotations
-
 import csv
 import re
 from pathlib import Path

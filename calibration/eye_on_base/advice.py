@@ -1,17 +1,13 @@
 """Advises which poses to add and when to stop, from what the poses so far leave uncertain."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _TURN_DEG = 15.0  # orientations that differ by less hardly tell a bias of the centre from a shift of the camera
 _FLAT = 0.25  # of the widest spread of positions: less in a direction leaves the rotation about the others weak

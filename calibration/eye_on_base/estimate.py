@@ -1,7 +1,5 @@
 """The estimate of X_BC with its covariance, residuals and held-out errors, and the error of a scanned point."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +10,8 @@ from scipy.stats import f as f_distribution
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.geometry.se3 import skew
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 

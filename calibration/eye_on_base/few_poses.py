@@ -1,12 +1,9 @@
 """Estimates X_BC from one, two or three scans, from normals or from whole poses by the hole pattern."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import TooFewPoses
@@ -17,8 +14,7 @@ from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.planning.observability import unobservable_sentences
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 ENOUGH = 4
 """Poses from which on a calibration needs no such help."""

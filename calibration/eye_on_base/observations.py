@@ -1,12 +1,9 @@
 """Fits the flange in every cloud of a dataset; returns observations and the reasons of refused scans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.clouds import CloudError
@@ -17,10 +14,9 @@ from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGue
 from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.published.icp import face_cloud
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
-
-Array = NDArray[np.float64]
 
 _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error is searched for in the whole scan
 

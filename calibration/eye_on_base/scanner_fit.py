@@ -1,12 +1,9 @@
 """Fits a scanner correction to observations of the flange, from the robot's motion and from the hole circles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
@@ -16,8 +13,7 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 LEAST_PATTERNS = 6
 STARTS = 30  # random starts of an estimate: these observations are cleared of gross outliers

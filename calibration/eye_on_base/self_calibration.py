@@ -1,12 +1,9 @@
 """Decides whether to correct the scanner, by comparing robot motion, hole circles and held-out errors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
@@ -22,9 +19,8 @@ from weldcal.calibration.eye_on_base.scanner_fit import (
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 _LEAST_POSES = 8  # nine unknowns, and as many held-out errors as make a comparison
 _LEAST_FOR_THIRD = 12  # sixteen unknowns

@@ -18,10 +18,10 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets, fit_rotation
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.observability import check_diversity, unobservable_sentences
+from weldcal.models.arrays import Array
 
 __all__ = ["CalibrationEstimate", "HeldOut", "SolveConfig", "estimate_eye_on_base", "point_error_covariance"]
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _GATE = 6.5  # in sigma per axis: only gross outliers go; a scanner's distortion at the rim of its field reaches five

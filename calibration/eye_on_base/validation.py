@@ -1,12 +1,9 @@
 """Held-out errors of a calibration: k-fold cross-validation and convergence over the number of scans."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
@@ -15,9 +12,9 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.algorithm1 import Cost, algorithm1_start, algorithm1_step, translation_cost
 from weldcal.calibration.published.icp import VerificationError, Verifier
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-Array = NDArray[np.float64]
 Solve = Callable[[list[Observation]], tuple[RigidTransform, ScannerCorrection]]
 """Camera pose and scanner correction from observations."""
 

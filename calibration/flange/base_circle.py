@@ -1,7 +1,5 @@
 """Fits the circle of a robot's base mounting in a scan that shows only an arc of it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +13,9 @@ from weldcal.calibration.flange.rim import coverage, plane_axes
 from weldcal.calibration.flange.search import window_about
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, local_planes
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _TILT_RAD = 0.2  # between the guessed normal and a plane that is tried

@@ -1,7 +1,5 @@
 """Maximum-likelihood circle fit to pixels labelled on or off a face; missing pixels are ignored."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,8 +10,8 @@ from scipy.special import ndtr
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.geometry.circle import CircleFit
 from weldcal.calibration.geometry.compiled import compiled
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 

@@ -1,7 +1,5 @@
 """Fits the concentric edges of a flat face and tests whether it is a flange."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,9 +11,8 @@ from weldcal.calibration.flange.rim import EdgePoints, FacePixels, coverage, pla
 from weldcal.calibration.flange.scene import Scene
 from weldcal.calibration.geometry.circle import CircleFit, fit_circle
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-
-Array = NDArray[np.float64]
 
 _CHAMFER_M = 0.0025  # a surface that goes on at most this far below the face is its chamfer, not another part
 _CHAMFER_SHARE = 0.2  # of the edge: more than flying pixels and noise could make look so

@@ -1,11 +1,8 @@
 """Finds a flange in a scan: the plane of its face and the centre of its concentric edges."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal, faces_on_plane
@@ -17,11 +14,11 @@ from weldcal.calibration.flange.track import fit_tracked
 from weldcal.calibration.flange.window import measure_window
 from weldcal.calibration.geometry.circle import fuse
 from weldcal.calibration.geometry.plane import local_planes
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
 __all__ = ["FlangeFit", "FlangeFitConfig", "FlangeGuess", "FlangeNotFound", "fit_flange"]
 
-Array = NDArray[np.float64]
 
 _GOOD_COVERAGE = 0.8  # a face seen this well, with its bore, ends the search
 _WARP = 0.2  # and so much of that along the normal: a scanner's warp tilts a half more than it tilts the whole

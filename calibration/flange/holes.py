@@ -1,7 +1,5 @@
 """Finds the hole pattern of a flange: its rotation about the flange axis and the scale of its pitch circle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,9 +11,8 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.search import typical_pitches, window_about
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-
-Array = NDArray[np.float64]
 
 _LEAST_HOLES = 4  # of a pattern: three would fit a wrong phase too easily
 _LEAST_EDGES = 17  # of a hole's 24 sectors

@@ -1,17 +1,13 @@
 """One observation of the flange: its pose in the base from the robot, and its centre and normal from the scanner."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,10 @@
 """Models the viewing rays of an organised scan over its pixels: quadratic, or pinhole where that fits."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
+
 Mask = NDArray[np.bool_]
 
 _BENT = 0.05  # pixels: a lens that bends rays more is for the careful way, which knows quadratics

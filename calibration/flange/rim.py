@@ -1,7 +1,5 @@
 """Locates the edges of a flat face: mask crossings in organised clouds, extreme points per sector in unordered ones."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,8 +7,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from weldcal.calibration.flange.rays import RayModel
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SMOOTHING_PX = 1.0  # of the face mask before its edge is located

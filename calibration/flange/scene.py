@@ -20,8 +20,8 @@ from weldcal.calibration.flange.rim import (
     plane_axes,
 )
 from weldcal.calibration.geometry.plane import PlaneFit
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Labels = NDArray[np.intp]
 

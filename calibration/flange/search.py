@@ -1,7 +1,5 @@
 """Searches an organised scan for the flange: flat parts on a thinned grid, then a fit at full resolution."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -13,9 +11,8 @@ from numpy.typing import NDArray
 from weldcal.calibration.flange.face import Face, FlangeFitConfig, Refusal
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.flange.window import measure_window
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-
-Array = NDArray[np.float64]
 
 _ACROSS = 7.0  # thinned pixels across the flat ring: fewer do not keep it in one piece between its holes
 _BEND_M = 2.5e-4  # least depth by which three neighbours must bend to be no plane, above the scan's own noise

@@ -1,7 +1,5 @@
 """Fits plane and both edges to a cloud that shows little but the flange; returns None where it does not."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
@@ -13,9 +11,9 @@ from weldcal.calibration.flange.rim import plane_axes, sector_count
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, weighted_moments
 from weldcal.calibration.geometry.robust import MAD, TUKEY
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 _FEW = 1200  # points that find the plane and the outline; all of them then measure

@@ -1,13 +1,9 @@
 """Information of a patch of the flange's surface on an error of its pose, and the components it leaves unobservable."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
-
-Array = NDArray[np.float64]
 
 COMPONENTS = (
     "tilt about x",

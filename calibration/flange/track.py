@@ -1,7 +1,5 @@
 """Fits plane and both edges of a flange within 3 mm of a given pose; returns None where it is not found there."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -26,9 +24,9 @@ from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
 from weldcal.calibration.geometry.robust import TUKEY
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 Index = NDArray[np.int64]

@@ -1,7 +1,5 @@
 """Compiles the flange fit's loops by fitting a synthetic flange once."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fits a flange face in a window of an organised scan: plane, edge crossings, and both circles from pixel labels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2
@@ -24,9 +22,9 @@ from weldcal.calibration.flange.rays import RayModel
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
 from weldcal.calibration.geometry.plane import PlaneFit, fit_plane, shared_noise
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _PLANE_POINTS = 4000

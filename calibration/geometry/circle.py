@@ -1,7 +1,5 @@
 """Robust geometric circle fit in the plane, with the covariance of centre and radius."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,8 +9,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _STEPS = 7  # of Gauss-Newton in the compiled fit
 

@@ -1,7 +1,5 @@
 """Decorator that compiles a loop with Numba on its first call and caches the machine code on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

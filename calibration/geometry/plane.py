@@ -1,7 +1,5 @@
 """Robust plane fits: seeded local hypotheses, Tukey-weighted least squares, and compiled fits for many points."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2
@@ -12,8 +10,8 @@ from scipy.spatial import cKDTree
 from weldcal.calibration.errors import PlaneFitError
 from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Single = NDArray[np.float32]
 
 _FEW = 1200  # points that find the plane, before all of them make it precise

@@ -1,12 +1,10 @@
 """Closed-form rigid registration of two point sets or direction sets: the paper's Eq. (10) to (12)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def fit_rigid(p_B: Array, p_C: Array, *, weights: Array | None = None) -> RigidTransform:

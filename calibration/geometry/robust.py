@@ -1,13 +1,9 @@
 """Robust statistics for compiled loops: Tukey's and the MAD's constants, a median, a small Cholesky solution."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.geometry.compiled import compiled
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 TUKEY = 4.685  # 95 % efficient on Gaussian noise
 MAD = 1.4826  # median absolute deviation -> standard deviation of a Gaussian

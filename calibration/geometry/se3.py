@@ -1,13 +1,10 @@
 """SE(3) on arrays: inverse, logarithm and exponential of rotations, small changes and means of 4 x 4 poses."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RotationMatrix
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 IDENTITY: Array = np.eye(4)
 IDENTITY.setflags(write=False)

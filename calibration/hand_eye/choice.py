@@ -1,7 +1,5 @@
 """Solves one hand-eye problem: starts, outlier rejection, candidate weightings, and the choice by held-out errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 
@@ -15,8 +13,8 @@ from weldcal.calibration.hand_eye.fit import Fit, descend, fit, noise_of
 from weldcal.calibration.hand_eye.linearisation import Loss
 from weldcal.calibration.hand_eye.problem import Problem, State, residuals
 from weldcal.calibration.hand_eye.starts import closed_forms, grid
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _GATE = 8.0  # sigma per axis, as in the eye-on-base solver: only gross outliers go

@@ -1,13 +1,10 @@
 """Refines a hand-eye calibration by reprojection of board corners, with an optional shift of the principal point."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
@@ -17,9 +14,8 @@ from weldcal.calibration.hand_eye.choice import CANDIDATES
 from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.problem import NAMES, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-
-Array = NDArray[np.float64]
 
 _LEVEL = 0.01  # at which a shift of the principal point is no chance
 _STEP_PX = 0.1  # of the differences that carry its uncertainty into the poses

@@ -1,19 +1,15 @@
 """Checks what the motion determines: diversity before the solution, unobservable directions after it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import CoplanarPoses, PureTranslation, RepeatedPoses, TooFewPoses
 from weldcal.calibration.geometry.se3 import log_rotation, nearest_rotation
 from weldcal.calibration.hand_eye.linearisation import RANK
 from weldcal.calibration.hand_eye.problem import NAMES, Problem, State
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 SAME_TURN_RAD = 2e-3
 SAME_PLACE_SHARE = 2e-3  # of the extent of the motion

@@ -1,7 +1,5 @@
 """Exports a hand-eye result to YAML, JSON, URDF, ROS 2, URScript and Drake directives."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Reads pose pairs from npz, CSV and JSON files and from the samples of easy_handeye2 and MoveIt."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 import zlib
@@ -10,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_load
 from scipy.spatial.transform import Rotation
 
@@ -19,9 +16,8 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.calibration.hand_eye.solve import as_poses
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 _NAMES = {
     "robot": ("A", "robot", "X_BF", "X_base_gripper"), "camera": ("B", "camera", "X_CM", "X_camera_target"),

@@ -1,7 +1,5 @@
 """Robust weighted least squares on SE(3); variances of rotation and translation come from the residuals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +8,8 @@ from numpy.typing import NDArray
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.hand_eye.linearisation import TINY, Loss, Noise, Scaled, pull
 from weldcal.calibration.hand_eye.problem import Linearised, Problem, State, gram, linearise, residuals
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _NEAR = 1e-3  # changes (rad, or share of the extent) up to which derivatives taken once still predict

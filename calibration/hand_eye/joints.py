@@ -24,9 +24,8 @@ from weldcal.calibration.hand_eye.solve import (
     solve_problem,
 )
 from weldcal.models.arms.chain import Chain
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-
-Array = NDArray[np.float64]
 
 KINDS = ("joints", "links")
 _STEP = 1e-3  # of the prior's standard deviation, for the differences by the robot's errors

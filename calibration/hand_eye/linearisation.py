@@ -7,11 +7,9 @@ from enum import Enum
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.hand_eye.problem import Linearised, Problem, gram
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _HUBER = 2.0  # in sigma per axis
 _STUDENT = 5.0  # degrees of freedom of the heavy-tailed loss

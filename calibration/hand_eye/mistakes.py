@@ -1,12 +1,9 @@
 """Detects usual mistakes in pose files: applies each correction and names the one that makes the poses agree."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher
 
@@ -19,9 +16,8 @@ from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.problem import Problem, full_problem, linearise, residuals
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_problem
 from weldcal.calibration.hand_eye.starts import grid, kronecker, with_positions
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-
-Array = NDArray[np.float64]
 
 _FAR_BETTER = 3.0  # times smaller residuals: no chance, whatever the noise
 _HARDLY_WORSE = 0.5  # one kind of residuals may grow by two, where the wrong answer had turned it down

@@ -1,19 +1,15 @@
 """The supported mountings: the frames of each equation, the names of its unknowns, and a sketch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
 from weldcal.calibration.hand_eye.problem import Problem
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

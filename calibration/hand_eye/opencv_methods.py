@@ -1,16 +1,12 @@
 """Runs OpenCV's hand-eye methods on the same observations, for comparison."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, nearest_rotation, pose
 from weldcal.calibration.hand_eye.problem import Problem, residuals
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, fold_labels
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 HAND_EYE = {
     "TSAI": cv2.CALIB_HAND_EYE_TSAI,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse, left_jacobian_inverse, log_rotation, moved, skew
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 State = tuple[Array, Array, Array]
 """Poses X, Y, Z (4, 4) each."""

@@ -1,7 +1,5 @@
 """Solves AX = XB, AX = YB and AXB = YCZ, with covariance, held-out errors and unobservable directions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -21,9 +19,9 @@ from weldcal.calibration.hand_eye.determinacy import (
     without_drift,
 )
 from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, residuals
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _SPARE = 2.5  # numbers per unknown below which an answer cannot be checked

@@ -1,17 +1,14 @@
 """Closed-form initial estimates: quaternions, Kronecker products, dual quaternions, logarithms, a rotation grid."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import inverse, log_rotation, nearest_rotation, pose
 from weldcal.calibration.hand_eye.problem import Problem, State
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Rotations = tuple[Array, Array, Array]
 
 _PAIRS = 600  # motions beyond these add little to a start

@@ -1,19 +1,15 @@
 """Covariance of a hand-eye result whose observations state their own covariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.hand_eye.determinacy import determinacy, with_open_directions
 from weldcal.calibration.hand_eye.linearisation import inverse_information
 from weldcal.calibration.hand_eye.problem import NAMES, Problem, State, linearise
 from weldcal.calibration.hand_eye.solve import HandEyeResult
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 
 def with_stated_noise(problem: Problem, known: State, result: HandEyeResult) -> HandEyeResult:

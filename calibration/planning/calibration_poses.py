@@ -1,13 +1,10 @@
 """Plans flange poses for eye-on-base calibration: reachable, clear, visible and D-optimal."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
@@ -16,10 +13,9 @@ from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_poin
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,14 @@
 """Clearance of the arm's capsules from the table, from itself and from the scanner's line of sight."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arms.urdf import Capsule, link_capsules
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 TOOL = 7  # bodies of the tool: on the flange, one link further than wrist 3
 _STANDING = (0, 1)  # base and shoulder stand on the table by design

@@ -1,13 +1,10 @@
 """Plans poses for calibration in any mounting: reachable, visible, clear and D-optimal in the unknowns."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.errors import UnreachableScanner
@@ -16,8 +13,7 @@ from weldcal.calibration.hand_eye.problem import linearise
 from weldcal.calibration.planning.mounting_scene import FLANGE, Bodies, MountingScene
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import jacobian, sigma_min
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _PRIOR = (0.2, 0.2)  # what is believed of an unknown pose before the first scan: rad and m, per axis
 _BIAS_M = 1e-3  # and of a constant error of the circle's centre in its own frame

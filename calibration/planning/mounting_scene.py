@@ -15,9 +15,8 @@ from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, 
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
 from weldcal.models.arms.kinematics import ArmModel, link_frames
+from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset
-
-Array = NDArray[np.float64]
 
 BASE, FLANGE = 0, 6
 """Places in link_frames of what does not move, and of the flange."""

@@ -1,7 +1,5 @@
 """Chooses the next hand-eye pose: the reachable, visible one that reduces the uncertainty at the work point most."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,8 +16,7 @@ from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, chain_inverse
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import known_arms, load_arm
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _TURNS_RAD = np.radians([20.0, 40.0, 60.0])
 _PRIOR_SHARE = 10.0  # what is believed of an open direction: ten radians or extents

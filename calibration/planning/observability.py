@@ -1,15 +1,12 @@
 """Checks the diversity of a set of poses and names the errors that they cannot show."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.errors import CoplanarPoses, RepeatedPoses, TooFewPoses
 from weldcal.calibration.geometry.se3 import rotation_vector, skew
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 SAME_PLACE_M = 0.002
 MIN_DEPTH_M = 0.002

@@ -1,15 +1,13 @@
 """Field of view, working distance and largest viewing angle of a camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 _MARGIN = 0.85  # of the half picture: a board is more than its origin

@@ -4,8 +4,6 @@ The measure is the mapped covariance: how uncertain a profile point's place in t
 view, by what the poses so far and the ones chosen tell together (docs/profiler.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

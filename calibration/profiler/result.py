@@ -1,7 +1,5 @@
 """The result of a profiler calibration: X_FS, its covariance and residuals, and its least certain direction."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

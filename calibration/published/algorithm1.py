@@ -1,20 +1,17 @@
 """Algorithm 1 of the flange paper: a pool of four pairs, improved scan by scan by its verification figure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
-Array = NDArray[np.float64]
 Cost = Callable[[Array], float]
 
 POOL_SIZE = 4

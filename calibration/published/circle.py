@@ -1,16 +1,12 @@
 """The paper's circle search: of 10 000 random triples of face points the one with the most points at its radius."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FlangeNotFound
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 SAMPLE_SIZE = 3
 _BLOCK = 64  # circles judged at once: keeps the distances of a 20 000-point face within a few megabytes

@@ -1,13 +1,10 @@
 """Algorithm 1's verification figure: ICP of a flange against its model (Eq. 13), and the share of an error it shows."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.fit import FlangeFit
@@ -20,10 +17,10 @@ from weldcal.calibration.flange.surface_information import (
     unobservable_components,
 )
 from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 
-Array = NDArray[np.float64]
 Method = Literal["point_to_point", "point_to_plane"]
 
 _MIN_FITNESS = 0.3

@@ -1,14 +1,11 @@
 """The paper's calibration pipeline: segmentation, circle, Eq. (9)-(12), Algorithm 1 with the ICP of Eq. (13)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
@@ -25,9 +22,9 @@ from weldcal.calibration.published.algorithm1 import (
 from weldcal.calibration.published.circle import CircleParameters, PublishedCircle, search_circle
 from weldcal.calibration.published.icp import FAILED, VerificationError, Verifier
 from weldcal.calibration.published.segmentation import SegmentationParameters, segment_flange
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 
-Array = NDArray[np.float64]
 Method = Literal["point_to_point", "point_to_plane"]
 
 

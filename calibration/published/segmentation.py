@@ -1,16 +1,12 @@
 """The paper's segmentation of a flange face: pass-through, statistical outlier removal, clustering, dominant plane."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
 from weldcal.calibration.errors import FlangeNotFound
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Detects the tablet's landmarks in a camera image, rings or single-pixel dots, in the order of the page."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Literal
@@ -11,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import LandmarksNotFound
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 Ellipse = tuple[Sequence[float], Sequence[float], float]
 """Centre, axes (px) and angle (deg), as OpenCV has them."""

@@ -1,7 +1,5 @@
 """Exceptions of the tablet calibration; each message names what to change."""
 
-from __future__ import annotations
-
 from weldcal.models.errors import InputError, WeldcalError
 
 

@@ -1,19 +1,16 @@
 """Reads camera intrinsics from YAML: fx, fy, cx, cy, or the camera matrix as ROS and OpenCV write it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.yaml import yaml_load
 
 from weldcal.calibration.tablet.errors import TabletDataError
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 _COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
 _MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficients", "D", "d", "distortion")
 

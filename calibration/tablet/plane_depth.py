@@ -1,14 +1,10 @@
 """Depth of the landmarks from a plane fitted to the tablet's pixels of a depth image."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import LandmarksNotFound
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _LEAST_PIXELS = 50
 _TUNING = 4.685  # Tukey's biweight: 95 % efficiency for normal noise

@@ -1,16 +1,12 @@
 """Pose of the tablet in the camera (PnP with intrinsics), and the tablet point that a pixel shows."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.tablet.errors import LandmarksNotFound
 from weldcal.calibration.tablet.touches import check_layout
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def tablet_pose(rays: Array, landmark_m: Array) -> RigidTransform:

@@ -1,7 +1,5 @@
 """Reads and writes a tablet calibration: tablet.yaml, tablet.json, and exports of the camera's pose on the flange."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 from pathlib import Path

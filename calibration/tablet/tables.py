@@ -1,7 +1,5 @@
 """Reads the tablet's CSV tables: required columns and numeric cells."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 MIN_LANDMARKS = 4
 _THIN = 0.05  # the landmarks' narrow spread as a share of their long one, below which they count as a line

@@ -1,20 +1,17 @@
 """A serial arm of revolute joints: forward kinematics, Jacobian, and iterative inverse kinematics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 RESIDUAL = 1e-9  # m and rad: what a returned solution fulfils
 _HERE = Path(__file__).resolve().parent

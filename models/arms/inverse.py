@@ -1,17 +1,14 @@
 """Inverse kinematics of UR arms: all closed-form branches, refined on the robot's calibrated kinematics."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 RESIDUAL = 1e-9  # m and rad: what a returned solution fulfils
 _TARGET = 1e-12  # where Newton stops: three orders below, above rounding

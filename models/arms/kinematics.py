@@ -6,8 +6,6 @@ in link i-1 at zero angle, and the chain is their plain product: X_BF = prod_i X
 factory calibration has the same schema as the nominal numbers, so nothing else changes when one is given.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-
-Array = NDArray[np.float64]
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 LINK_NAMES = ("base", *(f"{link}_link" for link in LINKS))

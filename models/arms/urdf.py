@@ -4,18 +4,15 @@ Shapes are drawn in the link frames from the nominal lengths and stop 6 mm short
 itself is a mesh of its own, because calibration measures it. They are visual only; the capsules serve planning.
 """
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import ArmModel
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 FLANGE_DISC_M = 0.006  # the last millimetres before the flange plane, left to the flange's own mesh
 WRIST_3_RADIUS_M = 0.045

@@ -1,7 +1,5 @@
 """A flat mesh textured with a picture, such as the printed tag or a phase label."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

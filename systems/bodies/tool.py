@@ -1,7 +1,5 @@
 """Adds the flange and the welding tool to a plant: bodies, visual geometry and contact geometry."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from pydrake.common import MemoryFile

@@ -1,7 +1,5 @@
 """Base classes of driver configurations: the devices that a driver supports, and whether it needs the simulated world."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import ClassVar
 

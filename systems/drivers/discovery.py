@@ -1,7 +1,5 @@
 """Finds drivers: modules of weldcal.systems.drivers, and modules that installed packages register as entry points."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import pkgutil

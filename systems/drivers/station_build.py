@@ -1,7 +1,5 @@
 """The interface between drivers and the station builder: the DiagramBuilder, the station's parts and the ports to export."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar

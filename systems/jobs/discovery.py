@@ -1,7 +1,5 @@
 """Finds jobs: modules of weldcal.systems.jobs, and modules that installed packages register with their drivers."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from functools import cache

@@ -1,7 +1,5 @@
 """Base classes of jobs: configuration, checks, planning, and the method that adds a job's systems to a cell."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Any, Generic, TypeVar

@@ -1,7 +1,5 @@
 """Checks that moves on straight lines in joint space keep the arm clear of the table and of itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -43,7 +41,7 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm is at [{stands}] deg. A straight joint move from there to home would touch the table or the arm itself: "
+        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table or the arm itself: "
         f"move it by hand near home_deg [{wanted}] first."
     )
 

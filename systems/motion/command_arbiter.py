@@ -1,7 +1,5 @@
 """CommandArbiter: selects the velocity of the mover, of the servo, or zero."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem

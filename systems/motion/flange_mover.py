@@ -1,7 +1,5 @@
 """FlangeMover: moves the arm to a joint goal on a quintic synchronised path, as a stream of joint velocities."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Checks whether an arm is at a joint goal."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

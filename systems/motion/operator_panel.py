@@ -1,7 +1,5 @@
 """OperatorPanel: reads Meshcat's button that holds the job and its slider for the pace of the simulation."""
 
-from __future__ import annotations
-
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 

@@ -1,9 +1,6 @@
 """PoseRecorder: stores recent joint positions, so that a sensor's datum is paired with the arm's pose at its capture time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,12 +53,7 @@ class PoseRecorder(LeafSystem):
         self._position = self.DeclareVectorInputPort("position_measured", 6)
         self._time = self.DeclareVectorInputPort("sample_time", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(PoseHistory()))
-        self.DeclareAbstractOutputPort(
-            "history",
-            lambda: AbstractValue.Make(PoseHistory()),
-            self._output,
-            {self.abstract_state_ticket(self._state)},
-        )
+        self.DeclareStateOutputPort("history", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._record)
 
     def _record(self, context: Context, state: State) -> None:
@@ -72,6 +64,3 @@ class PoseRecorder(LeafSystem):
         times = np.append(old.times[-self._length :], time)
         positions = np.vstack([old.positions[-self._length :], self._position.Eval(context)])
         state.get_mutable_abstract_state(self._state).set_value(PoseHistory(times, positions))
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())

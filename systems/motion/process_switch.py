@@ -1,7 +1,5 @@
 """ProcessSwitch: computes the process output; every cause that stops the arm first turns the torch off, latched."""
 
-from __future__ import annotations
-
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 

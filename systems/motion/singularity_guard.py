@@ -1,7 +1,5 @@
 """SingularityGuard: maps the commanded twist of the tip to joint velocity, slowed and stopped near the arm's singularities."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem

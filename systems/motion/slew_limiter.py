@@ -1,7 +1,5 @@
 """SlewLimiter: limits speed, acceleration and jerk of the joint velocity command and replaces non-finite commands."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Builds the spine shared by all jobs: pose recorder, mover, arbiter and limiter for each arm, operator hold, process switch."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Checks a scenario before anything is built; each error is one sentence that says what to change."""
 
-from __future__ import annotations
-
 from weldcal.calibration.published.algorithm1 import named_cost
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice

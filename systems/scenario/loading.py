@@ -1,7 +1,5 @@
 """Loads scenarios, by name from the package or by path; unknown keys are errors."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 import re
 from functools import cache, partial, reduce

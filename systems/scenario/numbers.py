@@ -1,7 +1,5 @@
 """Checks the numbers of a scenario: finite, with the required sign and list length."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 import math
 from typing import Any

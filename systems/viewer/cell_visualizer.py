@@ -1,7 +1,5 @@
 """CellVisualizer: shows the cell's estimates in Meshcat: clouds, fitted circle, camera, seams, torch and the job's phase."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Adds a kinematic display of the arm, at its measured joints, to a station without a simulated world."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.geometry import Box, SceneGraph
 from pydrake.math import RigidTransform

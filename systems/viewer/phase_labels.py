@@ -1,7 +1,5 @@
 """Labels of the job's phases in the viewer: one textured board per phase, shown during the phase."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,12 +1,11 @@
 """Draws the weld gauge: torch speed and n_d . n_t along the seam so far, as a picture for a board in the viewer."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
+
 Picture = NDArray[np.uint8]
 WIDTH_PX, HEIGHT_PX = 1024, 400
 _INK, _SOFT, _GROUND = (240, 240, 240), (150, 145, 140), (46, 38, 33)  # BGR, as in the phase labels

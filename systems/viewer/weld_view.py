@@ -1,13 +1,11 @@
 """Draws the weld's progress in Meshcat: CAD over the cloud, planned and measured seam, torch, deflection arrow, gauge."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Cylinder, Meshcat, MeshcatCone, Rgba
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.perception import BaseField, Fields, PointCloud
 
+from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
 from weldcal.models.tool import WeldingTool
@@ -19,7 +17,6 @@ from weldcal.systems.viewer.phase_labels import WIDTH_M as SIGN_WIDTH_M
 from weldcal.systems.viewer.phase_labels import X_WS, label_image
 from weldcal.systems.viewer.weld_gauge import HEIGHT_PX, WIDTH_PX, gauge_picture
 
-Array = NDArray[np.float64]
 PLANNED, REFINED, TORCH = Rgba(0.55, 0.55, 0.60, 1.0), Rgba(0.15, 0.45, 0.90, 1.0), Rgba(0.95, 0.45, 0.10, 1.0)
 TIP, CAD, ARROW = Rgba(0.35, 0.80, 0.95, 1.0), Rgba(0.05, 0.50, 0.42, 1.0), Rgba(0.80, 0.10, 0.45, 1.0)
 SHOWN_ABOVE_M = 0.008  # paths are raised above the groove to be visible

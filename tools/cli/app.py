@@ -1,7 +1,5 @@
 """The command line: every command in its group, in the order of the help text."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

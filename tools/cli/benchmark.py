@@ -1,14 +1,12 @@
 """weldcal benchmark: speed and accuracy of each part but the flange fit, in simulation and on recorded data."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, ScenarioOption, command
+from weldcal.tools.cli.options import Call, Outcome, ScenarioOption, command, option, switch
 
 
 @command("benchmark tablet")
@@ -22,16 +20,15 @@ def tablet(call: Call) -> Mapping[str, object]:
 @command("benchmark seam-planning")
 def seam_planning(
     call: Call,
-    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Random poses of each part.")] = 2,
+    runs: Annotated[int, option("--runs", "N", "Random poses of each part.", min=1)] = 2,
     preset: Annotated[
-        list[str] | None,
-        typer.Option("--preset", metavar="NAME", help="A scanner; repeat for more.", show_default="all"),
+        list[str] | None, option("--preset", "NAME", "A scanner; repeat for more.", show_default="all")
     ] = None,
     full: Annotated[
-        bool, typer.Option("--full-resolution", help="Images of the scanner's full width, not 824 pixels at most.")
+        bool, switch("--full-resolution", "Images of the scanner's full width, not 824 pixels at most.")
     ] = False,
     troubles: Annotated[
-        bool, typer.Option("--troubles/--no-troubles", help="Also test occlusion, clutter and wrong workpieces.")
+        bool, switch("--troubles/--no-troubles", "Also test occlusion, clutter and wrong workpieces.")
     ] = True,
 ) -> Outcome:
     """Measure the error of a seam planned from one scan, with and without a drawing, for each scanner."""
@@ -49,12 +46,8 @@ def seam_planning(
 @command("benchmark hand-eye")
 def hand_eye(
     call: Call,
-    data: Annotated[
-        Path | None, typer.Option("--data", metavar="FOLDER", help="A folder of sets, each a folder with pairs.npz.")
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few trials of each kind: seconds instead of minutes.")
-    ] = False,
+    data: Annotated[Path | None, option("--data", "FOLDER", "A folder of sets, each a folder with pairs.npz.")] = None,
+    quick: Annotated[bool, switch("--quick", "Few trials of each kind: seconds instead of minutes.")] = False,
 ) -> Outcome:
     """Compare the hand-eye solvers with OpenCV's on public data, and test them in simulation: outliers, invariance,
     uncertainty, speed."""
@@ -68,10 +61,8 @@ def hand_eye(
 @command("benchmark mountings")
 def mountings(
     call: Call,
-    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Number of seeds of each.")] = 5,
-    names: Annotated[
-        list[str] | None, typer.Option("--scenario", metavar="NAME", help="Only this scenario; repeat for more.")
-    ] = None,
+    runs: Annotated[int, option("--runs", "N", "Number of seeds of each.", min=1)] = 5,
+    names: Annotated[list[str] | None, option("--scenario", "NAME", "Only this scenario; repeat for more.")] = None,
 ) -> Outcome:
     """Calibrate every mounting live over several seeds: errors against the truth, held-out errors, and errors in units of
     the covariance."""
@@ -88,8 +79,7 @@ def mountings(
 def profiler(
     call: Call,
     data: Annotated[
-        Path | None,
-        typer.Option("--data", metavar="FOLDER", help="The fixed files. Without them, sets generated from the seed."),
+        Path | None, option("--data", "FOLDER", "The fixed files. Without them, sets generated from the seed.")
     ] = None,
 ) -> Outcome:
     """Time the profiler's calibration by an edge and compare it with the published method and a grid search."""
@@ -111,7 +101,7 @@ def cell(call: Call) -> Mapping[str, object]:
 def seeds(
     call: Call,
     scenario: ScenarioOption = "s_groove",
-    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Number of seeds.")] = 11,
+    runs: Annotated[int, option("--runs", "N", "Number of seeds.", min=1)] = 11,
 ) -> Mapping[str, object]:
     """Run the demo over many seeds: completed runs, and the largest errors of calibration and torch."""
     from weldcal.tools.studies.cell.seeds import run_seeds
@@ -123,10 +113,8 @@ def seeds(
 @command("benchmark robot-faults", options=("address",))
 def robot_faults(
     call: Call,
-    sequences: Annotated[
-        int, typer.Option("--sequences", metavar="N", min=0, help="Number of random fault sequences.")
-    ] = 20,
-    seconds: Annotated[float, typer.Option("--seconds", metavar="S", min=1.0, help="Length of each.")] = 60.0,
+    sequences: Annotated[int, option("--sequences", "N", "Number of random fault sequences.", min=0)] = 20,
+    seconds: Annotated[float, option("--seconds", "S", "Length of each.", min=1.0)] = 60.0,
 ) -> Outcome:
     """Inject every fault of the robot link at 0.05 m/s on an emulated controller: the arm must stop, stay, and say why."""
     from weldcal.tools.studies.robot.faults import run_fault_benchmark
@@ -144,8 +132,7 @@ def robot_faults(
 
 @command("benchmark robot", options=("address",))
 def robot(
-    call: Call,
-    minutes: Annotated[float, typer.Option("--minutes", metavar="M", min=0.05, help="Length of the stream.")] = 10.0,
+    call: Call, minutes: Annotated[float, option("--minutes", "M", "Length of the stream.", min=0.05)] = 10.0
 ) -> Mapping[str, object]:
     """Stream commands at 125 Hz to an emulated controller: periods, latencies, and deadlines missed by 20 ms or more."""
     from weldcal.tools.studies.robot.stream import run_robot_benchmark

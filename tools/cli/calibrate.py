@@ -1,13 +1,11 @@
 """weldcal calibrate: a scanner's pose from a dataset, or live in a scenario."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import MOTION, Call, CorrectionOption, FlangeOption, Outcome, command
+from weldcal.tools.cli.options import MOTION, Call, CorrectionOption, FlangeOption, Outcome, command, option, switch
 from weldcal.tools.cli.runs import run_options
 
 
@@ -15,29 +13,26 @@ from weldcal.tools.cli.runs import run_options
 def calibrate(
     call: Call,
     dataset: Annotated[Path | None, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/.")] = None,
-    scenario: Annotated[
-        str | None, typer.Option("--scenario", metavar="NAME", help="Calibrate live in this scenario instead.")
-    ] = None,
+    scenario: Annotated[str | None, option("--scenario", "NAME", "Calibrate live in this scenario instead.")] = None,
     robot: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--robot",
-            metavar="NAME",
-            help="For a dataset: the arm, if dataset.yaml does not name it. Live: simulated, emulated or a controller's address.",
+            "NAME",
+            "For a dataset: the arm, if dataset.yaml does not name it. Live: simulated, emulated or a controller's address.",
         ),
     ] = None,
     flange: FlangeOption = None,
     centres: Annotated[
-        bool,
-        typer.Option("--centres", help="Also write centres.csv: the flange centre found in each scan of a dataset."),
+        bool, switch("--centres", "Also write centres.csv: the flange centre found in each scan of a dataset.")
     ] = False,
     scanner_correction: CorrectionOption = True,
     axis_turn: Annotated[
         float | None,
-        typer.Option(
+        option(
             "--axis-turn",
-            metavar="DEG",
-            help="Known rotation of the hole pattern about the flange axis; one to three scans are then enough.",
+            "DEG",
+            "Known rotation of the hole pattern about the flange axis; one to three scans are then enough.",
         ),
     ] = None,
 ) -> Outcome:

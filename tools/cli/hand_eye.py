@@ -1,33 +1,24 @@
 """weldcal hand-eye: cameras calibrated from files of robot and camera poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, command
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 FileArgument = Annotated[
     Path, typer.Argument(help="npz, CSV, JSON, or a sample file of easy_handeye2 or MoveIt.", show_default=False)
 ]
 MountingOption = Annotated[
-    str | None,
-    typer.Option("--mounting", metavar="NAME", help="eye_in_hand, eye_on_base ..., if the file does not name it."),
+    str | None, option("--mounting", "NAME", "eye_in_hand, eye_on_base ..., if the file does not name it.")
 ]
-UnitOption = Annotated[
-    str | None, typer.Option("--unit", metavar="UNIT", help="Unit of the positions: m, mm or cm.", show_default="m")
-]
+UnitOption = Annotated[str | None, option("--unit", "UNIT", "Unit of the positions: m, mm or cm.", show_default="m")]
 RobotOption = Annotated[
-    str | None,
-    typer.Option("--robot", metavar="NAME", help="The arm, for example ur10e: the next pose is then within its reach."),
+    str | None, option("--robot", "NAME", "The arm, for example ur10e: the next pose is then within its reach.")
 ]
 ScannerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--camera", metavar="NAME", help="The scanner, for example phoxi_s: the next pose is then in its view."
-    ),
+    str | None, option("--camera", "NAME", "The scanner, for example phoxi_s: the next pose is then in its view.")
 ]
 
 
@@ -37,9 +28,7 @@ def ax_xb(
     file: FileArgument,
     mounting: MountingOption = None,
     unit: UnitOption = None,
-    motions: Annotated[
-        bool, typer.Option("--motions", help="The file holds motions (A and B of A X = X B), not poses.")
-    ] = False,
+    motions: Annotated[bool, switch("--motions", "The file holds motions (A and B of A X = X B), not poses.")] = False,
 ) -> Outcome:
     """Solve AX = XB for the camera's pose. With poses, the target's pose is estimated too, so that each counts once."""
     return _solve("ax-xb", call, file, mounting=mounting, unit=unit, motions=motions)
@@ -53,9 +42,9 @@ def ax_yb(
     unit: UnitOption = None,
     corners: Annotated[
         bool | None,
-        typer.Option(
+        switch(
             "--corners/--no-corners",
-            help="Use the board's corners: minimise the reprojection error, and test for a shifted principal point.",
+            "Use the board's corners: minimise the reprojection error, and test for a shifted principal point.",
             show_default="if the file holds them",
         ),
     ] = None,
@@ -63,11 +52,7 @@ def ax_yb(
     camera: ScannerOption = None,
     refine: Annotated[
         str | None,
-        typer.Option(
-            "--refine",
-            metavar="KIND",
-            help="joints or links: estimate errors of the robot (needs --robot and joint angles q).",
-        ),
+        option("--refine", "KIND", "joints or links: estimate errors of the robot (needs --robot and joint angles q)."),
     ] = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""

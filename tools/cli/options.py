@@ -1,7 +1,5 @@
 """What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -13,51 +11,51 @@ import typer
 
 from weldcal.tools import console
 
-ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME", help="Name of a scenario, or path of a scenario YAML file.")
-]
+
+def option(name: str, metavar: str, help: str, **settings: Any) -> Any:
+    """An option with a value, as Typer's Option; `settings` are its other settings, such as min and show_default."""
+    return typer.Option(name, metavar=metavar, help=help, **settings)
+
+
+def switch(names: str, help: str, **settings: Any) -> Any:
+    """An option without a value: "--name", or "--name/--no-name"; `settings` as in `option`."""
+    return typer.Option(names, help=help, **settings)
+
+
+ScenarioOption = Annotated[str, option("--scenario", "NAME", "Name of a scenario, or path of a scenario YAML file.")]
 ScenarioArgument = Annotated[
     str | None, typer.Argument(metavar="SCENARIO", help="The same as --scenario.", show_default=False)
 ]
-RecordOption = Annotated[bool, typer.Option("--record", help="Also write recording.html, the run in 3D.")]
+RecordOption = Annotated[bool, switch("--record", "Also write recording.html, the run in 3D.")]
 CorrectionOption = Annotated[
     bool,
-    typer.Option(
+    switch(
         "--scanner-correction/--no-scanner-correction",
-        help="For a dataset: estimate and correct the scanner's scale error, or use the scans uncorrected.",
+        "For a dataset: estimate and correct the scanner's scale error, or use the scans uncorrected.",
     ),
 ]
 FlangeOption = Annotated[
-    str | None,
-    typer.Option(
-        "--flange", metavar="NAME", help="Flange standard, if the dataset does not name it: iso9409-1-50-4-m6."
-    ),
+    str | None, option("--flange", "NAME", "Flange standard, if the dataset does not name it: iso9409-1-50-4-m6.")
 ]
 
-
-def _option(kind: Any, preset: object, name: str, **settings: Any) -> tuple[Any, object]:
-    return Annotated[kind, typer.Option(name, **settings)], preset
-
-
+_BROWSER = "Open the live 3D view in the web browser, or do not."
 _ROBOT = "simulated, emulated (a controller on loopback), or the address of a controller."
 _ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
 _PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
 _SLOWER = "Slow the arm's moves down: 0.05 to 1. The welding speed does not change."
 _OUT = "Output folder; default: a new one in weldcal-out."
-COMMON = {
-    "browser": _option(
-        bool, True, "--browser/--no-browser", help="Open the live 3D view in the web browser, or do not."
-    ),
-    "realtime": _option(bool, False, "--realtime", help="Do not run faster than real time."),
-    "robot": _option(str | None, None, "--robot", metavar="ROBOT", help=_ROBOT, show_default="as in the scenario"),
-    "dry_run": _option(bool, False, "--dry-run", help="Only read the robot, then run on a simulated arm."),
-    "pace": _option(float | None, None, "--pace", metavar="P", help=_PACE),
-    "speed_factor": _option(float | None, None, "--speed-factor", metavar="X", help=_SLOWER),
-    "address": _option(str, "127.0.0.1", "--address", metavar="ADDRESS", help=_ADDRESS),
-    "out": _option(Path | None, None, "--out", metavar="FOLDER", help=_OUT),
-    "seed": _option(int, 0, "--seed", metavar="N", min=0, help="Seed of all random numbers; the first of several."),
-    "json": _option(bool, False, "--json", help="Print the result as one JSON object, the last line of stdout."),
-    "debug": _option(bool, False, "--debug", help="Show the traceback of an internal error."),
+COMMON: dict[str, tuple[Any, object]] = {
+    "browser": (Annotated[bool, switch("--browser/--no-browser", _BROWSER)], True),
+    "realtime": (Annotated[bool, switch("--realtime", "Do not run faster than real time.")], False),
+    "robot": (Annotated[str | None, option("--robot", "ROBOT", _ROBOT, show_default="as in the scenario")], None),
+    "dry_run": (Annotated[bool, switch("--dry-run", "Only read the robot, then run on a simulated arm.")], False),
+    "pace": (Annotated[float | None, option("--pace", "P", _PACE)], None),
+    "speed_factor": (Annotated[float | None, option("--speed-factor", "X", _SLOWER)], None),
+    "address": (Annotated[str, option("--address", "ADDRESS", _ADDRESS)], "127.0.0.1"),
+    "out": (Annotated[Path | None, option("--out", "FOLDER", _OUT)], None),
+    "seed": (Annotated[int, option("--seed", "N", "Seed of all random numbers; the first of several.", min=0)], 0),
+    "json": (Annotated[bool, switch("--json", "Print the result as one JSON object, the last line of stdout.")], False),
+    "debug": (Annotated[bool, switch("--debug", "Show the traceback of an internal error.")], False),
 }
 """Every common option with its default, by the name of its parameter."""
 

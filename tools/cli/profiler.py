@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.cli.options import Call, Outcome, command
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 if TYPE_CHECKING:
     from weldcal.calibration.profiler.record import ProfilerRecord
@@ -17,23 +17,15 @@ if TYPE_CHECKING:
     from weldcal.tools.commands.profiler.files import ProfilerFile
 
 FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Measurements, .npz or .csv (docs/profiler.md).")]
-UnitOption = Annotated[
-    str | None, typer.Option("--unit", metavar="U", help="m or mm, for an NPZ that does not state its unit.")
-]
-SetOption = Annotated[str, typer.Option("--set", metavar="NAME", help="Which set of an NPZ with several.")]
-TrialOption = Annotated[
-    int | None, typer.Option("--trial", metavar="K", help="Which trial or world of an NPZ with several.")
-]
+UnitOption = Annotated[str | None, option("--unit", "U", "m or mm, for an NPZ that does not state its unit.")]
+SetOption = Annotated[str, option("--set", "NAME", "Which set of an NPZ with several.")]
+TrialOption = Annotated[int | None, option("--trial", "K", "Which trial or world of an NPZ with several.")]
 ROBOT_SIGMA, Z_SIGMA = "Standard deviation of the robot's position per axis.", "Standard deviation of a point in depth."
 ESTIMATED = "the file's, else estimated from the points, at least {}"
-PlanOption = Annotated[int, typer.Option("--plan", metavar="N", min=0, help="Also propose N poses to add next.")]
-RadiusOption = Annotated[
-    float | None, typer.Option("--radius", metavar="MM", help="Radius of the sphere, if the file has none.")
-]
-TouchesOption = Annotated[
-    Path | None, typer.Option("--touches", metavar="FILE", help="CSV of flange poses at touches of the sphere.")
-]
-TipOption = Annotated[str, typer.Option("--tip", metavar="X,Y,Z", help="The torch's tip in the flange frame, mm.")]
+PlanOption = Annotated[int, option("--plan", "N", "Also propose N poses to add next.", min=0)]
+RadiusOption = Annotated[float | None, option("--radius", "MM", "Radius of the sphere, if the file has none.")]
+TouchesOption = Annotated[Path | None, option("--touches", "FILE", "CSV of flange poses at touches of the sphere.")]
+TipOption = Annotated[str, option("--tip", "X,Y,Z", "The torch's tip in the flange frame, mm.")]
 
 
 @command("profiler edge", short_help="Calibrate by one straight edge.")
@@ -43,29 +35,22 @@ def edge(
     unit: UnitOption = None,
     dataset: SetOption = "",
     trial: TrialOption = None,
-    method: Annotated[
-        str, typer.Option("--method", metavar="M", help="joint, or paper (the published linear method).")
-    ] = "joint",
-    feature: Annotated[
-        str, typer.Option("--feature", metavar="KIND", help="For raw profiles: bar, step or apex.")
-    ] = "",
-    side: Annotated[str, typer.Option("--side", metavar="S", help="End of the near face: left or right.")] = "left",
+    method: Annotated[str, option("--method", "M", "joint, or paper (the published linear method).")] = "joint",
+    feature: Annotated[str, option("--feature", "KIND", "For raw profiles: bar, step or apex.")] = "",
+    side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
     sigma_robot: Annotated[
-        float | None,
-        typer.Option("--sigma-robot", metavar="MM", help=ROBOT_SIGMA, show_default=ESTIMATED.format(0.03)),
+        float | None, option("--sigma-robot", "MM", ROBOT_SIGMA, show_default=ESTIMATED.format(0.03))
     ] = None,
     sigma_x: Annotated[
         float | None,
-        typer.Option(
+        option(
             "--sigma-x",
-            metavar="MM",
-            help="Standard deviation of a point along the laser line.",
+            "MM",
+            "Standard deviation of a point along the laser line.",
             show_default=ESTIMATED.format(0.05),
         ),
     ] = None,
-    sigma_z: Annotated[
-        float | None, typer.Option("--sigma-z", metavar="MM", help=Z_SIGMA, show_default=ESTIMATED.format(0.06))
-    ] = None,
+    sigma_z: Annotated[float | None, option("--sigma-z", "MM", Z_SIGMA, show_default=ESTIMATED.format(0.06))] = None,
     plan: PlanOption = 0,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by points of one straight edge, seen in any poses. Needs no initial guess."""
@@ -89,14 +74,12 @@ def sphere(
     dataset: SetOption = "",
     trial: TrialOption = None,
     radius: RadiusOption = None,
-    model: Annotated[str, typer.Option("--model", metavar="M", help="auto, rigid, affine or affine+joints.")] = "auto",
-    arm: Annotated[
-        str, typer.Option("--arm", metavar="NAME", help="Arm whose kinematic table is used, for example ur10e.")
-    ] = "",
+    model: Annotated[str, option("--model", "M", "auto, rigid, affine or affine+joints.")] = "auto",
+    arm: Annotated[str, option("--arm", "NAME", "Arm whose kinematic table is used, for example ur10e.")] = "",
     touches: TouchesOption = None,
     tip: TipOption = "",
-    sigma_robot: Annotated[float, typer.Option("--sigma-robot", metavar="MM", help=ROBOT_SIGMA)] = 0.03,
-    sigma_z: Annotated[float, typer.Option("--sigma-z", metavar="MM", help=Z_SIGMA)] = 0.05,
+    sigma_robot: Annotated[float, option("--sigma-robot", "MM", ROBOT_SIGMA)] = 0.03,
+    sigma_z: Annotated[float, option("--sigma-z", "MM", Z_SIGMA)] = 0.05,
     plan: PlanOption = 0,
 ) -> Outcome:
     """Calibrate the profiler's pose on the flange by raw profiles of a sphere. Needs no initial guess, no scan sides and no
@@ -122,7 +105,7 @@ def compensate(
     touches: TouchesOption = None,
     tip: TipOption = "",
     solve_tip: Annotated[
-        bool, typer.Option("--solve-tip", help="Also estimate the tip from the touches (not in the paper).")
+        bool, switch("--solve-tip", "Also estimate the tip from the touches (not in the paper).")
     ] = False,
 ) -> Outcome:
     """Calibrate by the sphere paper's two linear steps and its compensation. 'sphere' is more accurate on the same file."""
@@ -141,9 +124,7 @@ def compensate(
 def seam(
     call: Call,
     file: FileArgument,
-    calibration: Annotated[
-        Path, typer.Option("--calibration", metavar="FOLDER", help="Result folder of edge, sphere or compensate.")
-    ],
+    calibration: Annotated[Path, option("--calibration", "FOLDER", "Result folder of edge, sphere or compensate.")],
     unit: UnitOption = None,
     trial: TrialOption = None,
 ) -> Outcome:

@@ -1,7 +1,5 @@
 """weldcal reproduce: the published studies repeated, with every figure compared with its target."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -9,7 +7,7 @@ from typing import Annotated, Protocol
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, command
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 MISSED = "Some targets were missed; see the table."
 
@@ -29,17 +27,9 @@ class Study(Protocol):
 def tablet(
     call: Call,
     evolution_seeds: Annotated[
-        int,
-        typer.Option(
-            "--evolution-seeds",
-            metavar="N",
-            min=0,
-            help="Seeds of differential evolution per table; each takes seconds.",
-        ),
+        int, option("--evolution-seeds", "N", "Seeds of differential evolution per table; each takes seconds.", min=0)
     ] = 1,
-    trials: Annotated[
-        int, typer.Option("--trials", metavar="N", min=1, help="Simulated trials for the error on unseen points.")
-    ] = 60,
+    trials: Annotated[int, option("--trials", "N", "Simulated trials for the error on unseen points.", min=1)] = 60,
 ) -> Outcome:
     """Repeat the tablet paper: Tables 7 to 12, the sign of Eq. 20, and models with smaller prediction errors."""
     from weldcal.tools.studies.tablet.command import run_tablet_study
@@ -63,9 +53,7 @@ def flange(
             show_default=False,
         ),
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer noise levels, realisations, shuffled orders and splits.")
-    ] = False,
+    quick: Annotated[bool, switch("--quick", "Fewer noise levels, realisations, shuffled orders and splits.")] = False,
 ) -> Outcome:
     """Repeat the flange paper: Table 1, Fig. 9, 10 and 11, the Kinect data, and the effect of Algorithm 1's cost."""
     from weldcal.tools.studies.flange.published.command import run_study
@@ -79,10 +67,8 @@ def flange(
 @command("reproduce profiler-seeds")
 def profiler_seeds(
     call: Call,
-    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=2, help="Number of seeds.")] = 12,
-    data: Annotated[
-        Path | None, typer.Option("--data", metavar="FOLDER", help="The fixed files, shown together with the seeds.")
-    ] = None,
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds.", min=2)] = 12,
+    data: Annotated[Path | None, option("--data", "FOLDER", "The fixed files, shown together with the seeds.")] = None,
 ) -> Outcome:
     """Run every target of 'reproduce profiler' over many seeds and compare with the Cramer-Rao bound. 20 s per seed."""
     from weldcal.tools.studies.profiler.seeds import run_profiler_seeds
@@ -102,12 +88,10 @@ def profiler_seeds(
 @command("reproduce weld")
 def weld(
     call: Call,
-    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Number of seeds of each weld.")] = 10,
-    rows: Annotated[
-        str, typer.Option("--rows", metavar="NAMES", help="Only these rows, separated by commas.", show_default="all")
-    ] = "",
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each weld.", min=1)] = 10,
+    rows: Annotated[str, option("--rows", "NAMES", "Only these rows, separated by commas.", show_default="all")] = "",
     quick: Annotated[
-        bool, typer.Option("--quick", help="Two seeds of each weld, and two for the comparison of the laws.")
+        bool, switch("--quick", "Two seeds of each weld, and two for the comparison of the laws.")
     ] = False,
 ) -> Outcome:
     """Run the weld law in a small kinematic world: every target, the published law for comparison, figures, a report."""
@@ -124,10 +108,9 @@ def weld(
 def profiler(
     call: Call,
     data: Annotated[
-        Path | None,
-        typer.Option("--data", metavar="FOLDER", help="The fixed files. Without them, worlds generated from the seed."),
+        Path | None, option("--data", "FOLDER", "The fixed files. Without them, worlds generated from the seed.")
     ] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Two sets of edges and two or three worlds.")] = False,
+    quick: Annotated[bool, switch("--quick", "Two sets of edges and two or three worlds.")] = False,
 ) -> Outcome:
     """Repeat both papers on laser profilers: their tables with ours for comparison, figures, a report."""
     from weldcal.tools.studies.profiler.command import run_profiler_study
@@ -143,14 +126,12 @@ def profiler(
 @command("reproduce cell")
 def cell(
     call: Call,
-    seeds: Annotated[int, typer.Option("--seeds", metavar="N", min=1, help="Number of seeds of each scenario.")] = 3,
-    scenarios: Annotated[
-        str, typer.Option("--scenarios", metavar="NAMES", help="Scenarios, separated by commas.")
-    ] = "s_groove,l_groove",
+    seeds: Annotated[int, option("--seeds", "N", "Number of seeds of each scenario.", min=1)] = 3,
+    scenarios: Annotated[str, option("--scenarios", "NAMES", "Scenarios, separated by commas.")] = "s_groove,l_groove",
     seam_mm: Annotated[
-        float | None, typer.Option("--seam-mm", metavar="MM", min=10.0, help="Weld only this length; default: all.")
+        float | None, option("--seam-mm", "MM", "Weld only this length; default: all.", min=10.0)
     ] = None,
-    law: Annotated[str, typer.Option("--law", metavar="NAME", help="Steering law, for comparison.")] = "guarded",
+    law: Annotated[str, option("--law", "NAME", "Steering law, for comparison.")] = "guarded",
 ) -> Outcome:
     """Weld in the whole simulated cell, with contact and rendered tag: seam points, torch and real-time factor."""
     from weldcal.tools.studies.cell.study import CellStudyOptions, print_cell_study, run_cell_study

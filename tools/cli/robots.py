@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
 
 if TYPE_CHECKING:
     from weldcal.models.robots import Robot
@@ -48,17 +48,13 @@ def check_robot(
 @command("emulate-ur", common=("seed", "debug"), short_help="Run an emulated UR controller on loopback.")
 def emulate_ur(
     call: Call,
-    polyscope: Annotated[
-        str, typer.Option("--polyscope", metavar="VERSION", help="Controller version: 5.12, 5.21, 10.7 ...")
-    ] = "5.21",
-    kinematics: Annotated[
-        Path | None, typer.Option("--kinematics", metavar="FILE", help="A robot's factory calibration.")
-    ] = None,
-    host: Annotated[str, typer.Option("--host", metavar="ADDRESS", help="Loopback address 127.x.y.z.")] = "127.0.0.1",
+    polyscope: Annotated[str, option("--polyscope", "VERSION", "Controller version: 5.12, 5.21, 10.7 ...")] = "5.21",
+    kinematics: Annotated[Path | None, option("--kinematics", "FILE", "A robot's factory calibration.")] = None,
+    host: Annotated[str, option("--host", "ADDRESS", "Loopback address 127.x.y.z.")] = "127.0.0.1",
     control_port: Annotated[
-        int, typer.Option("--control-port", metavar="PORT", help="Port that takes injected faults, as JSON lines.")
+        int, option("--control-port", "PORT", "Port that takes injected faults, as JSON lines.")
     ] = 30090,
-    pace: Annotated[float, typer.Option("--pace", metavar="P", help="Speed relative to real time, 0.05 to 1.")] = 1.0,
+    pace: Annotated[float, option("--pace", "P", "Speed relative to real time, 0.05 to 1.")] = 1.0,
 ) -> None:
     """Run a UR controller on loopback that executes the URScript it is sent, until it is interrupted."""
     from weldcal.tools.emulators.ur.main import run_emulator

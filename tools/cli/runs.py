@@ -15,6 +15,7 @@ from weldcal.tools.cli.options import (
     ScenarioArgument,
     ScenarioOption,
     command,
+    option,
 )
 
 if TYPE_CHECKING:
@@ -73,12 +74,9 @@ def profiler_live(
     call: Call,
     name: ScenarioArgument = None,
     scenario: Annotated[
-        str,
-        typer.Option(
-            "--scenario", metavar="NAME", help="profiler_edge, profiler_sphere, profiler_seam or a YAML file."
-        ),
+        str, option("--scenario", "NAME", "profiler_edge, profiler_sphere, profiler_seam or a YAML file.")
     ] = PROFILER_SCENARIO,
-    runs: Annotated[int, typer.Option("--runs", metavar="N", min=1, help="Number of seeds, from --seed on.")] = 1,
+    runs: Annotated[int, option("--runs", "N", "Number of seeds, from --seed on.", min=1)] = 1,
     record: RecordOption = False,
 ) -> Mapping[str, object]:
     """Calibrate a profiler on the arm by an edge and a touched sphere, then scan and follow a seam."""

@@ -1,26 +1,24 @@
 """weldcal tablet serve and calibrate: a tablet as the calibration target."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, command
+from weldcal.tools.cli.options import Call, command, option, switch
 
 
 @command("tablet serve", common=("debug",))
 def serve(
     call: Call,
     host: Annotated[
-        str, typer.Option("--host", metavar="ADDRESS", help="Address to listen on; 0.0.0.0 admits the whole network.")
+        str, option("--host", "ADDRESS", "Address to listen on; 0.0.0.0 admits the whole network.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Port; 0 takes any free one.")] = 8077,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FOLDER", help="Folder for the touches that the tablet sends.")
-    ] = Path("weldcal-out/tablet"),
+    port: Annotated[int, option("--port", "PORT", "Port; 0 takes any free one.")] = 8077,
+    out: Annotated[Path, option("--out", "FOLDER", "Folder for the touches that the tablet sends.")] = Path(
+        "weldcal-out/tablet"
+    ),
 ) -> None:
     """Serve the target page to a tablet until interrupted: landmarks at true scale, touches to a tenth of a pixel."""
     from weldcal.tools.commands.tablet.page.serve import run_server
@@ -32,45 +30,31 @@ def serve(
 def calibrate(
     call: Call,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The page's touches (CSV), or planar touches (npz).")],
-    poses: Annotated[
-        Path | None, typer.Option("--poses", metavar="CSV", help="Flange poses at each touch, and one row 'camera'.")
-    ] = None,
-    camera: Annotated[
-        Path | None, typer.Option("--camera", metavar="YAML", help="fx, fy, cx, cy and distortion of the camera.")
-    ] = None,
+    poses: Annotated[Path | None, option("--poses", "CSV", "Flange poses at each touch, and one row 'camera'.")] = None,
+    camera: Annotated[Path | None, option("--camera", "YAML", "fx, fy, cx, cy and distortion of the camera.")] = None,
     image: Annotated[
-        Path | None,
-        typer.Option("--image", metavar="PICTURE", help="The camera's image; landmarks are detected in it."),
+        Path | None, option("--image", "PICTURE", "The camera's image; landmarks are detected in it.")
     ] = None,
-    seen: Annotated[
-        Path | None, typer.Option("--seen", metavar="CSV", help="Instead of --image: landmark,u,v in the image.")
-    ] = None,
-    look: Annotated[
-        str, typer.Option("--look", metavar="LOOK", help="Landmarks in the image: rings or dots.")
-    ] = "rings",
+    seen: Annotated[Path | None, option("--seen", "CSV", "Instead of --image: landmark,u,v in the image.")] = None,
+    look: Annotated[str, option("--look", "LOOK", "Landmarks in the image: rings or dots.")] = "rings",
     pen_length_mm: Annotated[
-        float | None,
-        typer.Option(
-            "--pen-length-mm", metavar="MM", help="Distance of the pen tip from the flange, along its z axis."
-        ),
+        float | None, option("--pen-length-mm", "MM", "Distance of the pen tip from the flange, along its z axis.")
     ] = None,
-    pen_radius_mm: Annotated[
-        float, typer.Option("--pen-radius-mm", metavar="MM", min=0.0, help="Radius of the pen's round tip.")
-    ] = 0.0,
+    pen_radius_mm: Annotated[float, option("--pen-radius-mm", "MM", "Radius of the pen's round tip.", min=0.0)] = 0.0,
     hand_step_mm: Annotated[
         float | None,
-        typer.Option(
+        option(
             "--hand-step-mm",
-            metavar="MM",
+            "MM",
+            "npz: hand positions are rounded to this step; 0: not rounded.",
             min=0.0,
-            help="npz: hand positions are rounded to this step; 0: not rounded.",
             show_default="detected",
         ),
     ] = None,
     printed_sign: Annotated[
-        bool, typer.Option("--printed-sign", help="npz: use the sign of the touching error as printed in the paper.")
+        bool, switch("--printed-sign", "npz: use the sign of the touching error as printed in the paper.")
     ] = False,
-    two_stages: Annotated[bool, typer.Option("--two-stages", help="npz: also run the paper's two stages.")] = False,
+    two_stages: Annotated[bool, switch("--two-stages", "npz: also run the paper's two stages.")] = False,
 ) -> Mapping[str, object]:
     """Calibrate camera and pen on the wrist from one image of the tablet and a touch of each landmark."""
     from weldcal.tools.commands.tablet.calibrate import TabletInputs, calibrate_tablet

@@ -1,7 +1,5 @@
 """weldcal verify: the errors of a calibration on scans that it did not use."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated

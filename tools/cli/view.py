@@ -1,14 +1,12 @@
 """weldcal view: the report and the 3D recording of a finished run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from weldcal.tools import console
-from weldcal.tools.cli.options import LOOK, Call, Outcome, command
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, switch
 
 
 @command("view", common=LOOK, short_help="Show the report and the 3D recording of a finished run.")
@@ -16,10 +14,7 @@ def view(
     call: Call,
     result: Annotated[Path, typer.Argument(help="A result folder, or one recording.html or report.html.")],
     browser: Annotated[
-        bool,
-        typer.Option(
-            "--browser/--no-browser", help="Open the pages, or only print their paths.", show_default="browser"
-        ),
+        bool, switch("--browser/--no-browser", "Open the pages, or only print their paths.", show_default="browser")
     ] = True,
 ) -> Outcome:
     """Show a finished run again: its 3D recording and its report."""

@@ -1,19 +1,13 @@
 """Runs Algorithm 1 on the scans of a calibration and compares its reported figure with its error at unused poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.results import IcpRecord
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import (
-    position_errors,
-    run_algorithm1,
-)
+from weldcal.calibration.eye_on_base.validation import position_errors, run_algorithm1
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.published.icp import (
@@ -25,10 +19,9 @@ from weldcal.calibration.published.icp import (
     make_verification,
     sight,
 )
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.outcomes.calibration import Algorithm1Outcome, error_summary
-
-Array = NDArray[np.float64]
 
 
 def compare_algorithm1(

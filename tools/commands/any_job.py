@@ -1,7 +1,5 @@
 """Runs a job without a command of its own, such as one of an installed package; writes state, timing and recording."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,53 +1,34 @@
 """`weldcal calibrate DATASET`: estimates X_BC and its uncertainty from a folder of scans and writes exports and a report."""
 
-from __future__ import annotations
-
-import csv
-import io
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import load_dataset
-from weldcal.calibration.data.results import (
-    CalibrationResult,
-    PoseRecord,
-    export_all,
-    save_result,
-    software_version,
-)
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.self_calibration import (
-    apply_self_calibration,
-    calibrate_corrected,
-)
+from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration, calibrate_corrected
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.validation import (
-    convergence,
-    k_fold,
-)
+from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
+from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.report.calibration import calibration_report
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 
-Array = NDArray[np.float64]
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
-Progress = Callable[[str, float], None]
-"""Called with the stage and the completed fraction (0 to 1)."""
 
 
 def calibrate_dataset(
@@ -240,10 +221,8 @@ def _pose_records(
 
 
 def _centres_csv(observations: list[Observation]) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(["id", "centre_x", "centre_y", "centre_z", "normal_x", "normal_y", "normal_z"])
+    rows = []
     for o in observations:
         normal = ["", "", ""] if o.n_C is None else [f"{v:.9f}" for v in o.n_C]
-        writer.writerow([o.id, *(f"{v:.9f}" for v in o.p_CR), *normal])
-    return stream.getvalue()
+        rows.append([o.id, *(f"{v:.9f}" for v in o.p_CR), *normal])
+    return csv_text(("id", *(f"{what}_{axis}" for what in ("centre", "normal") for axis in "xyz")), rows)

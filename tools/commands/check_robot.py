@@ -1,7 +1,5 @@
 """`weldcal check-robot`: prints the pre-flight checks as a table or as JSON."""
 
-from __future__ import annotations
-
 import shutil
 import textwrap
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Runs the weld job of a scenario and writes its results; for `demo`, live calibration and `weld`."""
 
-from __future__ import annotations
-
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point

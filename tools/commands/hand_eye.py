@@ -1,7 +1,5 @@
 """weldcal hand-eye: solves for the unknown poses from a file of pose pairs, compares all methods and writes exports."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +7,6 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.errors import InconsistentPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import IDENTITY, inverse
@@ -29,8 +26,6 @@ from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.outcomes.hand_eye import HandEyeReport, MethodRow
-
-Array = NDArray[np.float64]
 
 EQUATIONS = ("ax-xb", "ax-yb", "axb-ycz")
 

@@ -1,9 +1,5 @@
 """Runs `weldcal hand-eye live`: a calibration in any mounting, with files and report, compared with the ground truth."""
 
-from __future__ import annotations
-
-import csv
-import io
 import json
 import time
 from hashlib import sha256
@@ -18,6 +14,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.mounting import mounting_report
 from weldcal.tools.report.mounting_picture import station_picture
 from weldcal.tools.report.render import write_atomic
@@ -61,13 +58,12 @@ def write_mounting(report: MountingReport, finished: JobRun) -> None:
 def _observations(report: MountingReport) -> str:
     """The rows of sightings.csv, one per scan: joints (deg), centre (mm) and normal in the camera frame, visible share of the edge."""
     two = report.job.scene.two
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     joints = [f"q{i}_deg" for i in range(1, 7)] + ([f"second_q{i}_deg" for i in range(1, 7)] if two else [])
-    writer.writerow(["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"])
+    columns = ["id", *joints, *(f"centre_{a}_mm" for a in "xyz"), *(f"normal_{a}" for a in "xyz"), "coverage"]
+    rows = []
     for s in report.status.seen:
         q = np.degrees(s.pose.q if s.pose.q_2 is None else np.concatenate([s.pose.q, s.pose.q_2]))
         normal = np.zeros(3) if s.observation.n_CM is None else s.observation.n_CM
         values = [*q, *(1e3 * s.observation.p_CM), *normal, s.coverage]
-        writer.writerow([s.label, *(json.dumps(round(float(v), 6)) for v in values)])
-    return text.getvalue()
+        rows.append([s.label, *(json.dumps(round(float(v), 6)) for v in values)])
+    return csv_text(columns, rows)

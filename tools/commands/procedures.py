@@ -1,7 +1,5 @@
 """Maps the key of a scenario's job to the command that runs it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol

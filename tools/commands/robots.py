@@ -1,7 +1,5 @@
 """Selects the robot of a run by the --robot option: simulated, an emulated controller, or a controller at an address."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Runs the job of a scenario for all commands: selects the robot, builds the cell, opens the viewer and advances it."""
 
-from __future__ import annotations
-
 import time
 import webbrowser
 from contextlib import closing
@@ -9,10 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import Meshcat, MeshcatParams
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.discovery import job_of
@@ -22,8 +19,6 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,5 @@
 """Writes the files of a run: calibration.yaml, the weld log and the scans as a dataset for `weldcal calibrate`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

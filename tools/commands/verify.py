@@ -1,13 +1,9 @@
 """`weldcal verify RESULT DATASET`: measures the errors of a calibration at the flange on scans that it did not use."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
@@ -18,12 +14,10 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
+from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import PoseError, VerifyReport
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.verify import verify_report
-
-Array = NDArray[np.float64]
-Progress = Callable[[str, float], None]
 
 _FEW = 4
 _TURN_DEG = 3.0  # orientations closer than this are one orientation to a verification

@@ -1,7 +1,5 @@
 """`weldcal view`: finds the pages of a finished run and opens them in the web browser."""
 
-from __future__ import annotations
-
 import webbrowser
 from pathlib import Path
 

@@ -1,14 +1,11 @@
 """The results that the reports of `calibrate` and `verify` show, and their JSON objects."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
@@ -18,8 +15,7 @@ from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergenc
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def error_summary(values: Array) -> dict[str, float]:

@@ -1,7 +1,5 @@
 """The result of a weld job: state, calibration and weld, and the JSON object of `demo` and `weld`."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,18 +1,14 @@
 """The result of `weldcal hand-eye`: poses with their uncertainty, the comparison of methods, the next pose."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.planning.next_pose import NextPose
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 @dataclass(frozen=True)

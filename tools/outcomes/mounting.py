@@ -1,7 +1,5 @@
 """The result of a live calibration in any mounting, with errors against the ground truth of a simulation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

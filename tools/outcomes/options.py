@@ -1,7 +1,5 @@
 """The options of a run of a cell."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

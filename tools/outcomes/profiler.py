@@ -1,16 +1,14 @@
 """The result of a live profiler run against the ground truth: pose errors in predicted sigmas, seam and torch errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import chi2
 
 from weldcal.calibration.profiler.result import ProfilerEstimate
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import pose_sigmas
 from weldcal.systems.jobs.profiler.job import AddedProfilerJob
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
@@ -19,7 +17,6 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
 
-Array = NDArray[np.float64]
 JOINT_3_SIGMA = float(chi2.ppf(chi2.cdf(9.0, 1), 6))  # 20.06
 
 

@@ -1,7 +1,5 @@
 """Errors of the weld and of the calibration of a run against the ground truth of the simulation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +8,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
+from weldcal.models.arrays import Array
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M
@@ -24,8 +23,6 @@ from weldcal.welding.record.process import (
 )
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Phase
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

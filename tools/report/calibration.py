@@ -1,7 +1,5 @@
 """The report page of `weldcal calibrate`, with its plots and tables."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -9,10 +7,11 @@ from matplotlib.figure import Figure
 from weldcal.calibration.data.results import export_ros2, export_ur_pose
 from weldcal.calibration.eye_on_base.solve import point_error_covariance
 from weldcal.calibration.geometry.se3 import rotation_vector
+from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.calibration import CalibrationReport
 from weldcal.tools.report.calibration_map import knowledge_map
 from weldcal.tools.report.flange_features import HEADER, feature_table, fit_cells
-from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, Array, error_bars, error_field, svg
+from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, error_bars, error_field, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
 

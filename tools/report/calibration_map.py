@@ -1,17 +1,13 @@
 """The map of the uncertainty of a scanned point, with the poses taken and the most informative next place."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from weldcal.calibration.eye_on_base.advice import sigma_at, weakest_place
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
+from weldcal.models.arrays import Array
 from weldcal.tools.report.pictures import svg
-
-Array = NDArray[np.float64]
 
 _STEPS = 25
 _MARGIN = 0.35  # of the widest extent of the poses: so far around them the map reaches

@@ -1,12 +1,10 @@
 """The report of a run, for someone who was not there: did it work, how well, what it looked like, where the numbers are from."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 
-from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
+from weldcal.calibration.data.results import export_ros2, export_ur_pose
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.weld import heat_input_kJ_mm
 from weldcal.tools.report import plots_demo, plots_weld
@@ -75,7 +73,6 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         observations=_observations(result),
         timing=_timing(result),
         recording=recording,
-        software=software_version(),
     )
 
 

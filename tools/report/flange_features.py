@@ -1,7 +1,5 @@
 """Table cells of the flange fits: residuals of face plane, outer edge, bore and holes, centre sigma and coverage."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -1,11 +1,8 @@
 """The report of a live calibration in any mounting: the station, what was found in which direction, and how sure it is."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import software_version
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, render
@@ -67,7 +64,6 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
         else None,
         rows=rows,
         seconds=report.run.seconds,
-        software=software_version(),
     )
 
 

@@ -1,7 +1,5 @@
 """A picture of a mounting as it stands in simulation, with its frames drawn into it."""
 
-from __future__ import annotations
-
 import io
 
 import numpy as np
@@ -20,9 +18,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.sensors import CameraInfo
 
 from weldcal.calibration.planning.mounting_scene import BASE, FLANGE
+from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.mounting import MountingReport
-
-Array = NDArray[np.float64]
 
 WIDTH, HEIGHT, FOCAL = 1000, 640, 900.0
 AXES_M = 0.10

@@ -1,7 +1,5 @@
 """Plots that several reports share: errors as bars, errors as arrows across the scanner's field of view."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 
@@ -15,10 +13,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.flange.observation import Observation
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 OURS, THEIRS, TRUTH, GREY = "#1d5f8a", "#b08a2e", "#a8402f", "#9aa3ab"
+PLANNED, TORCH, ROBOT = GREY, "#d9700f", "#5b7d4e"
 _GROSS = 10.0  # times the median: a gross outlier
 _PLATE = {"facecolor": "white", "alpha": 0.85, "edgecolor": "none", "pad": 1.0}  # keeps a label readable on a bar
 
@@ -91,6 +89,14 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
         axes.margins(0.15)
     left.set_title(f"errors, enlarged {scale:.0f} times", fontsize=9, loc="left")
     return svg(figure, left, right)
+
+
+def plain(axes: Axes, x: str, y: str) -> None:
+    """Axis labels, no box, a faint grid."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.25)
 
 
 def svg(figure: Figure, *all_axes: Axes) -> bytes:

@@ -1,13 +1,13 @@
 """The pictures of a run: how the calibration converged, and its weld in the form that the weld's pictures take."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 
+from weldcal.models.arrays import Array
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.tools.outcomes.weld import WeldOutcome
-from weldcal.tools.report.plots_weld import OURS, ROBOT, THEIRS, TRUTH, Array, WeldTrace, plain, svg
+from weldcal.tools.report.pictures import OURS, ROBOT, THEIRS, TRUTH, plain, svg
+from weldcal.tools.report.plots_weld import WeldTrace
 from weldcal.welding.record.process import path_error, speed_along, torch_angles
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import ServoConfig

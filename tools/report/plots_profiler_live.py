@@ -1,17 +1,14 @@
 """Pictures of a live profiler run: pose errors in sigmas of their prediction, the seam and the torch against the truth, raw profiles."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.profiler import PathOutcome, PoseOutcome
 from weldcal.tools.report.pictures import OURS, svg
 
-Array = NDArray[np.float64]
 RUST, GREY, GREEN = "#c4622d", "#9aa3ab", "#4b7f52"
 PARTS = ("turn x", "turn y", "turn z", "shift x", "shift y", "shift z")
 _COLOURS = {"edge": OURS, "sphere": RUST}

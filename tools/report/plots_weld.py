@@ -1,7 +1,5 @@
 """Plots of a weld: the paths over the seam (the paper's Fig. 13) and the quantities along it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -11,24 +9,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, Array, svg
+from weldcal.models.arrays import Array
+from weldcal.tools.report.pictures import OURS, PLANNED, ROBOT, TORCH, TRUTH, plain, svg
 
-__all__ = [
-    "OURS",
-    "PLANNED",
-    "ROBOT",
-    "THEIRS",
-    "TORCH",
-    "TRUTH",
-    "Array",
-    "WeldTrace",
-    "along_the_weld",
-    "paths",
-    "plain",
-    "svg",
-]
-
-PLANNED, TORCH, ROBOT = GREY, "#d9700f", "#5b7d4e"
 _SMALL = 8
 _ALONG = 0.99  # a chord that lies along the seam has no place worth a mark
 _DOTTED = (0, (1.2, 0.7))
@@ -75,14 +58,6 @@ class WeldTrace:
     windows: tuple[float, float] = (np.inf, np.inf)
     axes: tuple[int, int] = (0, 1)
     names: tuple[str, str] = field(default=("x, mm", "y, mm"))
-
-
-def plain(axes: Axes, x: str, y: str) -> None:
-    """Axis labels, no box, a faint grid."""
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.25)
 
 
 def paths(trace: WeldTrace) -> bytes:

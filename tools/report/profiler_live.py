@@ -1,19 +1,15 @@
 """The report pages of a live profiler run and of many: what was found, how far from the truth, in pictures and a table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from weldcal.calibration.data.results import software_version
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.procedure import ProfilerState
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render
 
-Array = NDArray[np.float64]
 LIMIT_MM = 0.3
 
 
@@ -39,7 +35,6 @@ def live_report(summary: Mapping[str, object], outcome: LiveOutcome, state: Prof
         header=(),
         tip_mm=outcome.tip_mm,
         recording=recording,
-        software=software_version(),
     )
 
 
@@ -64,7 +59,6 @@ def seeds_report(
         header=tuple(_COLUMNS[c] for c in columns),
         tip_mm=None,
         recording=False,
-        software=software_version(),
     )
 
 

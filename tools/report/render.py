@@ -1,7 +1,5 @@
 """Renders report templates to self-contained HTML, formats numbers, and writes files atomically."""
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import math
@@ -12,6 +10,8 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
 from markupsafe import Markup
+
+from weldcal.calibration.data.results import software_version
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
 
@@ -24,12 +24,12 @@ def render(template: str, **context: object) -> str:
 
     Args:
         template: file name in tools/report, such as "calibration.html.j2"; it extends "base.html.j2".
-        context: what the template shows.
+        context: what the template shows, besides `software`, the version of this package.
 
     Raises:
         jinja2.UndefinedError: if the context lacks a name.
     """
-    return environment().get_template(template).render(**context)
+    return environment().get_template(template).render(software=software_version(), **context)
 
 
 def data_uri(picture: bytes) -> str:

@@ -1,7 +1,5 @@
 """The report page of a tablet calibration, from files or from a simulated visit, with its plots and tables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,12 +11,12 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import export_ros2, export_ur_pose, software_version
 from weldcal.calibration.tablet.result import TabletResult
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Run
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
 
-Array = NDArray[np.float64]
 Card = tuple[str, str, str, str, str]
 _MARK = (40, 60, 220)  # BGR
 _MODELS = {

@@ -1,10 +1,7 @@
 """The report page of `weldcal verify`: errors per scan against the stated ones, and over the field of view."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
 from weldcal.tools.outcomes.calibration import VerifyReport
 from weldcal.tools.report.flange_features import fit_cells
 from weldcal.tools.report.pictures import error_bars, error_field
@@ -63,6 +60,5 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
         if seen.any()
         else None,
         field=error_field(report.result.X_BC, report.observations),
-        software=software_version(),
         hashes=list(report.hashes.items()),
     )

@@ -1,40 +1,11 @@
-"""Files and tables of the studies: JSON, CSV, Markdown, and tables for a terminal."""
+"""Tables of the studies: in Markdown, and for a terminal."""
 
-from __future__ import annotations
-
-import csv
-import io
-import json
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from weldcal.tools.console import plain
-from weldcal.tools.report.render import write_atomic
-
 _STYLES = {"met": "[green]met[/]", "MISSED": "[bold red]MISSED[/]"}
-
-
-def write_json(path: Path, content: object) -> None:
-    """Write the content, in JSON's own types (what is not finite becomes null), with its folder."""
-    write_atomic(path, json.dumps(plain(content), allow_nan=False, indent=1) + "\n")
-
-
-def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
-    """A header line and one line per row."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue()
-
-
-def records_csv(records: Sequence[object], columns: Sequence[str] = ()) -> str:
-    """Objects of one kind, one line each: these attributes, or all that they hold."""
-    columns = columns or list(vars(records[0]))
-    return csv_text(columns, ([getattr(record, name) for name in columns] for record in records))
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -1,7 +1,5 @@
 """Targets of a study: a figure, its bound and the verdict, judged and shown in one way by all studies."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """Finds faces bent over a cylinder in a cloud, fits them and unrolls them, so that methods for flat faces apply."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

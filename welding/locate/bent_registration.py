@@ -5,8 +5,6 @@ flat edge of what was seen. Then pose and inset are fitted together to the face 
 points (distance from the outline, unrolled): the face alone does not constrain the position along and around the axis.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

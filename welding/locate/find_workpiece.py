@@ -6,8 +6,6 @@ runners-up: a second place that fits as well, or a half turn that looks the same
 outline is symmetric the groove decides, if it is drawn asymmetrically and can be seen.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field, replace
 

@@ -3,8 +3,6 @@
 All in the plane of the face; a bent face is unrolled first.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Finds upward planes in a scan, frames on them, and rasters of the points on and below a face."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

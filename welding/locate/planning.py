@@ -1,7 +1,5 @@
 """Plans the groove's root from one scan: by the drawing registered to the scan, or from the cloud alone."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ Errors of neighbouring scan points are correlated, and so may be those of all po
 on the plate repeats along an edge. Both are modelled; the figures were tuned on simulated scans and are tested on others.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -11,8 +11,6 @@ the plate's edges run exactly along the pixel rows. A slanted view adds about 0.
 because a scanner loses its last pixel more often at the edges that face away from it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Computes the figures of a weld: arc events, torch speed, heat input, angles and path error."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Writes and reads the weld log: a CSV with one row per servo tick and a JSON header with the meaning and unit of each column."""
 
-from __future__ import annotations
-
 import csv
 import hashlib
 import io

@@ -1,7 +1,5 @@
 """Computes the motion that a planned seam requires of a tool whose torch trails its tip: turn, speed and travel angle."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

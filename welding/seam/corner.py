@@ -1,7 +1,5 @@
 """Reconstructs a corner that the tip jumped across: extends the two measured sides until they meet and rounds them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

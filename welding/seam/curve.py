@@ -1,7 +1,5 @@
 """A weld seam as an arc-length spline: position, tangent, normal, up-normal, curvature and projection."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property

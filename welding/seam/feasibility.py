@@ -1,7 +1,5 @@
 """Checks whether a seam can be welded in one go, and where to split it if not."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass

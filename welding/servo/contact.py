@@ -1,7 +1,5 @@
 """Updates the servo's state from finger-camera frames: tip point, deflection, contact and tactile points."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Measures the soft tip's displacement from an ArUco tag behind it, seen by the finger camera."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Measures the seam's start: draws the seated tip back over it, so that the torch starts on tactile points."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Guards that keep motion bounded: seam conditioning, arm singularity and joint slew limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple

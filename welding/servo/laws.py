@@ -1,7 +1,5 @@
 """The steering laws by name: the paper's as printed, its corrections step by step, and the guarded law."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

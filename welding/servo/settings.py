@@ -1,7 +1,5 @@
 """Settings of the welding servo in SI units, grouped by what they govern; the defaults are those of docs/weld_law.md."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

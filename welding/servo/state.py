@@ -1,7 +1,5 @@
 """Inputs, state and outputs of the welding servo: immutable values only."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """The welding servo as one pure step: from the measured deflection and pose to the tool's motion and the arc."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Computes the tool's chord and axes on the seam, and the roll rate that holds the work angle."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The TOUCH phase: descend next to the planned seam and search sideways until the tip is seated in the groove."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The guarded law: computes tip speed and turning rate that keep the torch on the seam at its speed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Computes the weave: the torch oscillates across the seam with a dwell at each side, and the tip keeps its path."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Extracts the point of a straight edge from a raw profile: end of a bar or step, or apex of a blade."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

@@ -5,8 +5,6 @@ robot), with a Cauchy loss that keeps 95 % of what least squares would get; the 
 share, where the stated sigmas are right.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ As published it answers some degenerate motions with confident nonsense (colline
 rank of its matrix does not show them in noise; here these motions are named and refused. Kept beside edge_joint to compare.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ The distance of a point to a line has no division by the angle between edge and 
 orientation, where the reprojection of edge_joint would not.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fits a square frustum to a point cloud: six planes, the slanted edges between them, and their angles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -4,8 +4,6 @@ Where the seam turns under the laser line its walls are curved in the profile: a
 that they may hide is in the sigmas.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Finds the arc of a sphere in a profile and fits its circle."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -4,8 +4,6 @@ Every profile point lies on the sphere, and so does the tip at every touch. The 
 where the joint angles are given, the arm's offsets and sag may be estimated with it, each held by a prior.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Literal
 

@@ -3,8 +3,6 @@
 Kept as published, beside sphere_joint, which needs neither the side of the centre nor the pure translations.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

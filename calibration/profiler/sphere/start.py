@@ -1,7 +1,5 @@
 """Initial estimates of the sphere problem: radial least squares from the 24 orientations of a cube."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

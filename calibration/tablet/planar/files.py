@@ -1,19 +1,15 @@
 """Reads planar touches from an npz file: one visit or many of one rig, with optional queries that no fit uses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-
-Array = NDArray[np.float64]
 
 # keys of the file and their dimensions for one visit; one more in front where visits differ in it
 DIMENSIONS = {

@@ -1,11 +1,8 @@
 """Fits camera and pen by the tablet's known size: PnP, then a planar rigid motion and the pen offset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.optimize import minimize
 from scipy.special import log_ndtr
@@ -14,8 +11,7 @@ from weldcal.calibration.tablet.errors import CollinearLandmarks, LandmarksNotFo
 from weldcal.calibration.tablet.plane_pose import tablet_points, tablet_pose
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches, check_touches, same_landmark
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 PLANAR_NAMES = ("phi", "t_x", "t_y", "x_p", "y_p", "scale")
 

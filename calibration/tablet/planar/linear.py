@@ -1,7 +1,5 @@
 """Fits camera and pen by linear least squares in six unknowns: an image-plane similarity and the pen offset."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +8,7 @@ from numpy.typing import NDArray
 from weldcal.calibration.tablet.errors import TooFewLandmarks
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, check_touches, same_landmark
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 LINEAR_NAMES = ("a", "b", "t_x", "t_y", "x_p", "y_p")
 UNKNOWNS = len(LINEAR_NAMES)

@@ -1,12 +1,9 @@
 """The tablet paper's two-stage calibration: chain, affine pair, and the hand position for a pixel."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.published.chain import Model, place_landmarks, search_range
 from weldcal.calibration.tablet.published.distances import DistanceMinimum, Residuals, minimise_distances
@@ -22,8 +19,8 @@ from weldcal.calibration.tablet.published.two_stage import (
     stage2_residuals,
 )
 from weldcal.calibration.tablet.touches import TabletTouches, check_touches
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Minimiser = Callable[[Residuals, Array], DistanceMinimum]
 """Finds a minimum of residuals within a range (p, 2)."""
 

@@ -1,16 +1,13 @@
 """The tablet paper's two chains to the base: homogeneous transforms (HTM) and Denavit-Hartenberg (DH)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 Model = Literal["htm", "dh"]
 
 HTM_NAMES = ("x_c", "y_c", "alpha_c", "beta_c", "gamma_c", "x_t", "y_t", "alpha_t", "beta_t", "gamma_t", "x_p", "y_p")

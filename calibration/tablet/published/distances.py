@@ -1,15 +1,13 @@
 """Minimises the sum of mean distances: least squares, then smoothed distances of growing sharpness by SLSQP."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
+
 Residuals = Callable[[Array], Array]
 """Parameter sets (k, p) to differences (k, 2 n, 2), mm."""
 

@@ -1,16 +1,12 @@
 """Differential evolution with the settings of the paper's Table 4: DE/rand/1, binomial crossover, CR 0.9, F 0.5."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, differential_evolution
 
 from weldcal.calibration.tablet.published.distances import DistanceMinimum, Residuals
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 PUBLISHED_POPULATION = 10_000
 PUBLISHED_GENERATIONS = 10_000

@@ -1,17 +1,13 @@
 """The tablet paper's two fitness functions: mean distances after the chain (stage 1) and the affine pair (stage 2)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.published.chain import Landmarks, Model, place_landmarks
 from weldcal.calibration.tablet.touches import TabletTouches
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 AFFINE_NAMES = ("X_1", "Y_1", "Sx_1", "Sy_1", "theta_1", "X_2", "Y_2", "Sx_2", "Sy_2", "theta_2")
 AFFINE_NONE = np.array([0.0, 0.0, 1.0, 1.0, 0.0] * 2)

@@ -1,18 +1,13 @@
 """Diagnoses touches from full robot poses: scale, single wrong landmarks and wrong order; changes nothing."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS
 from weldcal.calibration.tablet.wrist.fit import WristFit, WristTouches
-
-Array = NDArray[np.float64]
 
 _SCALE_SIGMAS, _SCALE_LEAST = 3.0, 2.5e-3
 _BAD_TOUCH_M, _BAD_PIXEL = 1.5e-3, 2.0  # residuals above these are no noise

@@ -1,7 +1,5 @@
 """Reads a tablet visit: the page's CSV, robot poses and an image."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,8 +18,7 @@ from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
 from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist.fit import WristTouches
 from weldcal.calibration.tablet.wrist.page_grid import find_page
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
 POSE_COLUMNS = ("landmark", "x", "y", "z", "qw", "qx", "qy", "qz")

@@ -13,8 +13,7 @@ from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import check_layout, check_turns
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _OPEN_PRIOR_M = 1.0  # of the pen's tip where nothing is known: far wider than any pen
 _KNOWN_PRIOR_M = 0.5e-3  # of a pen length that a person measured

@@ -1,7 +1,5 @@
 """Derives the page's grid from the touched landmarks: columns, rows and spacing."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Mapping
 
@@ -10,8 +8,8 @@ from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.detection import Look, arrange, find_marks
 from weldcal.calibration.tablet.errors import LandmarksNotFound, TabletDataError
+from weldcal.models.arrays import Array
 
-Array = NDArray[np.float64]
 MOST_COLUMNS = 30
 _ON_GRID_PX = 1.5  # of the page: its landmarks sit on whole device pixels
 _MORE_ROWS = 8  # rows below the last touched one that are looked for in the image

@@ -1,7 +1,5 @@
 """The objects that a job adds to the simulated world, with true poses drawn from the run's seed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A separate scene graph for a camera; its poses are updated only when a picture is taken."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
@@ -44,10 +42,7 @@ class PicturePoses(LeafSystem):
         self._frames = frames
         self._body_poses = self.DeclareAbstractInputPort("body_poses", plant.get_body_poses_output_port().Allocate())
         self.DeclareAbstractOutputPort(
-            "frame_poses",
-            lambda: AbstractValue.Make(FramePoseVector()),
-            self._calculate,
-            {self._body_poses.ticket()},
+            "frame_poses", lambda: AbstractValue.Make(FramePoseVector()), self._calculate, {self._body_poses.ticket()}
         )
 
     def _calculate(self, context: Context, output: Any) -> None:

@@ -1,7 +1,5 @@
 """Renders pictures in a separate thread while the Diagram advances to their arrival time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 

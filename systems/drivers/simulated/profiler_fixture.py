@@ -1,7 +1,5 @@
 """Draws the true profiler fixture from the seed: sensor, torch, straightedge and sphere, each off its nominal pose."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 

@@ -1,21 +1,18 @@
 """Adds torch, profiler, straightedge and sphere to the simulated world of a profiler cell, at their true poses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.geometry import AddContactMaterial, Box, Cylinder, GeometryId, Mesh, ProximityProperties, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex, SpatialInertia, UnitInertia
 
+from weldcal.models.arrays import Array
 from weldcal.models.mesh import TriMesh, revolve
 from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
 
-Array = NDArray[np.float64]
 TIP_RADIUS_M = 2e-5  # of the contact point: 0.01 mm is below the resolution of every reported figure
 POST_RADIUS_M = 0.006
 BEVEL_M = 0.007  # thickness of the straightedge, bevelled under 45 degrees so that its side is hidden from above

@@ -1,17 +1,17 @@
 """Simulated laser profiler: casts a fan of rays at the true geometry; adds noise, rounding and lost returns."""
 
 import dataclasses as dc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.profilers import ProfilerPreset, with_noise
 from weldcal.systems.drivers.config import DriverConfig
@@ -21,7 +21,6 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.jobs.profiler.config import pose_of
 from weldcal.systems.messages import ProfileScan, TorchTouch
 
-Array = NDArray[np.float64]
 FORCE_N = 0.02  # contact force above which a touch is reported
 
 
@@ -188,12 +187,7 @@ class ProfilerSensor(LeafSystem):
         self._poses = self.DeclareAbstractInputPort("body_poses", AbstractValue.Make([RigidTransform()]))
         self._shown = self.DeclareAbstractState(AbstractValue.Make(ProfileScan()))
         self._pending = self.DeclareAbstractState(AbstractValue.Make(ProfileScan()))
-        self.DeclareAbstractOutputPort(
-            "profile",
-            lambda: AbstractValue.Make(ProfileScan()),
-            self._output,
-            {self.abstract_state_ticket(self._shown)},
-        )
+        self.DeclareStateOutputPort("profile", self._shown)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -210,9 +204,6 @@ class ProfilerSensor(LeafSystem):
         points = measured_profile(self._config, clean, cosine, dark, np.random.default_rng([self._seed, wanted]))
         scan = ProfileScan(wanted, last_step(now, self._step), points)
         state.get_mutable_abstract_state(self._pending).set_value(scan)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
 class TouchSensor(LeafSystem):
@@ -233,9 +224,7 @@ class TouchSensor(LeafSystem):
         self._pair, self._step = {pair.tip, pair.ball}, plant_period_s
         self._contacts = self.DeclareAbstractInputPort("contact_results", AbstractValue.Make(ContactResults()))
         self._touch = self.DeclareAbstractState(AbstractValue.Make(TorchTouch()))
-        self.DeclareAbstractOutputPort(
-            "touch", lambda: AbstractValue.Make(TorchTouch()), self._output, {self.abstract_state_ticket(self._touch)}
-        )
+        self.DeclareStateOutputPort("touch", self._touch)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -253,9 +242,6 @@ class TouchSensor(LeafSystem):
         info = results.point_pair_contact_info(k)
         pair = info.point_pair()
         return {pair.id_A, pair.id_B} == self._pair and float(np.linalg.norm(info.contact_force())) > FORCE_N
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._touch).get_value())
 
 
 class CheatTorch(LeafSystem):

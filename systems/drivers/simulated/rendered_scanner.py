@@ -1,7 +1,7 @@
 """Simulated structured-light scanner: renders the depth of the true geometry and adds the scanner's noise."""
 
 import dataclasses as dc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +46,8 @@ class RenderedScanner(ScannerConfig):
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
     field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
-    mounted_on: str = (
-        "base"  # or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
-    )
+    # base, or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
+    mounted_on: str = "base"
 
     def scanner(self) -> ScannerPreset:
         """The scanner with the configured resolution and field of view; the pixels' aspect ratio is unchanged."""
@@ -107,9 +106,7 @@ class DepthSensor(LeafSystem):
         )
         self._shown = self.DeclareAbstractState(AbstractValue.Make(Scan()))
         self._pending = self.DeclareAbstractState(AbstractValue.Make(Scan()))
-        self.DeclareAbstractOutputPort(
-            "scan", lambda: AbstractValue.Make(Scan()), self._output, {self.abstract_state_ticket(self._shown)}
-        )
+        self.DeclareStateOutputPort("scan", self._shown)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -134,9 +131,6 @@ class DepthSensor(LeafSystem):
             return None
         rgb = np.asarray(self._color.Eval(context).data[:, :, :3], dtype=np.float32)
         return darkness(rgb)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
 def _carrier(world: SimulatedWorld, mounted_on: str) -> RigidBody | None:

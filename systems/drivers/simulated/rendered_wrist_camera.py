@@ -1,7 +1,7 @@
 """Simulated wrist depth camera: takes one picture of the true geometry per trigger."""
 
 import dataclasses as dc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +72,7 @@ class WristCamera(LeafSystem):
         self._color = self.DeclareAbstractInputPort("color_image", AbstractValue.Make(ImageRgba8U(*size)))
         self._depth = self.DeclareAbstractInputPort("depth_image", AbstractValue.Make(ImageDepth32F(*size)))
         self._shown = self.DeclareAbstractState(AbstractValue.Make(WristPicture()))
-        ticket = {self.abstract_state_ticket(self._shown)}
-        self.DeclareAbstractOutputPort("picture", lambda: AbstractValue.Make(WristPicture()), self._output, ticket)
+        self.DeclareStateOutputPort("picture", self._shown)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -90,9 +89,6 @@ class WristCamera(LeafSystem):
         depth[~np.isfinite(depth)] = 0.0
         picture = WristPicture(wanted, context.get_time(), noisy, depth)
         state.get_mutable_abstract_state(self._shown).set_value(picture)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._shown).get_value())
 
 
 def ApplyDriverConfig(config: RenderedWristCamera, build: StationBuild) -> None:

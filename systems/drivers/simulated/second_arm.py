@@ -1,7 +1,5 @@
 """Adds a second arm to the simulated plant, with its base at its true pose."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 
 import numpy as np

@@ -1,7 +1,7 @@
 """Simulated tablet: detects the pen by its contact force and reports the position to a tenth of a pixel."""
 
 import dataclasses as dc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -57,8 +57,7 @@ class TabletDigitizer(LeafSystem):
         self._X_TB, self._seed = X_BT.inverse(), seed
         self._contacts = self.DeclareAbstractInputPort("contact_results", AbstractValue.Make(ContactResults()))
         self._touch = self.DeclareAbstractState(AbstractValue.Make(TabletTouch()))
-        ticket = {self.abstract_state_ticket(self._touch)}
-        self.DeclareAbstractOutputPort("touch", lambda: AbstractValue.Make(TabletTouch()), self._output, ticket)
+        self.DeclareStateOutputPort("touch", self._touch)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -84,9 +83,6 @@ class TabletDigitizer(LeafSystem):
             if np.linalg.norm(info.F_Ac_W().translational()) > self._config.touch_force_N:
                 return np.asarray(self._X_TB.multiply(surface.centroid())[:2])
         return None
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._touch).get_value())
 
 
 def _geometry(plant: MultibodyPlant, body: str, build: StationBuild, name: str) -> GeometryId:

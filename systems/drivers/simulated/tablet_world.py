@@ -1,7 +1,5 @@
 """Adds the tablet job's bodies to the simulated world: plate, camera and sprung pen on the flange, tablet on the table."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import cv2

@@ -1,28 +1,15 @@
 """Builds the simulated world: arm, tool with its soft tip, table and workpiece in one MultibodyPlant and scene graph."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from pydrake.geometry import (
-    AddContactMaterial,
-    AddRigidHydroelasticProperties,
-    Box,
-    ProximityProperties,
-    SceneGraph,
-)
+from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties, Box, ProximityProperties, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import (
-    JointActuatorIndex,
-    ModelInstanceIndex,
-    PdControllerGains,
-    PrismaticJoint,
-)
+from pydrake.multibody.tree import JointActuatorIndex, ModelInstanceIndex, PdControllerGains, PrismaticJoint
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer

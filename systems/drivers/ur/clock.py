@@ -1,7 +1,5 @@
 """Maps robot time to the host's clock: a line fitted to the earliest package arrivals, with offset and drift."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

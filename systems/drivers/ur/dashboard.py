@@ -1,7 +1,5 @@
 """Client of the PolyScope 5 dashboard: sends one command line and reads one answer, on a new connection each time."""
 
-from __future__ import annotations
-
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
 from weldcal.systems.drivers.ur.line import Line
 

@@ -1,7 +1,5 @@
 """Errors for a robot that cannot be started; each message is one sentence with the operator action."""
 
-from __future__ import annotations
-
 from weldcal.models.errors import WeldcalError
 
 

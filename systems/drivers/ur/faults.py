@@ -1,7 +1,5 @@
 """The faults for which the UR driver stops the arm, each with its message and operator action."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

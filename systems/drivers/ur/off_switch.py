@@ -1,7 +1,5 @@
 """Turns a digital output off over a separate RTDE connection, independent of the program on the controller."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 

@@ -1,7 +1,5 @@
 """Sets the thread priorities on the cell's computer: the cell, the worker's loop, and ur_rtde's polling threads."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import threading

@@ -1,7 +1,5 @@
 """The worker's interface to the robot through ur_rtde: connect, upload the guard, read samples, send numbered velocities."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

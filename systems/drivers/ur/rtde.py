@@ -1,7 +1,7 @@
 """Driver of a UR robot: reads the link in an update event and sends in a publish event."""
 
 import dataclasses as dc
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -13,11 +13,10 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
-from weldcal.systems.drivers.ur.link import LinkState, UrLink
+from weldcal.systems.drivers.ur.link import UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import Limits
-from weldcal.systems.messages import UrStatus
 
 FULL_PACE = 1.0
 STILL_RAD_S = 1e-9
@@ -44,16 +43,6 @@ class UrRtde(DriverConfig):
         return Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
-
-
-class ArmLink(Protocol):
-    """The interface of a robot link; neither call blocks."""
-
-    def state(self) -> LinkState:
-        """The newest state."""
-
-    def command(self, qd: np.ndarray, process: bool = False) -> int:
-        """Pass on the newest joint velocity (6,) rad/s and the process enable."""
 
 
 class UrRtdeArm(LeafSystem):
@@ -98,8 +87,7 @@ class UrRtdeArm(LeafSystem):
         self.DeclareVectorOutputPort("velocity_measured", 6, self._velocity, ticket)
         self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
         self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
-        said = {self.abstract_state_ticket(self._said)}
-        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(UrStatus()), self._status, said)
+        self.DeclareStateOutputPort("status", self._said)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._read)
         self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
 
@@ -135,9 +123,6 @@ class UrRtdeArm(LeafSystem):
 
     def _time(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
-
-    def _status(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._said).get_value())
 
 
 def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:

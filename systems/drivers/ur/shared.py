@@ -1,15 +1,12 @@
 """Memory shared by two processes: blocks with one writer each and consistent reads, and a ring of joint positions."""
 
-from __future__ import annotations
-
 import mmap
 import struct
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 _COUNT_BYTES = 8
 _CHECK = struct.Struct("<I")

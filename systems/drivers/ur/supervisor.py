@@ -6,11 +6,9 @@ from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
-
-Array = NDArray[np.float64]
 
 NORMAL, REDUCED, PROTECTIVE, RECOVERY, SAFEGUARD = 1, 2, 3, 4, 5
 SYSTEM_EMERGENCY, ROBOT_EMERGENCY = 6, 7

@@ -1,13 +1,9 @@
 """MountingCalibrator: estimates the unknown poses of any mounting from scans of a circle, and proposes the next pose."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
@@ -22,14 +18,13 @@ from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, sol
 from weldcal.calibration.hand_eye.stated_noise import information_of, with_stated_noise
 from weldcal.calibration.planning.mounting_poses import MountingPose, information, prior, work_point
 from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
-
-Array = NDArray[np.float64]
 
 FIT_SHARE = 1.25  # errors of the fits over their predicted sigma (which assumes independent noise in a scan), rms in simulated scans
 
@@ -63,11 +58,7 @@ class MountingCalibrator(LeafSystem):
     """
 
     def __init__(
-        self,
-        scene: MountingScene,
-        config: MountingFitConfig,
-        plan: Sequence[MountingPose],
-        period_s: float = 0.02,
+        self, scene: MountingScene, config: MountingFitConfig, plan: Sequence[MountingPose], period_s: float = 0.02
     ) -> None:
         super().__init__()
         warm_up()
@@ -77,12 +68,7 @@ class MountingCalibrator(LeafSystem):
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._history_2 = self.DeclareAbstractInputPort("history_2", AbstractValue.Make(PoseHistory()))
         self._status = self.DeclareAbstractState(AbstractValue.Make(MountingStatus()))
-        self.DeclareAbstractOutputPort(
-            "status",
-            lambda: AbstractValue.Make(MountingStatus()),
-            self._output,
-            {self.abstract_state_ticket(self._status)},
-        )
+        self.DeclareStateOutputPort("status", self._status)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -95,9 +81,6 @@ class MountingCalibrator(LeafSystem):
         q_2 = self._history_2.Eval(context).joints_at(scan.capture_time) if self._scene.two else None
         new = digest(status, scan, job, (q, q_2), self._scene, self._config, self._plan)
         state.get_mutable_abstract_state(self._status).set_value(new)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._status).get_value())
 
 
 def digest(

@@ -1,7 +1,5 @@
 """The mounting job: calibrates a scanner in any mounting by the robot's flange or base circle, with one arm or two."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,10 +122,7 @@ class Mounting(Job[MountingPlanned]):
         state = procedure.GetOutputPort("state")
         wiring.connect(calibrator, scan=wiring.out("scanner.scan"), state=state)
         wiring.connect(
-            procedure,
-            status=calibrator.GetOutputPort("status"),
-            hold=spine.hold,
-            position_measured=spine.arm.position,
+            procedure, status=calibrator.GetOutputPort("status"), hold=spine.hold, position_measured=spine.arm.position
         )
         wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
         for arm, suffix in zip(spine.arms, ("", "_2"), strict=False):

@@ -1,19 +1,15 @@
 """Messages of the mounting job: the state of the procedure and the status of the calibration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.hand_eye.mountings import TargetObservation
 from weldcal.calibration.hand_eye.solve import HandEyeResult
 from weldcal.calibration.planning.mounting_poses import MountingPose
+from weldcal.models.arrays import Array
 from weldcal.systems.messages import Message
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

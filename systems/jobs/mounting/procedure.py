@@ -1,22 +1,19 @@
 """MountingProcedure: visits the planned poses with one arm or two, scans at each, holds out some scans, returns home."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.calibration.planning.mounting_poses import MountingPose
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.messages import JobCommand, UrStatus
 from weldcal.systems.motion.goals import stands_at
 
-Array = NDArray[np.float64]
 ENDS = ("done", "held")
 
 
@@ -73,7 +70,7 @@ class MountingProcedure(LeafSystem):
                 name, lambda: AbstractValue.Make(JobCommand()), lambda c, o, arm=arm: self._job(c, o, arm), ticket
             )
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
-        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(MountingState()), self._show, ticket)
+        self.DeclareStateOutputPort("state", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -158,9 +155,6 @@ class MountingProcedure(LeafSystem):
 
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().trigger))
-
-    def _show(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
 
 
 def _go(s: MountingState, route: tuple[tuple[int, Array], ...], label: str, now: float) -> MountingState:

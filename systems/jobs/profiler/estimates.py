@@ -1,7 +1,5 @@
 """Estimates of the profiler job from its profiles: X_FS by an edge, X_FS and the torch's tip by a sphere, a seam."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +16,12 @@ from weldcal.calibration.profiler.sphere.arc import find_arc
 from weldcal.calibration.profiler.sphere.joint import Model, SphereEstimate, sphere_joint
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arrays import Array
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.jobs.profiler.config import ProfilerJob
 from weldcal.systems.messages import Message
 from weldcal.welding.seam.curve import SeamCurve
 
-Array = NDArray[np.float64]
 SMOOTHING_M = 0.004  # seam wavelengths below about six times this are treated as noise
 FAR_SIGMAS = 4.0  # times the scatter about the smooth seam; points beyond it are rejected
 TRIALS = 3  # rounds of outlier rejection

@@ -1,7 +1,5 @@
 """The profiler job: calibrates a laser profiler by an edge and by a touched sphere, measures a seam, moves the torch along."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -12,21 +12,16 @@ from scipy.interpolate import CubicSpline
 
 from weldcal.calibration.profiler.edge.model import EdgeState
 from weldcal.calibration.profiler.motion import FlangePoses
-from weldcal.calibration.profiler.plan import (
-    plan_edge_poses,
-    plan_sphere_poses,
-    sample_edge_poses,
-    sample_sphere_poses,
-)
+from weldcal.calibration.profiler.plan import plan_edge_poses, plan_sphere_poses, sample_edge_poses, sample_sphere_poses
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.profiler.config import edge_as_thought
 from weldcal.systems.jobs.profiler.planning_context import PlanningContext
 from weldcal.systems.messages import Message
 from weldcal.welding.seam.curve import SeamCurve
 
-Array = NDArray[np.float64]
 CANDIDATES = 160
 FIRST = 5  # random poses with which the planner starts
 CAP_RAD = np.radians(55.0)  # angle from the top of the sphere within which it is touched

@@ -14,12 +14,12 @@ from weldcal.calibration.profiler.plan import Field
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import LINKS, ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
 from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 
-Array = NDArray[np.float64]
 STEP_RAD = 0.1  # along a move, between the checked configurations
 
 

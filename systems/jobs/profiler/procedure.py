@@ -1,17 +1,15 @@
 """ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.jobs.profiler.estimates import (
@@ -31,7 +29,6 @@ from weldcal.systems.messages import JobCommand, Message, ProfileScan, TorchTouc
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.seam.curve import SeamCurve
 
-Array = NDArray[np.float64]
 ENDS = ("done", "held")
 DWELL_S = 0.1  # at rest before a profile is taken
 FEEDBACK_PER_S = 8.0  # feedback gain towards the path
@@ -107,9 +104,9 @@ class ProfilerProcedure(LeafSystem):
         out = self.DeclareDiscreteState(np.zeros(6))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
-        self.DeclareVectorOutputPort("creep", 6, self._creep, {self.discrete_state_ticket(out)})
+        self.DeclareStateOutputPort("creep", out)
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
-        self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(ProfilerState()), self._show, ticket)
+        self.DeclareStateOutputPort("state", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -304,11 +301,5 @@ class ProfilerProcedure(LeafSystem):
             )
         )
 
-    def _creep(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value())
-
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(context.get_abstract_state(self._state).get_value().sequence))
-
-    def _show(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())

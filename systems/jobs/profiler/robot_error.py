@@ -1,7 +1,5 @@
 """RobotError: adds a random position error of the flange, drawn for each pose, to the simulated arm's joints."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem

@@ -1,7 +1,5 @@
 """The tablet job: the camera takes one picture of the tablet, then the pen touches each of its landmarks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,16 +1,13 @@
 """Messages of the tablet job: a picture of the wrist camera, a touch, and the ground truth of a simulation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.models.arrays import Array
 from weldcal.systems.messages import Message
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

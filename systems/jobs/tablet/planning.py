@@ -1,15 +1,13 @@
 """Plans the tablet job from nominal poses: the camera pose, the poses above each landmark, and free moves."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.planning.clearance import Body, arm_bodies
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.jobs.tablet.config import TabletConfig
@@ -19,7 +17,6 @@ from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 
-Array = NDArray[np.float64]
 PEN_BODY_M = 0.006  # radius of the pen in the clearance checks
 _LOOK_ASLANT_RAD = (
     0.12,

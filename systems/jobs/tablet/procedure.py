@@ -1,21 +1,17 @@
 """TabletProcedure: takes one picture of the tablet, then lowers the pen onto each landmark until the tablet detects it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.messages import TabletTouch, WristPicture
 from weldcal.systems.messages import JobCommand, Message, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-
-Array = NDArray[np.float64]
 
 MOVES = ("to_start", "to_look", "to_above", "lift", "to_home")
 ENDS = ("done", "held")
@@ -185,7 +181,7 @@ class TabletProcedure(LeafSystem):
         out = self.DeclareDiscreteState(np.zeros(6))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job, ticket)
-        self.DeclareVectorOutputPort("descent", 6, self._descent, {self.discrete_state_ticket(out)})
+        self.DeclareStateOutputPort("descent", out)
         self.DeclareVectorOutputPort("trigger", 1, self._trigger, ticket)
         self.DeclareAbstractOutputPort("state", lambda: AbstractValue.Make(TabletState()), self._show, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
@@ -229,9 +225,6 @@ class TabletProcedure(LeafSystem):
                 reason=s.reason or None,
             )
         )
-
-    def _descent(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value())
 
     def _trigger(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(self.stands(context).trigger))

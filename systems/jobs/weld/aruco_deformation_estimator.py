@@ -1,7 +1,5 @@
 """ArucoDeformationEstimator: measures the soft tip's displacement from its rest position in the finger camera's images."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,9 +1,6 @@
 """CalibrationPosePlanner: outputs the next of the checked calibration poses."""
 
-from __future__ import annotations
-
 import dataclasses as dc
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +43,7 @@ class CalibrationPosePlanner(LeafSystem):
         self._state = self.DeclareAbstractState(
             AbstractValue.Make(NextPose(-1, 0, "pose01", plan[0].q if plan else None))
         )
-        self.DeclareAbstractOutputPort(
-            "next_pose", lambda: AbstractValue.Make(NextPose()), self._output, {self.abstract_state_ticket(self._state)}
-        )
+        self.DeclareStateOutputPort("next_pose", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -60,6 +55,3 @@ class CalibrationPosePlanner(LeafSystem):
         q = self._plan[index].q if index < len(self._plan) else None
         new = NextPose(status.sequence, index, f"pose{index + 1:02d}", q)
         state.get_mutable_abstract_state(self._state).set_value(new)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())

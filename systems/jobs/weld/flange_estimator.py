@@ -1,9 +1,6 @@
 """FlangeEstimator: fits the circle of the flange (or of the tool's flange-like ring) in each scan."""
 
-from __future__ import annotations
-
 import dataclasses as dc
-from typing import Any
 
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
@@ -58,12 +55,7 @@ class FlangeEstimator(LeafSystem):
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(FlangeEstimate()))
-        self.DeclareAbstractOutputPort(
-            "flange_estimate",
-            lambda: AbstractValue.Make(FlangeEstimate()),
-            self._output,
-            {self.abstract_state_ticket(self._state)},
-        )
+        self.DeclareStateOutputPort("flange_estimate", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -78,9 +70,6 @@ class FlangeEstimator(LeafSystem):
             scan, job, X_BF, self._X_FR, self._standard, status.X_BC or self._X_BC_guess, self._guess_radius_m
         )
         state.get_mutable_abstract_state(self._state).set_value(estimate)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
 
 
 def estimate_flange(

@@ -1,7 +1,5 @@
 """IterativeCalibrator: estimates X_BC from the flange estimates until its expected error is small enough."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The weld job: calibrate, verify, scan the workpiece, plan the seam, weld it; or the calibration only."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -188,8 +186,7 @@ def _add_welding(
         or not isinstance(scenario.finger_camera, FingerCameraConfig)
     ):
         return WeldingPorts(
-            seam=wiring.constant("no_seam", PlannedSeam()),
-            report=wiring.constant("no_servo", ServoReport()),
+            seam=wiring.constant("no_seam", PlannedSeam()), report=wiring.constant("no_servo", ServoReport())
         )
     out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
     position, welding = spine.arm.position, scenario.welding

@@ -1,7 +1,5 @@
 """Selects the planned pose that a live eye-to-hand calibration should add next, with its predicted benefit."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

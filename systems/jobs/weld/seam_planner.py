@@ -1,9 +1,6 @@
 """SeamPlanner: plans the seam in the base, and the arm's approach, from a scan of the workpiece."""
 
-from __future__ import annotations
-
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,12 +60,7 @@ class SeamPlanner(LeafSystem):
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(PlannedSeam()))
-        self.DeclareAbstractOutputPort(
-            "planned_seam",
-            lambda: AbstractValue.Make(PlannedSeam()),
-            self._output,
-            {self.abstract_state_ticket(self._state)},
-        )
+        self.DeclareStateOutputPort("planned_seam", self._state)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
@@ -110,9 +102,6 @@ class SeamPlanner(LeafSystem):
             sigma_m=found.sigma_m,
             summary=found.summary,
         )
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
 
 
 class SeamOutOfReach(WeldcalError):

@@ -1,7 +1,5 @@
 """JobSequencer: the state machine of the weld job: home, calibrate, verify, scan, plan, approach, weld, retract, hold."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Callable
 from typing import Any

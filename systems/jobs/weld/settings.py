@@ -1,7 +1,5 @@
 """Computes the weld job's settings from scenario and station: feature, poses, stop criterion, servo."""
 
-from __future__ import annotations
-
 import numpy as np
 from pydrake.math import RigidTransform
 

@@ -1,9 +1,6 @@
 """WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip deformation."""
 
-from __future__ import annotations
-
 import dataclasses as dc
-from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -75,7 +72,7 @@ class WeldingVelocityServo(LeafSystem):
         self._state = self.DeclareAbstractState(AbstractValue.Make(ServoReport()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket)
-        self.DeclareAbstractOutputPort("servo_report", lambda: AbstractValue.Make(ServoReport()), self._report, ticket)
+        self.DeclareStateOutputPort("servo_report", self._state)
         self.DeclareVectorOutputPort("telemetry", len(TELEMETRY), self._telemetry, ticket)
         self.DeclareVectorOutputPort("torch_on", 1, self._torch, ticket | {self._job.ticket()})
         self.DeclarePeriodicUnrestrictedUpdateEvent(config.period_s, 0.0, self._update)
@@ -101,9 +98,6 @@ class WeldingVelocityServo(LeafSystem):
     def _velocity(self, context: Context, output: BasicVector) -> None:
         command = context.get_abstract_state(self._state).get_value().command
         output.SetFromVector(np.zeros(6) if command is None else command.V_BT)
-
-    def _report(self, context: Context, output: Any) -> None:
-        output.set_value(context.get_abstract_state(self._state).get_value())
 
     def _telemetry(self, context: Context, output: BasicVector) -> None:
         report: ServoReport = context.get_abstract_state(self._state).get_value()

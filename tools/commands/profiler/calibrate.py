@@ -1,9 +1,5 @@
 """`weldcal profiler`: calibrates from a file by an edge or a sphere, maps a seam and writes the result."""
 
-from __future__ import annotations
-
-import csv
-import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -44,6 +40,7 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.commands.profiler.files import ProfilerFile
 from weldcal.tools.commands.profiler.noise import Sigmas, edge_by_noise
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 
 CANDIDATES = 300
@@ -338,10 +335,8 @@ def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, A
         raise InputError("The file has no 'profiles' of the groove. Give (n, m, 2), or 'xz' with the lengths 'n'.")
     poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
     _check_number(poses, (len(file.profiles),), "profiles")
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"])
-    lost, rms = [], []
+    columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
+    rows, lost, rms = [], [], []
     for k, p in enumerate(file.profiles):
         try:
             f = groove_features(p)
@@ -349,13 +344,13 @@ def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, A
             lost.append(k)
             continue
         at = record.points_F(f.points) @ poses.rotation[k].T + poses.translation[k]
-        table.writerow([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
+        rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
         rms.append(f.rms_m)
     if not rms:
         raise FeatureNotFound(
             "No profile of the file shows a V-groove with plate on both sides. Check the file and its unit."
         )
-    write_atomic(folder / "seam.csv", text.getvalue())
+    write_atomic(folder / "seam.csv", csv_text(columns, rows))
     return {
         "scans": len(poses),
         "found": len(rms),

@@ -1,7 +1,5 @@
 """Reads measurements of a profiler from NPZ or CSV into SI units and one set of names (layouts: docs/profiler.md)."""
 
-from __future__ import annotations
-
 import hashlib
 import zipfile
 from dataclasses import dataclass

@@ -1,8 +1,5 @@
 """Runs `weldcal profiler live`: the profiler job, its measurement files, calibrations and report; for several seeds, a table."""
 
-from __future__ import annotations
-
-import csv
 import hashlib
 import io
 from collections.abc import Mapping, Sequence
@@ -10,20 +7,19 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.profiler.record import ProfilerRecord, save_record
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.runner import Progress
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.profiler import WITHIN_MM, LiveOutcome, ProfilerLive, live_outcome
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.profiler_live import live_report, seeds_report
 from weldcal.tools.report.render import write_atomic
-
-Array = NDArray[np.float64]
 
 
 def run_profiler_live(scenario: Scenario, options: RunOptions, progress: Progress) -> ProfilerLive:
@@ -61,7 +57,7 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
             )
     if s.seam is not None:
         rows = [dict(zip(("x_mm", "y_mm", "z_mm"), (f"{1e3 * v:.4f}" for v in p), strict=True)) for p in s.seam.points_B]  # fmt: skip
-        write_atomic(folder / "seam.csv", _csv(rows))
+        write_atomic(folder / "seam.csv", mappings_csv(rows))
     finished.write_recording(folder)
     write_atomic(
         folder / "report.html", live_report(live.summary(), live.outcome, s, recording=finished.meshcat is not None)
@@ -103,7 +99,7 @@ def run_profiler_seeds(scenario: Scenario, options: RunOptions, runs: int, progr
         rows.append(_flat(live.summary()))
         outcomes.append(live.outcome)
         columns = list(dict.fromkeys(name for row in rows for name in row))
-        write_atomic(options.out / "seeds.csv", _csv([{c: row.get(c, "") for c in columns} for row in rows]))
+        write_atomic(options.out / "seeds.csv", mappings_csv([{c: row.get(c, "") for c in columns} for row in rows]))
     done = [row for row in rows if row["state"] == "done"]
     found: dict[str, object] = {"state": "done" if len(done) == runs else "held", "scenario": options.scenario}
     found |= {"runs": runs, "runs_done": len(done)}
@@ -134,11 +130,3 @@ def _flat(summary: Mapping[str, object]) -> dict[str, object]:
         else:
             row[name] = value
     return row
-
-
-def _csv(rows: Sequence[Mapping[str, object]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

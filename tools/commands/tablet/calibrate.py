@@ -1,7 +1,5 @@
 """`weldcal tablet calibrate`: calibrates camera and pen from the touches of one visit or of many."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path

@@ -1,18 +1,16 @@
 """Runs the tablet job of a scenario: files for `weldcal tablet calibrate`, the calibration, and its errors against the truth."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RollPitchYaw
 
 from weldcal.calibration.tablet.detection import find_landmarks
 from weldcal.calibration.tablet.plane_depth import plane_depth
 from weldcal.calibration.tablet.wrist.fit import WristFit, seen_point
 from weldcal.models.arms.kinematics import forward_kinematics
+from weldcal.models.arrays import Array
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Progress, Run
 from weldcal.systems.scenario.schema import Scenario
@@ -23,7 +21,6 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.tablet import visit_report
 
-Array = NDArray[np.float64]
 MOST_LEAN_RAD = 0.15  # tilt of the pen at the unseen points
 UNSEEN = 50  # points of the tablet that are neither landmarks nor touched
 

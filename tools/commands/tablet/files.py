@@ -1,10 +1,5 @@
 """Writes a simulated tablet run in the files of a real one: touches.csv, poses.csv, camera.yaml and picture.png."""
 
-from __future__ import annotations
-
-import csv
-import io
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -14,6 +9,7 @@ from pydrake.math import RigidTransform
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Run
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import write_atomic
 
 
@@ -39,8 +35,8 @@ def write_visit(run: Run[AddedVisit], folder: Path) -> None:
     poses.append(_pose_row("camera", forward_kinematics(arm, state.q_look)))
     K = job.camera.camera_matrix()
     intrinsics = {"fx": float(K[0, 0]), "fy": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
-    write_atomic(folder / "touches.csv", _csv(touches))
-    write_atomic(folder / "poses.csv", _csv(poses))
+    write_atomic(folder / "touches.csv", mappings_csv(touches))
+    write_atomic(folder / "poses.csv", mappings_csv(poses))
     write_atomic(folder / "camera.yaml", yaml_dump(intrinsics))
     write_atomic(folder / "picture.png", cv2.imencode(".png", job.picture(run.root).grey)[1].tobytes())
 
@@ -51,11 +47,3 @@ def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:
         "landmark": name,
         **{c: f"{v:.9f}" for c, v in zip(("x", "y", "z", "qw", "qx", "qy", "qz"), values, strict=True)},
     }
-
-
-def _csv(rows: Sequence[Mapping[str, object]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

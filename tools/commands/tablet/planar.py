@@ -1,21 +1,18 @@
 """Fits every model to planar touches, selects the one with the smallest held-out error, and detects mistakes in the data."""
 
-from __future__ import annotations
-
 import dataclasses as dc
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.planar.files import PlanarVisit
 from weldcal.calibration.tablet.planar.fit import PLANAR_NAMES, PlanarConfig, PlanarFit, fit_planar
 from weldcal.calibration.tablet.planar.linear import LINEAR_NAMES, LinearFit, fit_linear
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches, same_landmark
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 
-Array = NDArray[np.float64]
 PNP, FREE, LINEAR = "pnp", "pnp_free_scale", "closed_form"
 NAMES = {PNP: PLANAR_NAMES, FREE: PLANAR_NAMES, LINEAR: LINEAR_NAMES}
 
@@ -163,9 +160,7 @@ def _other_signs(touches: TabletTouches, sign: Sign, sigma_m: float) -> list[str
             touches, delta_px=-touches.delta_px
         ),
         "tablet_px counted up the page: y goes down it, as the image's does": dc.replace(
-            touches,
-            landmark_px=touches.landmark_px * flip + [0.0, extent[1]],
-            delta_px=touches.delta_px * flip,
+            touches, landmark_px=touches.landmark_px * flip + [0.0, extent[1]], delta_px=touches.delta_px * flip
         ),
     }
     found = []

@@ -1,9 +1,5 @@
 """Calibrates each visit of a file by itself, with the model that has the smallest held-out error over all of them."""
 
-from __future__ import annotations
-
-import csv
-import io
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,19 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.data.results import software_version
 from weldcal.calibration.tablet.planar.files import PlanarFile
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.wrist.files import file_hash
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.tablet.planar import NAMES, VisitFits, best_model, fit_visit
 from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.report.files import mappings_csv
 from weldcal.tools.report.render import fixed, render, write_atomic
 from weldcal.tools.report.tablet import Page
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,12 +141,5 @@ def _number(value: float) -> float | None:
 
 
 def _csv(visits: Sequence[dict[str, Any]]) -> str:
-    text = io.StringIO()
-    plain = [
-        {k: v for k, v in visit.items() if k not in ("parameters", "warnings")} | visit["parameters"]
-        for visit in visits
-    ]
-    writer = csv.DictWriter(text, list(plain[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(plain)
-    return text.getvalue()
+    left_out = ("parameters", "warnings")
+    return mappings_csv([{k: v for k, v in x.items() if k not in left_out} | x["parameters"] for x in visits])

@@ -1,7 +1,5 @@
 """Invariant checker: records the motion of every frame and counts motions without a command."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Process of the emulator: opens every port and runs 500 control frames a second."""
 
-from __future__ import annotations
-
 import argparse
 import gc
 import os

@@ -1,7 +1,5 @@
 """Starts an emulated controller as a child process, one at a time per loopback address, and always ends it."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

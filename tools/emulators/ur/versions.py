@@ -1,7 +1,5 @@
 """PolyScope versions that can be emulated, and the features that depend on them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from weldcal.models.errors import InputError

@@ -1,7 +1,5 @@
 """Runs the demo over many seeds: how many runs end done, and the worst errors of calibration and torch."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +8,8 @@ import numpy as np
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.demo import run_demo
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import csv_text
 
 COLUMNS = (
     "seed", "state", "n_scans", "X_BC_error_mm", "X_BC_error_deg", "X_BC_error_at_work_mm", "expected_error_mm",

@@ -1,7 +1,5 @@
 """Measures the real-time factor of the whole cell, phase by phase, on the S groove with the finger camera on."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

@@ -1,14 +1,12 @@
 """Runs the weld in the whole simulated cell over seeds: seam points and torch against the truth, and speed."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import build_cell
 from weldcal.systems.runner import Progress, no_progress, run_cell
@@ -18,12 +16,12 @@ from weldcal.tools.commands.demo import known_camera, measure
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import FeltSeam, felt_seam
+from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import fixed, write_atomic
-from weldcal.tools.studies.output import print_note, print_table, records_csv, write_json
+from weldcal.tools.studies.output import print_note, print_table
 from weldcal.tools.studies.targets import Target, print_targets
 from weldcal.welding.servo.laws import get_law
 
-Array = NDArray[np.float64]
 # (figure, worst or mean over the runs, limit, unit); a real-time factor is a lower bound
 TARGETS = (
     ("point_sd_mm", "worst", 0.02, "mm"),

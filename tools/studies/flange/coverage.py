@@ -1,13 +1,10 @@
 """Coverage of the stated 95 % regions: shares of simulated calibrations whose regions hold the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from scipy.stats import binom, chi2
 
@@ -20,12 +17,13 @@ from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
 from weldcal.calibration.planning.observability import check_diversity
+from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.pictures import svg
 from weldcal.tools.studies.flange.frames import facing
 
-Array = NDArray[np.float64]
 LEVEL = 0.95
+SIGMA_M, SIGMA_RAD, SIGMA_RATIO = 1e-4, 1e-3, 1e-3  # of a centre and a normal per axis, and of a hole circle's ratio
 WORK_C = np.array([0.02, -0.05, 0.72])
 """The work point (3,) m in the camera."""
 Calibrated = tuple[CalibrationEstimate, RigidTransform, Array]
@@ -52,17 +50,15 @@ class Coverage:
         return float(low), float(high)
 
 
-def simulated_observations(
-    n: int, rng: np.random.Generator, *, sigma_m: float = 1e-4, sigma_rad: float = 1e-3
-) -> tuple[list[Observation], RigidTransform]:
-    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``sigma_m`` and ``sigma_rad`` an
+def simulated_observations(n: int, rng: np.random.Generator) -> tuple[list[Observation], RigidTransform]:
+    """Observations (n) of a flange and the camera's true pose X_BC: arm and scanner are off by ``SIGMA_M`` and ``SIGMA_RAD`` an
     axis, the fit by what its own covariance says (0.02 to 0.06 mm). Places that lie in one plane, which a calibration refuses,
     are drawn again."""
     X_BC = RigidTransform(
         RollPitchYaw(rng.uniform(np.array([2.8, -0.3, -3.1]), np.array([3.4, 0.3, 3.1]))), rng.uniform(-0.6, 1.0, 3)
     )
     while True:
-        out = [_simulated_observation(f"p{k}", X_BC, rng, sigma_m, sigma_rad) for k in range(n)]
+        out = [_simulated_observation(f"p{k}", X_BC, rng) for k in range(n)]
         try:
             check_diversity(np.array([o.p_BR for o in out]), np.ones(n, dtype=bool))
         except CoplanarPoses:
@@ -70,17 +66,15 @@ def simulated_observations(
         return out, X_BC
 
 
-def _simulated_observation(
-    id: str, X_BC: RigidTransform, rng: np.random.Generator, sigma_m: float, sigma_rad: float
-) -> Observation:
+def _simulated_observation(id: str, X_BC: RigidTransform, rng: np.random.Generator) -> Observation:
     p = np.array([rng.uniform(-0.18, 0.18), rng.uniform(-0.13, 0.13), rng.uniform(0.5, 0.9)])
     X_CR = facing(p, np.radians(rng.uniform(0.0, 30.0)), rng.uniform(0.0, 6.28), rng.uniform(0.0, 6.28))
     A = np.linalg.qr(rng.standard_normal((3, 3)))[0] * rng.uniform(2e-5, 6e-5, 3)
     covariance = A @ A.T
     normal_sigma = rng.uniform(2e-5, 2e-4)
-    seen = p + A @ rng.standard_normal(3) + sigma_m * rng.standard_normal(3)
+    seen = p + A @ rng.standard_normal(3) + SIGMA_M * rng.standard_normal(3)
     z = X_CR.rotation().matrix()[:, 2]
-    lean = float(np.hypot(sigma_rad, normal_sigma)) * rng.standard_normal(3)
+    lean = float(np.hypot(SIGMA_RAD, normal_sigma)) * rng.standard_normal(3)
     normal = exp_rotation(lean - z * float(z @ lean)) @ z
     return Observation(id, X_BC @ X_CR, seen, normal, covariance, normal_sigma)
 
@@ -90,7 +84,7 @@ WRONG = ScannerCorrection(1.002, (0.006, -0.004))
 
 
 def seen_by_a_wrong_scanner(
-    observations: list[Observation], rng: np.random.Generator, *, sigma_ratio: float = 1e-3
+    observations: list[Observation], rng: np.random.Generator
 ) -> tuple[list[Observation], dict[str, HolePattern]]:
     """The same observations by a scanner that needs WRONG, and the hole circle that it sees in each."""
     out, patterns = [], {}
@@ -101,7 +95,7 @@ def seen_by_a_wrong_scanner(
         normal = J.T @ o.n_C
         out.append(replace(o, p_CR=seen, n_C=normal / np.linalg.norm(normal)))
         x, y = np.linalg.svd(np.asarray(o.n_C)[None])[2][1:]
-        ratio = 2.0 / float(x @ J @ x + y @ J @ y) + sigma_ratio * rng.standard_normal()
+        ratio = 2.0 / float(x @ J @ x + y @ J @ y) + SIGMA_RATIO * rng.standard_normal()
         R = RotationMatrix(np.column_stack([x, np.cross(o.n_C, x), o.n_C]))
         patterns[o.id] = HolePattern(np.zeros((4, 3)), np.zeros(4), seen, RigidTransform(R, seen), ratio, 0.0)
     return out, patterns

@@ -1,22 +1,18 @@
 """Detection rate of the flange in ray-cast frames: with clutter, without a flange, and half hidden."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange.frames import Frame, box, empty_frame, flange_frame, random_place
-
-Array = NDArray[np.float64]
 
 WAYS = ("plate", "border", "missing")
 SAME_PLACE_M = 0.001  # a flange reported farther from where it is, is another thing taken for it

@@ -1,19 +1,15 @@
 """Ray-cast scanner frames with a flange at a known pose, or with objects that resemble one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard, flange_mesh, flange_ring
 from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
-
-Array = NDArray[np.float64]
 
 _THICK_M = 0.012
 _SEGMENTS = 96  # of bodies that are no flange
@@ -57,24 +53,19 @@ def flange_frame(
     *,
     X_CR: RigidTransform | None = None,
     clutter: int = 6,
-    wrist: bool = True,
     before: tuple[TriMesh, ...] = (),
 ) -> Frame:
     """A frame with the flange on an arm's wrist, a table behind, and ``clutter`` things about it that do not hide it;
     ``before`` holds bodies (in the camera frame) that may."""
     X_CR = random_place(scanner, standard, rng) if X_CR is None else X_CR
-    bodies = [flange_mesh(standard, _THICK_M).transformed(X_CR)]
-    if wrist:
-        bodies += [m.transformed(X_CR) for m in _wrist(standard, rng)]
+    bodies = [m.transformed(X_CR) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
     bodies += _surroundings(scanner, standard, rng, clutter, clear_of=X_CR)
     return Frame(_scan([*bodies, *before], scanner, rng), X_CR)
 
 
-def empty_frame(
-    scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator, *, clutter: int = 9
-) -> Frame:
+def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> Frame:
     """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends)."""
-    bodies = _surroundings(scanner, standard, rng, clutter, clear_of=None)
+    bodies = _surroundings(scanner, standard, rng, 9, clear_of=None)
     for k in range(3):
         bodies.append(_lookalike(standard, rng, k).transformed(random_place(scanner, standard, rng)))
     return Frame(_scan(bodies, scanner, rng), None)

@@ -1,11 +1,8 @@
 """Difference between the flange's centres from two parts of one cloud, and its Cramer-Rao bound."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.special import ndtr
@@ -13,10 +10,9 @@ from scipy.stats import norm
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFit, fit_flange
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.runner import Progress, no_progress
-
-Array = NDArray[np.float64]
 
 PARTS = (2, 4, 8)
 _REACH_M = 0.0015  # about an edge, in which its blur shows

@@ -1,13 +1,10 @@
 """Live calibrations with few scans: errors, the Cramer-Rao bound, and repeats with redrawn noise."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -15,6 +12,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.models.arms.inverse import inverse_kinematics
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
+from weldcal.models.arrays import Array
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.jobs.weld.settings import work_point
@@ -24,8 +22,6 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.report.pictures import svg
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

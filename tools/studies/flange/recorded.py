@@ -1,13 +1,10 @@
 """Calibrations of recorded scans: the worth of each ingredient, and the errors with few scans."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from scipy.stats import chi
 
@@ -22,11 +19,10 @@ from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_b
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.systems.runner import Progress, no_progress
-
-Array = NDArray[np.float64]
 
 LEAST = 12
 SIZES = (1, 2, 3, 4, 6, 8, 12)

@@ -1,25 +1,22 @@
 """Times the detection of the flange: weldcal, the paper's loop, an Open3D chain and a PCL-style random search."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
-from numpy.typing import NDArray
 
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
+from weldcal.models.arrays import Array
 from weldcal.models.flanges import PAPER_RADIUS_M, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange.frames import Frame, facing, flange_frame
 
-Array = NDArray[np.float64]
-
 FLANGE = "iso9409-1-50-4-m6"
 _E_D, _E_R, _K_MAX = 0.0003, 0.001, 10_000  # paper, section 3.2.2
+_REPEATS = 15
 _SEGMENTED = 13_000  # points, as the recorded clouds have
 
 
@@ -34,9 +31,7 @@ class Timing:
     target_ms: float | None = None
 
 
-def run_flange_benchmark(
-    seed: int = 0, *, repeats: int = 15, loop: bool = True, progress: Progress = no_progress
-) -> list[Timing]:
+def run_flange_benchmark(seed: int = 0, *, loop: bool = True, progress: Progress = no_progress) -> list[Timing]:
     """Every way on the same simulated PhoXi M scans; single thread where the method's library lets us ask for it.
 
     ``loop`` includes the paper's search as a Python loop (its 10 000 draws take seconds).
@@ -62,7 +57,7 @@ def run_flange_benchmark(
         ours.append((f"{name} Mpx frame, tracked", find(points, guess), 2.0))
     for k, (name, job, target) in enumerate(ours):
         progress("ours", 0.1 + 0.08 * k)
-        rows.append(_time(f"weldcal, {name}", job, repeats, truth, target))
+        rows.append(_time(f"weldcal, {name}", job, _REPEATS, truth, target))
     progress("the others", 0.55)
     rows.append(_time("PCL-style random circles in NumPy, segmented cloud", lambda: _ransac(cloud, seed), 3, truth))
     progress("the others", 0.65)

@@ -1,7 +1,5 @@
 """Benchmark of the hand-eye solvers: public data against OpenCV, outliers, invariance, uncertainty, AXB = YCZ, speed."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -9,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import IDENTITY, exp_rotation, inverse, pose
@@ -25,13 +22,12 @@ from weldcal.calibration.hand_eye.solve import (
     solve_axb_ycz,
     solve_problem,
 )
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.hand_eye.fuzz import fuzz
 from weldcal.tools.studies.output import markdown_table
-
-Array = NDArray[np.float64]
 
 _PLAIN = HandEyeConfig(folds=0)
 _TOLERANCE = (0.02, 0.01, 0.05)  # share, degrees, millimetres: how much of a tie still counts as one

@@ -1,23 +1,19 @@
 """Random worlds for the hand-eye solver: no NaN, no confident wrong answer, mistakes are named."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose, random_rotations
 from weldcal.calibration.hand_eye.files import PosePairs
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, as_transform
+from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.hand_eye import solve_pairs
-
-Array = NDArray[np.float64]
 
 MOTIONS = ("arm", "stream", "few", "planar", "wobble", "small")
 MISTAKES = (

@@ -1,7 +1,5 @@
 """Benchmark of the mountings: every mounting scenario live over several seeds, as the table of docs/hand_eye.md."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,8 +12,9 @@ from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import markdown_table, write_json
+from weldcal.tools.studies.output import markdown_table
 
 HEADER = (
     "scenario", "runs", "scans", "point at best distance, mm: expected / true median / worst",

@@ -1,14 +1,12 @@
 """Runs the profiler study: both papers' tables and the joint method; writes table.json and report.html."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import write_json
 from weldcal.tools.studies.profiler.edge import all_sets, ball_points
 from weldcal.tools.studies.profiler.fixed import fixed_lines, published_lines, require_files
 from weldcal.tools.studies.profiler.report import profiler_report
@@ -45,10 +43,7 @@ def run_profiler_study(options: ProfilerStudyOptions, progress: Progress) -> Pro
     results = all_worlds(made, worlds, lambda name, share: progress(f"sphere, {name}", 0.4 + 0.4 * share))
     fixed: list[Target] = []
     if whole is not None:
-        fixed = [
-            *published_lines(results),
-            *fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share)),
-        ]
+        fixed = [*published_lines(results), *fixed_lines(whole, lambda name, share: progress(name, 0.8 + 0.2 * share))]
     first = next(iter(trials_of(names[0])))
     e = first.joint()
     cloud = ball_points(first, e.rotation, e.translation)

@@ -1,7 +1,5 @@
 """Tables 1 to 3 of the edge paper, and the calibration's own error, by its method and by the joint method."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Targets of the fixed files alone: free poses, outliers, degenerate sets, raw profiles, a real sphere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace

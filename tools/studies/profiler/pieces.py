@@ -1,7 +1,5 @@
 """Workpieces under a simulated profiler: meshes of the S-shaped V-groove and the frustum."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,26 +1,18 @@
 """Pictures of the profiler study: Fig. 6 to 8 of the edge paper, the seam's deviations and the frustum."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from weldcal.tools.report.plots_weld import OURS, PLANNED, svg
+from weldcal.tools.report.pictures import OURS, PLANNED, plain, svg
 from weldcal.tools.studies.profiler.edge import COUNTS, EdgeRow
 from weldcal.tools.studies.profiler.results import TargetLine
 from weldcal.tools.studies.profiler.sphere import METHODS, WorldResult
 
 PAPER = PLANNED
 _COLOURS = {METHODS[0]: "black", METHODS[1]: PAPER, METHODS[2]: "#6aa5c9", METHODS[3]: OURS}
-
-
-def _tidy(axes: Axes, x: str, y: str) -> None:
-    axes.set(xlabel=x, ylabel=y)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.25)
 
 
 def against_rotations(
@@ -68,7 +60,7 @@ def _panels(
         draw(axes, {method: [by[method, n] for n in COUNTS] for method in ("paper", "joint")})
         axes.set_xticks(COUNTS)
         axes.set_title(titles[name], fontsize=9)
-        _tidy(axes, "rotations", "")
+        plain(axes, "rotations", "")
     panels[0].set_ylabel(y)
     _legend(picture, panels[0])
     return svg(picture)
@@ -103,7 +95,7 @@ def seam(results: list[WorldResult]) -> bytes:
             assert r.seam_each_mm is not None
             axes.semilogy(r.seam_each_mm[:, j], color=_COLOURS[r.method], marker=".", ms=3, lw=1.0, label=r.method)
         axes.set_title(title, fontsize=9, loc="left")
-        _tidy(axes, "", "off, mm")
+        plain(axes, "", "off, mm")
     panels[-1].set_xlabel("station along the seam")
     _legend(picture, panels[0])
     return svg(picture)
@@ -145,7 +137,7 @@ def over_seeds(lines: Sequence[TargetLine]) -> bytes:
     axes.axvline(1.0, color="black", lw=1.0, ls="--", label="target, set on the fixed files")
     axes.set_yticks(range(len(lines)), [f"{line.what}, {line.target:g} {line.unit}" for line in lines], fontsize=8)
     axes.invert_yaxis()
-    _tidy(axes, "reached over target", "")
+    plain(axes, "reached over target", "")
     axes.set_xlim(left=0.0)
     _legend(picture, axes)
     return svg(picture)

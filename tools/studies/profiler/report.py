@@ -1,10 +1,7 @@
 """Report page of the profiler study: targets, both papers' tables compared with ours, and pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.profiler import edge, plots, sphere
 from weldcal.tools.studies.profiler.fixed import figure_text
@@ -107,7 +104,6 @@ def profiler_report(study: ProfilerStudy) -> str:
         fig_seam=plots.seam(list(study.sphere)),
         fig_boss=plots.frustum(with_boss),
         command="weldcal reproduce profiler" + (" --data FOLDER" if fixed_files else f" --seed {study.options.seed}") + (" --quick" if study.options.quick else ""),
-        software=software_version(),
     )  # fmt: skip
 
 

@@ -1,7 +1,5 @@
 """Results of the profiler study, its targets, and its JSON object."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every target of the profiler study over many seeds: figures, their Cramer-Rao bounds, and the fixed files."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -18,8 +16,8 @@ from weldcal.calibration.profiler.sphere.joint import SphereEstimate, sphere_joi
 from weldcal.calibration.profiler.sphere.model import SphereSigmas
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import write_json
 from weldcal.tools.studies.profiler.edge import TARGETS, edge_figures, edge_targets
 from weldcal.tools.studies.profiler.plots import over_seeds
 from weldcal.tools.studies.profiler.results import Reached, TargetLine

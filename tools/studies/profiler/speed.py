@@ -1,7 +1,5 @@
 """Times the calibration of a profiler by an edge without a guess, the paper's method and a grid search."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -17,7 +15,7 @@ from weldcal.calibration.profiler.edge.start import edge_starts
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
 from weldcal.tools.console import Progress
-from weldcal.tools.studies.output import write_json
+from weldcal.tools.report.files import write_json
 from weldcal.tools.studies.profiler.sets import TRANSLATIONS, EdgeTrial, fixed_edge_trials, made_edge_trials, rms
 
 SETS = 20

@@ -1,7 +1,5 @@
 """Tables 1 to 3 of the sphere paper: points, seam and frustum, by the paper's method and by the joint method."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Test bench of the hardware link: an emulated controller, the link, and an arm that moves at 0.05 m/s."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -11,9 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, load_arm
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.faults import Fault
@@ -22,8 +20,6 @@ from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_re
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import Emulator
-
-Array = NDArray[np.float64]
 
 RATE_HZ = 125.0
 SPEED_M_S = 0.05

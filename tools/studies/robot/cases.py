@@ -1,7 +1,5 @@
 """The faults that are injected into the hardware link: how, what must follow, and the repair."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -9,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.tools.studies.robot.bench import Array, Bench
+from weldcal.tools.studies.robot.bench import Bench
 
 STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3

@@ -1,7 +1,5 @@
 """Benchmark of the hardware link under faults: a matrix of faults, and random sequences of them."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,8 +16,8 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.emulators.ur.process import HOST, emulator_process
+from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import csv_text, write_json
 from weldcal.tools.studies.robot.bench import SPEED_M_S, Bench, StoppedUnasked
 from weldcal.tools.studies.robot.cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
 from weldcal.tools.studies.robot.sequences import Sequence, run_sequence

@@ -1,7 +1,5 @@
 """Random faults at random times, with random repairs and restarts: the arm must never move without a command."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from dataclasses import dataclass, field

@@ -22,8 +22,8 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
 from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.emulators.ur.process import HOST, emulator_process
+from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import csv_text, write_json
 from weldcal.tools.studies.robot.faults import LOADED
 
 RATE_HZ = 125.0

@@ -1,14 +1,12 @@
 """Benchmark of seam planning from one scan, by drawing and from the cloud alone, for each scanner and hard case."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
 from weldcal.models.scanners import SCANNERS
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.report.files import records_csv
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import records_csv
 from weldcal.tools.studies.seam_planning.trials import (
     COLUMNS,
     FIRST_HELD_OUT,

@@ -1,7 +1,5 @@
 """Simulated scans of workpieces: a part on a table with other objects, ray-cast for any scanner preset."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +14,7 @@ from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
 from weldcal.models.workpieces import Workpiece
 
 TABLE_M = 1.4
+SLANT_RAD = 0.1  # of the scanner against the vertical, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,21 +83,18 @@ def scan_part(
     scanner: ScannerPreset,
     seed: int,
     *,
-    distance_m: float | None = None,
     tilt_rad: float = 0.0,
-    slant_rad: float = 0.1,
     spread_m: float = 0.06,
     others: Sequence[TriMesh] = (),
-    X_BP: RigidTransform | None = None,
 ) -> Scene:
-    """A part in a random place and turn under a scanner that hangs roughly above it, `distance_m` away.
+    """A part in a random place and turn under a scanner that hangs roughly above it.
 
     Everything random, the scanner's place and noise included, follows from the seed.
     """
     rng = np.random.default_rng([seed, 41])
-    X = random_pose(rng, part, tilt_rad, spread_m) if X_BP is None else X_BP
-    far = distance_m if distance_m is not None else min(0.93, 0.97 * scanner.far_m)
-    around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
+    X = random_pose(rng, part, tilt_rad, spread_m)
+    far = min(0.93, 0.97 * scanner.far_m)
+    around, slant = rng.uniform(-math.pi, math.pi), SLANT_RAD * math.sqrt(rng.uniform())
     target = np.array([0.6, 0.0, 0.02])
     eye = target + far * np.array(
         [math.sin(slant) * math.cos(around), math.sin(slant) * math.sin(around), math.cos(slant)]

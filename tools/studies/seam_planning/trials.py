@@ -1,7 +1,5 @@
 """Trials of seam planning in random poses: every scanner preset, and hard cases."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

@@ -4,18 +4,14 @@ J. Sato, "Hand-Eye Calibration Using a Tablet Computer", Math. Comput. Appl. 202
 The tablet's grid and the turn at the first landmark are not printed; both are inferred from the printed results.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, Model
 from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES
 from weldcal.calibration.tablet.touches import TabletTouches
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 # Table 2: u, v (px), depth (mm), hand x, y (mm), touching error (px)
 TABLE_2 = np.array(

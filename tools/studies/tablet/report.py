@@ -1,15 +1,12 @@
 """Report page and pictures of the tablet study: targets, the paper's tables and ours, the sign, the models."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.figure import Figure
 
-from weldcal.calibration.data.results import software_version
 from weldcal.calibration.tablet.planar.fit import fit_plane_motion, hand_over
 from weldcal.calibration.tablet.published.two_stage import Sign
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.tools.report.plots_weld import OURS, THEIRS, TRUTH, svg
+from weldcal.tools.report.pictures import OURS, THEIRS, TRUTH, svg
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.tablet.paper import TABLE_NUMBER, TOUCHING_MM, printed_stage, published_touches
 from weldcal.tools.studies.tablet.results import TabletStudy, limit_words
@@ -129,5 +126,4 @@ def tablet_report(study: TabletStudy) -> str:
         touching=[(f"Table {n}", *(fixed(v) for v in values)) for n, values in TOUCHING_MM.items()],
         residuals=sign_residuals(touches),
         errors=unseen_errors(study.models, study.unseen),
-        software=software_version(),
     )

@@ -1,7 +1,5 @@
 """Results of the tablet study, its targets, and its JSON object."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from pathlib import Path
 

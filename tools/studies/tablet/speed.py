@@ -1,15 +1,12 @@
 """Times each tablet calibration: closed form, PnP, the paper's stages, and the published search."""
 
-from __future__ import annotations
-
-import json
 from pathlib import Path
 
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
 from weldcal.calibration.tablet.published.calibration import tablet_stage1, tablet_stage2
-from weldcal.tools.console import Progress, plain
-from weldcal.tools.report.render import write_atomic
+from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
 from weldcal.tools.studies.tablet.paper import published_touches
 from weldcal.tools.studies.tablet.study import PUBLISHED_EVALUATIONS, evaluation_seconds, median_seconds
 from weldcal.tools.studies.tablet.world import simulate_trial
@@ -49,5 +46,5 @@ def run_tablet_benchmark(folder: Path, seed: int, progress: Progress) -> dict[st
         "two_stages_times_faster": 2.0 * published / two_stages,
         "closed_form_in_evaluations": closed / alone,
     }
-    write_atomic(folder / "benchmark.json", json.dumps(plain(summary), indent=1) + "\n")
+    write_json(folder / "benchmark.json", summary)
     return summary

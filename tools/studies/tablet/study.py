@@ -1,7 +1,5 @@
 """Reproduces the tablet paper's tables: every stage, sign and model, their cost, and their prediction errors."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,10 +14,10 @@ from weldcal.calibration.tablet.published.chain import Model, place_landmarks
 from weldcal.calibration.tablet.published.evolution import PUBLISHED_GENERATIONS, PUBLISHED_POPULATION, evolve
 from weldcal.calibration.tablet.published.two_stage import Fitness, Sign, fitness, stage1_residuals
 from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.models.arrays import Array
 from weldcal.tools.studies.tablet.paper import STAGE_1
 from weldcal.tools.studies.tablet.world import TabletTrial, simulate_trial
 
-Array = NDArray[np.float64]
 PUBLISHED_EVALUATIONS = PUBLISHED_POPULATION * PUBLISHED_GENERATIONS
 MODELS: tuple[Model, ...] = ("htm", "dh")
 
@@ -117,7 +115,7 @@ def _evolved(touches: TabletTouches, model: Model, stage: int, seed: int) -> Sta
     )
 
 
-def evaluation_seconds(touches: TabletTouches, repeats: int = 300) -> tuple[float, float]:
+def evaluation_seconds(touches: TabletTouches) -> tuple[float, float]:
     """Seconds of one evaluation of Eq. 17, alone and as one of 10,000 at once (medians)."""
     x = STAGE_1["htm"].parameters[None]
     crowd = np.repeat(x, PUBLISHED_POPULATION, axis=0)
@@ -126,7 +124,7 @@ def evaluation_seconds(touches: TabletTouches, repeats: int = 300) -> tuple[floa
         r = stage1_residuals(touches, parameters, "htm", Sign.PRINTED)
         return np.asarray(np.sqrt((r**2).sum(axis=2)).sum(axis=1) / 9.0)
 
-    return median_seconds(lambda: objective(x), repeats), median_seconds(lambda: objective(crowd), 5) / len(crowd)
+    return median_seconds(lambda: objective(x), 300), median_seconds(lambda: objective(crowd), 5) / len(crowd)
 
 
 def median_seconds(work: Callable[[], object], repeats: int) -> float:

@@ -1,14 +1,12 @@
 """Simulated tablet, camera and pen: touches with the paper's noise, and queries for validation."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.tablet.touches import TabletTouches
+from weldcal.models.arrays import Array
 from weldcal.tools.studies.tablet.paper import (
     CENTRE_PX,
     FOCAL_PX,
@@ -17,8 +15,6 @@ from weldcal.tools.studies.tablet.paper import (
     THETA_DEG,
     published_touches,
 )
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

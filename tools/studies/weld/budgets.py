@@ -1,7 +1,5 @@
 """Error budgets of the weld study: tag, robot, wall and plan."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

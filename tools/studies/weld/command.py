@@ -1,14 +1,12 @@
 """Runs the weld study: rows, turns and laws; writes table.json, CSV files and report.html."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterable
 from dataclasses import astuple, fields
 
 from weldcal.tools.console import Progress
+from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.output import csv_text, write_json
 from weldcal.tools.studies.weld.metrics import RunMetrics
 from weldcal.tools.studies.weld.plant import COLUMNS, PHASES, StudyRun
 from weldcal.tools.studies.weld.report import study_report

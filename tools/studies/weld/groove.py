@@ -1,7 +1,5 @@
 """Contact of the tip in the groove: a massless sphere on springs between two walls with Coulomb friction."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Figures of one simulated weld against the true seam."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Plant of the weld study: a lagging robot, a late and noisy tag, a tip in its groove."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

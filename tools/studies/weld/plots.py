@@ -1,7 +1,5 @@
 """Converts a simulated weld to the trace that the weld pictures take."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,12 +1,9 @@
 """Tables and report page of the weld study: targets, turns, pictures of every seam, and the laws."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
 from weldcal.tools.report.plots_weld import along_the_weld, paths
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.output import print_note, print_table
@@ -136,5 +133,4 @@ def study_report(study: Study) -> str:
         seams=seams,
         turns=turn_lines(study.turns),
         compared=compared_lines(study.compared),
-        software=software_version(),
     )

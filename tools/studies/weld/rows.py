@@ -1,7 +1,5 @@
 """Rows of the target table: welds, figures and limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from weldcal.models.errors import InputError

@@ -1,7 +1,5 @@
 """Seams of the weld study: straight, S, L corners, infeasible turns, and seams on a cylinder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

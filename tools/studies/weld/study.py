@@ -1,21 +1,18 @@
 """Runs every case of the weld study over its seeds and compares the figures with the targets."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from weldcal.tools.console import Progress
 from weldcal.tools.studies.weld.metrics import RunMetrics, judge
 from weldcal.tools.studies.weld.plant import StudyRun, simulate
 from weldcal.tools.studies.weld.rows import Case, Row, Target
 from weldcal.tools.studies.weld.seams import get_seam
 from weldcal.welding.seam.feasibility import SeamWindows
 from weldcal.welding.servo.settings import ServoConfig, ToolGeometry, TouchConfig
-
-Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Turns, U-turns and cusps: the prediction of the chord map, and the result of the weld."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

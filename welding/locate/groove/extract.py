@@ -6,8 +6,6 @@ converges (measure). A face bent over a cylinder is unrolled first, measured as 
 a sigma, scaled by the observed scatter of neighbouring slices.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

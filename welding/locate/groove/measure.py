@@ -1,7 +1,5 @@
 """Measures one groove from its coarse line: root and shoulder lines, ends, gaps and corners, each with a sigma."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

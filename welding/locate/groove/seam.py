@@ -1,7 +1,5 @@
 """Data of a V-groove: the expected profile, the measured seam with its sigmas, limits, and the errors that refuse it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Searches a cloud for grooves to a pixel or two: cells below a flat face, with face on both sides, joined to lines."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -5,8 +5,6 @@ looks down is in z, so z is regressed on n and no point is selected by its depth
 would bias their slopes.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,21 +1,18 @@
 """Reads a robot's factory kinematics from its primary port and checks it against the controller's flange pose."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.line import Line
-
-Array = NDArray[np.float64]
 
 PRIMARY_PORT = 30001
 # With the right calibration FK agrees with the controller to 10-20 um; without it, to millimetres.

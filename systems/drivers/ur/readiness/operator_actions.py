@@ -1,7 +1,5 @@
 """Operator actions, one sentence for each condition that prevents a start, with the menu names of PolyScope 5."""
 
-from __future__ import annotations
-
 ROBOT_MODES = {
     -1: "NO_CONTROLLER",
     0: "DISCONNECTED",

@@ -4,16 +4,14 @@ Nothing moves, nothing is written, nothing is uploaded: outputs are read, and in
 The operator actions use the menu names of PolyScope 5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
@@ -28,8 +26,6 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import (
 )
 from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported, upper_range_works
 from weldcal.systems.drivers.ur.rtde_wire import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
-
-Array = NDArray[np.float64]
 
 RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
 FULL_SPEED = 0.99

@@ -1,7 +1,5 @@
 """Supported controller software, the limits of ur_rtde 1.6 with it, and the check that ur_rtde is installed."""
 
-from __future__ import annotations
-
 import importlib.util
 
 from weldcal.systems.drivers.ur.errors import RobotRefused

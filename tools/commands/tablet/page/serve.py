@@ -1,7 +1,5 @@
 """Serves the page to a tablet and receives its touches as a CSV file; on loopback by default."""
 
-from __future__ import annotations
-
 import errno
 import ipaddress
 import socket

@@ -1,17 +1,13 @@
 """Arm of the emulated controller: integrates the kinematic model in steps of 2 ms."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
-
-Array = NDArray[np.float64]
 
 # [M] how the arm slows when its program stops, pauses, or a safety function acts
 STOP_RAD_S2 = 10.0

@@ -1,7 +1,5 @@
 """The controller: runs programs and watchdogs, and moves the arm, one call of `step` every 2 ms."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

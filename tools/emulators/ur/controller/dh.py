@@ -1,7 +1,5 @@
 """Denavit-Hartenberg parameters of a chain of link transforms, as in a controller's KinematicsInfo."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Enumerations of the controller, numbered as in RTDE."""
 
-from __future__ import annotations
-
 import enum
 
 

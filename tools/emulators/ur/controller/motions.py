@@ -4,19 +4,15 @@ Marked [M] in docs/ur_emulator.md: profiles are trapezoids without jerk limit, b
 chase, and the reaction to limits is a protective stop.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
+from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.poses import pose_error, rotation_matrix, rotation_vector
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.002
 # [M] where speedl gives up: smallest singular value of the tool's Jacobian (m and rad as they are)

@@ -1,14 +1,11 @@
 """UR poses [x, y, z, rx, ry, rz] with a rotation vector, and their conversions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 
 def rotation_matrix(vector: Sequence[float] | Array) -> Array:

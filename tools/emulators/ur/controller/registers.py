@@ -1,7 +1,5 @@
 """Registers and terminals that RTDE and scripts read and write; values outlive programs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
@@ -62,10 +60,10 @@ class Terminals:
         """Sets the outputs that `mask` names, counted from `first` (0 standard, 8 configurable, 16 tool)."""
         self.digital_outputs = self.digital_outputs & ~(mask << first) | (value & mask) << first
 
-    def program_ended(self, *, unscheduled: bool = False) -> None:
+    def program_ended(self) -> None:
         """Outputs that follow the program's state take their level for a program that does not run."""
         for n, choice in self.runstate.items():
-            if choice in (1, 3) or (unscheduled and choice in (4, 5)):
+            if choice in (1, 3):
                 self.digital_outputs &= ~(1 << n)
             elif choice == 2:
                 self.digital_outputs |= 1 << n

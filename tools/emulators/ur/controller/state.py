@@ -1,7 +1,5 @@
 """The state of the emulated controller: power, safety, arm, registers and clock, without programs."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 

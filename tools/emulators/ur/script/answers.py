@@ -1,16 +1,14 @@
 """URScript functions that return at once: registers, states, kinematics, poses."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
@@ -19,8 +17,6 @@ from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.compiler import Pose
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
-
-Array = NDArray[np.float64]
 
 
 def six(values: Any, what: str) -> Array:

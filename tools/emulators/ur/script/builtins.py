@@ -4,8 +4,6 @@ Motions and the reads of sockets are generators that take frames; all other func
 physics for (force mode, freedrive ...) is accepted and noted in the log.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any

@@ -4,8 +4,6 @@ Variables assigned in the main body or declared global are global, all others be
 are prefixed (v_, f_, b_), since scripts call variables `async` or `time`. Assignment copies lists.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass

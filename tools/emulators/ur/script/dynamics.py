@@ -1,13 +1,11 @@
 """URScript functions of the arm's mechanics (PolyScope 5.23, 10.9): Jacobian, mass matrix."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, link_frames
-from weldcal.tools.emulators.ur.controller.motions import Array
+from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.poses import matrix
 from weldcal.tools.emulators.ur.script.answers import Answers, six
 

@@ -1,7 +1,5 @@
 """Splits URScript text into tokens, and a stream into programs."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """URScript functions that take frames: motions hold the arm until they return."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

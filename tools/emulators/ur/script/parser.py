@@ -1,7 +1,5 @@
 """Parses URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.script import syntax
@@ -9,15 +7,7 @@ from weldcal.tools.emulators.ur.script.lexer import Token, tokenize
 from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
 
 # Loosest first, as the URScript manual orders them; `not` binds tighter than `and`.
-_BINARY = (
-    ("or",),
-    ("xor",),
-    ("and",),
-    ("==", "!="),
-    ("<", ">", "<=", ">="),
-    ("+", "-"),
-    ("*", "/", "%"),
-)
+_BINARY = (("or",), ("xor",), ("and",), ("==", "!="), ("<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
 
 
 def parse_program(source: str) -> Routine:

@@ -34,9 +34,7 @@ class Program:
     """
 
     def __init__(
-        self,
-        source: str,
-        builtins: Callable[[Program], tuple[Mapping[str, Callable[..., Any]], Iterable[str]]],
+        self, source: str, builtins: Callable[[Program], tuple[Mapping[str, Callable[..., Any]], Iterable[str]]]
     ) -> None:
         self.source = source
         self.current: Thread | None = None

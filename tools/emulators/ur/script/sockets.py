@@ -1,7 +1,5 @@
 """URScript socket functions: the script is a client on loopback and waits frame by frame."""
 
-from __future__ import annotations
-
 import math
 import re
 import socket

@@ -1,7 +1,5 @@
 """Control channel: a line of JSON injects a fault or asks a question, a line of JSON answers."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -108,10 +106,7 @@ class ControlServer(Server):
         }
 
     def arrived(self, connection: Connection, data: bytes, now: float) -> None:
-        connection.inbox += data
-        while b"\n" in connection.inbox:
-            line, _, rest = bytes(connection.inbox).partition(b"\n")
-            connection.inbox[:] = rest
+        for line in connection.lines(data):
             if line.strip():
                 connection.send(json.dumps(self.answer(line, now)).encode() + b"\n", now)
 

@@ -1,7 +1,5 @@
 """Dashboard server on port 29999: one reply per command line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.controller.core import Controller
@@ -60,10 +58,7 @@ class DashboardServer(Server):
         connection.send(f"{GREETING}\n".encode(), now)
 
     def arrived(self, connection: Connection, data: bytes, now: float) -> None:
-        connection.inbox += data
-        while b"\n" in connection.inbox:
-            line, _, rest = bytes(connection.inbox).partition(b"\n")
-            connection.inbox[:] = rest
+        for line in connection.lines(data):
             text = line.decode("utf-8", "replace").strip()
             connection.send(f"{self.answer(text)}\n".encode(), now)
             if text.lower() in ("quit", "exit"):

@@ -4,8 +4,6 @@ This is the only way in on PolyScope X before 10.10, where ur_rtde neither opens
 URCap does, it connects to the client's script sender, asks `request_program`, and takes what comes until 0.1 s of silence.
 """
 
-from __future__ import annotations
-
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 

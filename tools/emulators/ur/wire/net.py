@@ -1,13 +1,11 @@
 """Sockets of the emulator in one loop, with injected network faults per connection."""
 
-from __future__ import annotations
-
 import contextlib
 import select
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,6 +123,13 @@ class Connection:
         if not data:
             self.closed = True
         return b"" if now < self.faults.deaf_until else data
+
+    def lines(self, data: bytes) -> Iterator[bytes]:
+        """The lines that are complete with these bytes, without their ends; the rest waits in the inbox."""
+        self.inbox += data
+        while b"\n" in self.inbox:
+            line, _, self.inbox[:] = bytes(self.inbox).partition(b"\n")
+            yield line
 
     def readable(self, now: float) -> bool:
         """Whether the loop should look at this socket."""

@@ -1,7 +1,5 @@
 """RTDE fields, their types and their values, as in Universal Robots' RTDE guide."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -177,9 +175,7 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "actual_configurable_digital_output_bits": lambda c: c.terminals.digital_outputs >> 8 & 0xFF,
         "control_step": lambda c: c.frame,
     },
-    "UINT8": {
-        **_constants(0, "tool_output_mode tool_digital_output0_mode tool_digital_output1_mode"),
-    },
+    "UINT8": {**_constants(0, "tool_output_mode tool_digital_output0_mode tool_digital_output1_mode")},
 }
 
 

@@ -1,7 +1,5 @@
 """RTDE server on port 30004: recipes, claims, and packages at an integer share of 500 Hz (protocols 1 and 2)."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field

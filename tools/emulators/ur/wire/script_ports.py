@@ -1,7 +1,5 @@
 """Ports that accept script text and stream state: primary 30001, secondary 30002, real-time 30003."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 

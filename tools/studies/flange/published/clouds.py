@@ -1,7 +1,5 @@
 """Compares both methods on the same real scans: circles, registrations, Algorithm 1, and errors on held-out scans."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -30,11 +28,10 @@ from weldcal.calibration.published.pipeline import (
     published_model,
     published_pairs,
 )
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress
-
-Array = NDArray[np.float64]
 
 ICP_POINTS = 2_500
 """Points of a face that the repeated registrations use, of some 12 000: they differ by less than what they cannot see."""

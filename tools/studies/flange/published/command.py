@@ -1,7 +1,5 @@
 """Runs the flange study: simulation, the authors' runs, both methods on real scans; writes tables, pictures and report."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 
@@ -10,6 +8,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome, study_clouds
 from weldcal.tools.studies.flange.published.pairs import (
@@ -22,7 +21,6 @@ from weldcal.tools.studies.flange.published.pairs import (
 from weldcal.tools.studies.flange.published.report import pictures, study_report
 from weldcal.tools.studies.flange.published.results import Study, StudyOptions
 from weldcal.tools.studies.flange.published.simulation import simulate
-from weldcal.tools.studies.output import write_json
 
 NO_DATA = (
     "No data folder was given: only the simulated parts were run; give the folder that holds the recorded datasets."

@@ -1,13 +1,10 @@
 """Calibrations from centre pairs: the authors' runs of Algorithm 1, all pairs, and the time-of-flight camera."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
@@ -15,8 +12,7 @@ from weldcal.calibration.eye_on_base.validation import k_fold, position_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid_sets
 from weldcal.calibration.published.pipeline import all_pairs
-
-Array = NDArray[np.float64]
+from weldcal.models.arrays import Array
 
 RUNS_FILE = "paper_algorithm1_50_runs.npz"
 _SAME_H_M = 1e-5  # a stored H and the fit of its four pairs agree to rounding; other sets of four differ by much more

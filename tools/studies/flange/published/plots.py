@@ -1,19 +1,16 @@
 """Pictures of the flange study: the paper's Fig. 9, 10 and 11 with the true errors, circles and held-out errors."""
 
-from __future__ import annotations
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from weldcal.tools.report.plots_weld import OURS, PLANNED, THEIRS, TRUTH, svg
+from weldcal.models.arrays import Array
+from weldcal.tools.report.pictures import OURS, PLANNED, THEIRS, TRUTH, plain, svg
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Simulation
-
-Array = NDArray[np.float64]
 
 # the paper's order and grouping: x, y, z above roll, pitch, yaw
 PANELS = (
@@ -204,9 +201,8 @@ def _whole_steps(axes: Axes) -> None:
 
 
 def _plain(axes: Axes, x: str, y: str) -> None:
-    axes.set(xlabel=x, ylabel=y)
+    """As `plain`, in small letters."""
+    plain(axes, x, y)
     axes.tick_params(labelsize=8)
     axes.xaxis.label.set_fontsize(8)
     axes.yaxis.label.set_fontsize(8)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.25)

@@ -1,16 +1,14 @@
 """Tables and report page of the flange study: the paper's numbers, ours, and the true errors."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from weldcal.calibration.data.results import software_version
+from weldcal.models.arrays import Array
 from weldcal.tools.report.render import fixed, render
 from weldcal.tools.studies.flange.published import plots
 from weldcal.tools.studies.flange.published.clouds import METHODS, CloudsOutcome
-from weldcal.tools.studies.flange.published.results import TABLE1, Array, Study, statistics
+from weldcal.tools.studies.flange.published.results import TABLE1, Study, statistics
 from weldcal.tools.studies.flange.published.simulation import COSTS
 from weldcal.tools.studies.output import print_note, print_table
 
@@ -179,7 +177,6 @@ def study_report(study: Study, drawn: Mapping[str, bytes]) -> str:
         },
         statistics=statistics,
         circle_sentences={c.name: circle_sentence(c) for c in study.clouds},
-        software=software_version(),
         degrees=np.degrees,
     )
 

@@ -1,18 +1,14 @@
 """Results of the flange study and its JSON object."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from weldcal.models.arrays import Array
 from weldcal.tools.studies.flange.published.clouds import CloudsOutcome
 from weldcal.tools.studies.flange.published.pairs import PAPER_E_RPY_DEG, PAPER_E_XYZ_MM, KinectOutcome, PairsOutcome
 from weldcal.tools.studies.flange.published.simulation import Errors, Simulation
-
-Array = NDArray[np.float64]
 
 TABLE1: dict[str, tuple[float, ...]] = {
     "UR5 & PhoXi M": (11.60, 2.81, 5.55, 0.49, -0.89, -0.47),

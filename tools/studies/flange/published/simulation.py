@@ -1,7 +1,5 @@
 """Simulates section 3.1 of the paper: the effect of Algorithm 1's cost on the errors that it is judged by."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_all_rigid_sets
+from weldcal.models.arrays import Array
 from weldcal.tools.console import Progress
 
-Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 X_BC_TRUE = RigidTransform(RotationMatrix([[0.0, -1, 0], [-1, 0, 0], [0, 0, -1]]), [0.6, -0.0125, 1.0])

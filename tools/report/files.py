@@ -1,0 +1,36 @@
+"""Files of a result: JSON and CSV, from objects, rows or mappings."""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from weldcal.tools.console import plain
+from weldcal.tools.report.render import write_atomic
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write the content, in JSON's own types (what is not finite becomes null), with its folder."""
+    write_atomic(path, json.dumps(plain(content), allow_nan=False, indent=1) + "\n")
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Iterable[object]]) -> str:
+    """A header line and one line per row."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def records_csv(records: Sequence[object], columns: Sequence[str] = ()) -> str:
+    """Objects of one kind, one line each: these attributes, or all that they hold."""
+    columns = columns or list(vars(records[0]))
+    return csv_text(columns, ([getattr(record, name) for name in columns] for record in records))
+
+
+def mappings_csv(rows: Sequence[Mapping[str, object]]) -> str:
+    """Mappings with the keys of the first, one line each."""
+    columns = list(rows[0])
+    return csv_text(columns, ([row.get(name, "") for name in columns] for row in rows))
