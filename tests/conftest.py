@@ -14,6 +14,7 @@ import pytest
 
 from tests.browser import browser
 from tests.short_job import short_jobs
+from tests.ur_rtde import NEEDS_UR_RTDE
 
 __all__ = ["browser", "short_jobs"]
 
@@ -24,7 +25,13 @@ SLOWEST = ("test_cell.py", "test_readme.py")  # a core that is left with one of 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes longest comes first: files are dealt to the cores one by one, in this order."""
+    """What takes longest comes first: files are dealt to the cores one by one, in this order.
+
+    The tests on the emulated robot need its client library.
+    """
+    for item in items:
+        if item.path.parent.name == "hardware":
+            item.add_marker(NEEDS_UR_RTDE)
     items.sort(key=lambda item: (item.path.name not in SLOWEST, item.path.parent.name != "scenario"))
 
 

@@ -65,20 +65,23 @@ def chosen_robot(
             scenario.robot = SimulatedUr()
         yield ChosenRobot("simulated")
         return
+    kind, _, address = word.partition("@")
+    emulated = kind == EMULATED
+    if pace is not None and not emulated and not word.startswith("127."):
+        raise InputError("A real controller runs in real time: --pace is for an emulated one, at a loopback address.")
+    if pace is None:
+        pace = EMULATED_PACE if emulated else 1.0
+    _check_pace(pace)
     if not dry_run:
         require_ur_rtde()
-    kind, _, address = word.partition("@")
-    if kind == EMULATED:
-        host, pace = address or EMULATOR_HOST, EMULATED_PACE if pace is None else pace
-        _check_pace(pace)
-        kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
-        q_home = np.deg2rad(scenario.home_deg)
-        with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace):
-            yield _at(host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
+    if not emulated:
+        yield _at(word, f"the controller at {word}", scenario, dry_run=dry_run, pace=pace)
         return
-    if pace is not None and not word.startswith("127."):
-        raise InputError("A real controller runs in real time: --pace is for an emulated one, at a loopback address.")
-    yield _at(word, f"the controller at {word}", scenario, dry_run=dry_run, pace=1.0 if pace is None else pace)
+    host = address or EMULATOR_HOST
+    kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
+    q_home = np.deg2rad(scenario.home_deg)
+    with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace):
+        yield _at(host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
 
 
 def _check_pace(pace: float) -> None:
@@ -87,7 +90,6 @@ def _check_pace(pace: float) -> None:
 
 
 def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float) -> ChosenRobot:
-    _check_pace(pace)
     config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
     config = dc.replace(config, host=host, pace=pace)
     if not dry_run:

@@ -11,8 +11,6 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from rtde_control import RTDEControlInterface
-from rtde_receive import RTDEReceiveInterface
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.clock import ClockMap
@@ -65,6 +63,10 @@ class Robot:
     """Both ur_rtde interfaces, the clock map and the newest complete package."""
 
     def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel, output: int | None = None) -> None:
+        # Here and not above: the guard's text can be read where ur_rtde is not installed.
+        from rtde_control import RTDEControlInterface
+        from rtde_receive import RTDEReceiveInterface
+
         self._word = 36 if upper else 12
         self._script = guard_script(upper, output)
         self._output = output
