@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses as dc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,11 +25,12 @@ from weldcal.systems.motion.clear_moves import clear_poses
 from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Truth
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.commands.demo import DemoResult, measure, run_scenario, run_weld, write_result
 from weldcal.tools.commands.run import JobRun
 from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import calibration_error
+from weldcal.tools.outcomes.weld import calibration_error, weld_outcome
 from weldcal.tools.studies.cell.study import figures
 from weldcal.welding.record.weld_log import load_weld_log
 
@@ -164,6 +166,25 @@ def test_the_same_seed_gives_the_same_run(
     assert here["X_BC"] is not None
     for key in ("X_BC", "X_BC_error_mm", "held_out_mm", "verification_mm", "n_scans", "simulated_seconds"):
         assert here[key] == there[key], key
+
+
+def test_the_weld_log_needs_nothing_that_only_a_simulation_knows(short_job: DemoResult) -> None:
+    run = short_job.run
+    logs = {name: sink for name, sink in run.cell.logs.items() if name not in ("torch", "tip_and_deflection")}
+    nothing_known = dc.replace(run.cell.station, truth=Truth(None, None, None))
+    real = dc.replace(run.cell, logs=logs, station=nothing_known)
+    found, known = weld_outcome(real, run.root), short_job.weld
+    assert found is not None
+    assert known is not None
+    assert found.error is None
+    assert found.plan_error is None
+    assert found.speed is not None
+    assert known.speed is not None
+    assert found.speed.welded_m == pytest.approx(known.speed.welded_m, abs=5e-4)
+    # the measured joints are some milliseconds old, at 8 mm/s
+    burning = known.log.torch_on
+    gap = np.linalg.norm(found.log.p_BTorch - known.log.p_BTorch, axis=1)[burning]
+    assert 0.0 < gap.max() < 2e-4
 
 
 def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
