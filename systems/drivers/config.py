@@ -1,6 +1,7 @@
 """Base classes of driver configurations: the devices that a driver supports, and whether it needs the simulated world."""
 
 import dataclasses as dc
+from abc import ABC, abstractmethod
 from typing import ClassVar
 
 from weldcal.models.scanners import ScannerPreset
@@ -29,22 +30,22 @@ class NoDevice(DriverConfig):
     FOR: ClassVar[tuple[str, ...]] = DEVICES
 
 
-class ScannerConfig(DriverConfig):
+class ScannerConfig(DriverConfig, ABC):
     """Base class of all scanner configurations."""
 
     FOR: ClassVar[tuple[str, ...]] = ("scanner",)
     mounted_on: str = "base"  # or flange, or a link of the arm
 
+    @abstractmethod
     def scanner(self) -> ScannerPreset:
         """Intrinsics, range and noise, used by pose planning."""
-        raise NotImplementedError(f"{type(self).__name__} does not define scanner()")
 
 
-class FingerCameraConfig(DriverConfig):
+class FingerCameraConfig(DriverConfig, ABC):
     """Base class of all finger camera configurations."""
 
     FOR: ClassVar[tuple[str, ...]] = ("finger_camera",)
 
+    @abstractmethod
     def camera(self) -> FingerCamera:
         """Image size, focal length, frame rate and latency."""
-        raise NotImplementedError(f"{type(self).__name__} does not define camera()")

@@ -80,6 +80,11 @@ def _configs_of(module: ModuleType) -> list[type[DriverConfig]]:
         if not (inspect.isclass(member) and issubclass(member, DriverConfig) and member.__module__ == module.__name__):
             continue
         if member.FOR and hasattr(member, "__dataclass_fields__"):
+            if inspect.isabstract(member):
+                missing = ", ".join(sorted(f"{name}()" for name in vars(member)["__abstractmethods__"]))
+                raise InputError(
+                    f"The driver {member.__name__} in {module.__name__} does not define {missing}: add it there."
+                )
             _resolve_types(member)
             found.append(member)
     return found

@@ -78,3 +78,17 @@ def test_a_driver_that_cannot_be_imported_is_named_with_its_package(
     said = " ".join(finished.stderr.split())
     assert "The driver 'ray' of the package somebodys-scanner cannot be imported" in said
     assert "a_module_that_nobody_has" in said
+
+
+def test_a_scanner_that_does_not_say_what_it_is_is_refused_by_name(environment: dict[str, str]) -> None:
+    Path(environment["PYTHONPATH"], "somebodys_scanner.py").write_text(
+        "import dataclasses as dc\n"
+        "from weldcal.systems.drivers.config import ScannerConfig\n"
+        "@dc.dataclass\n"
+        "class HalfScanner(ScannerConfig):\n"
+        "    serial: str = ''\n"
+    )
+    finished = weldcal(environment, "calibrate", "--scenario", "calibrate_only")
+    assert finished.returncode == 1
+    said = " ".join(finished.stderr.split())
+    assert "The driver HalfScanner in somebodys_scanner does not define scanner()" in said
