@@ -36,15 +36,13 @@ class FewPosesEstimate:
 def estimate_from_whole_poses(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], turn_rad: float = 0.0
 ) -> FewPosesEstimate:
-    """X_BC from the observations whose hole pattern was seen (n >= 1): each gives all six degrees of freedom.
+    """X_BC from the observations whose hole pattern shows its rotation (n >= 1): each gives all six degrees of freedom.
 
     ``turn_rad`` is how far the drilled pattern is turned about the face normal from where the robot's flange frame says it is;
     ``axis_turn`` finds it once from a calibration by many poses, and a flange keeps it. Rotations are averaged (chordal
-    mean), then centres. Raises TooFewPoses where no pattern was seen.
+    mean), then centres. Raises TooFewPoses where no scan shows one.
     """
-    seen = [o for o in observations if o.id in patterns]
-    if not seen:
-        raise TooFewPoses("No scan shows the flange's holes well enough; scan from nearer or take four poses and more.")
+    seen = _with_turn(observations, patterns)
     turn = RotationMatrix.MakeZRotation(turn_rad).matrix()
     total = np.zeros((3, 3))
     for o in seen:
@@ -62,17 +60,33 @@ def axis_turn(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float]:
     """How far (rad) the drilled pattern is turned about the face normal from the robot's flange frame, and its spread over
-    the scans (standard deviation, rad; NaN for one scan). Median over the scans that show the pattern; raises TooFewPoses
-    where none does."""
+    the scans (standard deviation, rad; NaN for one scan). Circular median over the scans that show its rotation; raises
+    TooFewPoses where none does."""
     turns = []
-    for o in observations:
-        if o.id in patterns:
-            R = (o.X_BR.rotation().inverse() @ X_BC.rotation() @ patterns[o.id].X_CR.rotation()).matrix()
-            turns.append(float(np.arctan2(R[1, 0], R[0, 0])))
-    if not turns:
-        raise TooFewPoses("No scan shows the flange's holes well enough to tell its rotation about the axis.")
-    middle = float(np.median(turns))
-    return middle, float(np.std(turns, ddof=1)) if len(turns) > 1 else float("nan")
+    for o in _with_turn(observations, patterns):
+        R = (o.X_BR.rotation().inverse() @ X_BC.rotation() @ patterns[o.id].X_CR.rotation()).matrix()
+        turns.append(complex(R[0, 0], R[1, 0]))
+    unit = np.array(turns) / np.abs(turns)
+    # turns near half a circle wrap round: both figures are taken about the mean direction
+    mean = np.angle(unit.sum())
+    about = np.angle(unit * np.exp(-1j * mean))
+    middle = float(np.angle(np.exp(1j * (mean + np.median(about)))))
+    return middle, float(np.std(about, ddof=1)) if len(about) > 1 else float("nan")
+
+
+def _with_turn(observations: Sequence[Observation], patterns: Mapping[str, HolePattern]) -> list[Observation]:
+    """The observations whose hole pattern shows its rotation about the axis. Raises TooFewPoses where none does."""
+    seen = [o for o in observations if o.id in patterns]
+    known = [o for o in seen if patterns[o.id].turn_known]
+    if known:
+        return known
+    if seen:
+        turns = (0.0, *(np.degrees(t) % 360.0 for t in patterns[seen[0].id].other_turns_rad))
+        raise TooFewPoses(
+            "The scans show the flange's threads but not its dowel hole, so the rotation about the axis may be any of "
+            f"{', '.join(f'{t:.0f}' for t in sorted(turns))} degrees; clear the dowel hole or take four poses and more."
+        )
+    raise TooFewPoses("No scan shows the flange's holes well enough; scan from nearer or take four poses and more.")
 
 
 def calibrate_from_few(
@@ -109,7 +123,8 @@ def calibrate_from_few(
 def _from_whole_poses(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], turn_rad: float
 ) -> CalibrationEstimate:
-    seen = [o for o in observations if o.id in patterns]
+    seen = _with_turn(observations, patterns)
+    ids = {o.id for o in seen}
     X = estimate_from_whole_poses(observations, patterns, turn_rad).X_BC
     n = len(seen)
     information = np.zeros((3, 3))
@@ -133,7 +148,7 @@ def _from_whole_poses(
     estimate = CalibrationEstimate(
         X_BC=X,
         covariance=T @ covariance @ T.T,
-        inliers=np.array([o.id in patterns for o in observations]),
+        inliers=np.array([o.id in ids for o in observations]),
         position_residuals_m=position_errors(X, observations),
         tilt_residuals_rad=tilt_errors(X, observations),
         held_out=HeldOut(held_out[0], held_out[1]),

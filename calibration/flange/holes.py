@@ -31,7 +31,9 @@ class HolePattern:
 
     ``off_m`` (k,) is how far each hole lies from its place in the pattern and ``rms_m`` their root mean square.
     ``turn_sigma`` rad is the spread of the rotation about the axis and ``covariance`` (6, 6) that of X_CR, rotation then
-    translation, in the camera's axes; both cover this scan's noise and how well the holes agree.
+    translation, in the camera's axes; both cover this scan's noise and how well the holes agree. ``other_turns_rad`` are
+    rotations about the axis, from that of X_CR, under which the scan shows the pattern as well (the threads alone are
+    symmetric; the dowel hole decides): the spread then covers all of them, and ``turn_known`` is false.
     """
 
     holes_C: Array
@@ -43,6 +45,12 @@ class HolePattern:
     turn_sigma: float = float("nan")
     covariance: Array | None = None
     off_m: Array | None = None
+    other_turns_rad: tuple[float, ...] = ()
+
+    @property
+    def turn_known(self) -> bool:
+        """Whether the scan shows one rotation about the axis only."""
+        return not self.other_turns_rad
 
 
 def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> HolePattern | None:
@@ -96,6 +104,9 @@ def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Hol
         threads = float(np.median(radii[seen < standard.n_holes]))
     off = z - start - gain * np.exp(1j * angles[seen])
     turn_sigma = _turn_sigma(off, gain, angles[seen], covariances)
+    others = _other_turns(xy, start, gain, standard, seen, pitch)
+    if others:  # equally likely rotations: their spread about the one reported
+        turn_sigma = float(np.sqrt(turn_sigma**2 + np.sum(np.square(others)) / (len(others) + 1)))
     n = fit.normal_C
     turn = gain / abs(gain)
     x = axes @ np.array([turn.real, turn.imag])
@@ -114,6 +125,7 @@ def find_holes(points_C: Array, fit: FlangeFit, standard: FlangeStandard) -> Hol
         turn_sigma=turn_sigma,
         covariance=covariance,
         off_m=np.abs(off),
+        other_turns_rad=others,
     )
 
 
@@ -161,6 +173,27 @@ def _phase(xy: Array, angles: Array, standard: FlangeStandard) -> float | None:
     low = np.nonzero(total <= total[best] + 0.02 * float(np.median(total)))[0]
     low = low[np.abs((low - best + 180) % 360 - 180) < 8]
     return float(np.radians(best + np.mean((low - best + 180) % 360 - 180)))
+
+
+def _other_turns(
+    xy: Array, start: complex, gain: complex, standard: FlangeStandard, seen: Array, pitch: float
+) -> tuple[float, ...]:
+    """Rotations (rad, -pi to pi) that take the threads onto themselves and that the dowel hole does not exclude.
+
+    It excludes one only if its rim is seen where the pattern has it, and no such rim where the rotation would have it.
+    """
+    threads = np.exp(1j * np.asarray(standard.hole_angles_rad))
+    turns = [
+        float(np.angle(t))
+        for t in threads[1:] / threads[0]
+        if float(np.abs(threads[:, None] * t - threads).min(axis=1).max()) < 1e-3
+    ]
+    if standard.n_holes not in seen:  # the dowel hole is the last of the openings
+        return tuple(turns)
+    places = start + gain * np.exp(1j * (standard.pin_angle_rad + np.array(turns)))
+    nominal = np.full(len(turns), 0.5 * standard.pin_m)
+    found = _holes(_about(xy, places, nominal), places, nominal, 0, pitch, None, passes=3) if turns else {}
+    return tuple(t for k, t in enumerate(turns) if k in found and abs(complex(*found[k].center) - places[k]) < _OFF_M)
 
 
 def _about(xy: Array, expected: NDArray[np.complex128], nominal: Array) -> list[Array]:

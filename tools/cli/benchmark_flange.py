@@ -154,7 +154,26 @@ def few(
     return _figures(call, few_table(study_few_scans(dataset, draws, call.seed, progress=call.progress), draws))
 
 
-COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few)
+@command("benchmark flange-holes")
+def holes(
+    call: Call,
+    scans: Annotated[int, option("--scans", "N", "Number of scans for each set of filled holes.", min=1)] = 200,
+    width: WidthOption = 1032,
+    flange: FlangeName = FLANGE,
+) -> Outcome:
+    """Fill holes of the flange and count the rotations about its axis that are stated, left open and wrong."""
+    from weldcal.models.flanges import get_flange
+    from weldcal.models.scanners import get_scanner
+    from weldcal.tools.studies.flange.hole_turn import study_hole_turn
+    from weldcal.tools.studies.flange.tables import hole_turn_table
+
+    rows = study_hole_turn(
+        get_scanner("phoxi_m", width), get_flange(flange), scans, seed=call.seed, progress=call.progress
+    )
+    return _figures(call, hole_turn_table(rows))
+
+
+COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes)
 
 
 def _figures(call: Call, table: "Table") -> Outcome:

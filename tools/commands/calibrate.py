@@ -186,8 +186,8 @@ def _axis_turn(
     inliers: list[Observation], patterns: dict[str, HolePattern], X_BC: RigidTransform
 ) -> tuple[float, float] | None:
     """Rotation of the hole pattern about the flange axis and its spread over the scans (deg), for later use as axis_turn_deg;
-    None where fewer than four scans show the holes. From uncorrected scans, as in a calibration from one scan."""
-    seen = [o for o in inliers if o.id in patterns]
+    None where fewer than four scans show it. From uncorrected scans, as in a calibration from one scan."""
+    seen = [o for o in inliers if o.id in patterns and patterns[o.id].turn_known]
     if len(seen) < ENOUGH:
         return None
     turn, spread = axis_turn(seen, patterns, X_BC)

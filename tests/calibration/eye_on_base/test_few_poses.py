@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
@@ -55,3 +57,24 @@ def test_scans_without_holes_are_refused() -> None:
     observations, _ = _observations(1)
     with pytest.raises(TooFewPoses, match="holes"):
         estimate_from_whole_poses(observations, {})
+
+
+@pytest.mark.parametrize("turn_deg", [179.99, -179.99, 90.0])
+def test_a_turn_near_half_a_circle_does_not_wrap(turn_deg: float) -> None:
+    """Some turns of one flange read +180 and others -180 degrees."""
+    observations, patterns = _observations(4)
+    turned = RotationMatrix.MakeZRotation(TURN - np.radians(turn_deg))
+    observations = [replace(o, X_BR=o.X_BR @ RigidTransform(turned, np.zeros(3))) for o in observations]
+    turn, spread = axis_turn(observations, patterns, X_BC)
+    assert abs(np.angle(np.exp(1j * (turn - np.radians(turn_deg))))) < np.radians(0.1)
+    assert spread < np.radians(0.1)
+
+
+def test_a_rotation_that_the_holes_leave_open_is_not_used() -> None:
+    observations, patterns = _observations(3)
+    quarter = tuple(np.radians([90.0, 180.0, -90.0]))
+    patterns["p1"] = replace(patterns["p1"], other_turns_rad=quarter)
+    assert estimate_from_whole_poses(observations, patterns, TURN).ids == ("p0", "p2")
+    patterns = {k: replace(p, other_turns_rad=quarter) for k, p in patterns.items()}
+    with pytest.raises(TooFewPoses, match=r"dowel hole, .* any of 0, 90, 180, 270 degrees"):
+        estimate_from_whole_poses(observations, patterns, TURN)

@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.fit import fit_flange
-from weldcal.calibration.flange.holes import find_holes
+from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.models.flanges import FlangeStandard, face_points, get_flange
+from weldcal.models.scanners import get_scanner
+from weldcal.tools.studies.flange.hole_turn import study_hole_turn
 
 Array = NDArray[np.float64]
 STANDARD = get_flange("iso9409-1-50-4-m6")
@@ -87,6 +89,57 @@ def test_the_stated_spread_of_the_rotation_covers_its_error() -> None:
     # chi-square with 16 degrees of freedom over its mean, 99.9 % above; below, innermost points err less than a circle's
     # residuals say, at most by the 2.5 seen over 60 seeds
     assert 0.2 / 2.5 < np.mean(np.square(normalised)) < 2.5
+
+
+def _turn_error(pattern: HolePattern, X_CR: RigidTransform) -> float:
+    R = (X_CR.rotation().inverse() @ pattern.X_CR.rotation()).matrix()
+    return float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1]))
+
+
+def test_without_the_dowel_hole_the_rotation_is_left_open() -> None:
+    """The threads alone look the same after a quarter turn."""
+    normalised = []
+    for seed in range(12):
+        points, X_CR = _scan(STANDARD, 31.0 * seed, seed=seed)
+        points = _filled(points, X_CR, STANDARD.n_holes)
+        pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
+        assert pattern is not None
+        assert not pattern.turn_known
+        error = _turn_error(pattern, X_CR)
+        # the true rotation is the one reported or one of the others
+        shifted = error + np.array([0.0, *pattern.other_turns_rad])
+        assert np.abs(np.angle(np.exp(1j * shifted))).min() < np.radians(0.5)
+        normalised.append(error / pattern.turn_sigma)
+        assert pattern.ratio == pytest.approx(1.0, abs=4.0 * RATIO_SIGMA)
+    assert np.mean(np.square(normalised)) < 2.5
+
+
+@pytest.mark.parametrize("thread", range(STANDARD.n_holes))
+def test_a_filled_thread_leaves_the_rotation_known(thread: int) -> None:
+    points, X_CR = _scan(STANDARD, 47.0)
+    points = _filled(points, X_CR, thread)
+    pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
+    assert pattern is not None
+    assert pattern.turn_known
+    assert abs(_turn_error(pattern, X_CR)) < np.radians(0.5)
+
+
+def test_a_second_hole_at_a_rival_place_of_the_dowel_leaves_the_rotation_open() -> None:
+    points, X_CR = _scan(STANDARD, 12.0)
+    inside = (X_CR.inverse() @ points.T)[:2]
+    points = points[np.hypot(inside[0] + 0.5 * STANDARD.pitch_circle_m, inside[1]) > 0.5 * STANDARD.pin_m]
+    pattern = find_holes(points, fit_flange(points, STANDARD), STANDARD)
+    assert pattern is not None
+    assert np.degrees(np.abs(pattern.other_turns_rad)) == pytest.approx([90.0])
+
+
+def test_no_filled_holes_lead_to_a_wrong_rotation() -> None:
+    rows = study_hole_turn(get_scanner("phoxi_m", 1032), STANDARD, 3, seed=4)
+    assert [r.filled for r in rows] == ["nothing", *(f"thread {k}" for k in (1, 2, 3, 4)), "dowel hole", "two"]
+    assert sum(r.wrong for r in rows) == 0
+    assert rows[0].right > 0
+    assert rows[5].right == 0
+    assert rows[5].left_open > 0
 
 
 def test_a_ring_has_no_pattern() -> None:

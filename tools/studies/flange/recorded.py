@@ -145,7 +145,8 @@ def study_few_scans(
     which is known from a calibration with all scans. Raises InputError for a folder that is none, TooFewPoses where nothing remains."""
     refusal = f"Draws need {ENOUGH + KEPT} usable scans and more"
     good, patterns, X_rough = usable_scans(folder, ENOUGH + KEPT, refusal, seed, progress, 0.3, allow_coplanar=True)
-    turn = axis_turn(good, patterns, X_rough)[0] if any(o.id in patterns for o in good) else None
+    known = any(o.id in patterns and patterns[o.id].turn_known for o in good)
+    turn = axis_turn(good, patterns, X_rough)[0] if known else None
     sizes = [n for n in sizes if n <= len(good) - KEPT and (n > 1 or turn is not None)]
     rng = np.random.default_rng(seed)
     rows = []

@@ -8,6 +8,7 @@ from weldcal.models.arrays import Array
 from weldcal.tools.studies.flange.coverage import Coverage
 from weldcal.tools.studies.flange.found import Found, Hidden
 from weldcal.tools.studies.flange.halves import PartRow
+from weldcal.tools.studies.flange.hole_turn import HoleTurn
 from weldcal.tools.studies.flange.live import TARGET_M, TARGET_RAD, LiveRow, joined
 from weldcal.tools.studies.flange.recorded import Draws, Ingredient
 from weldcal.tools.studies.flange.speed import Timing
@@ -58,6 +59,16 @@ def hidden_table(rows: Sequence[Hidden]) -> Table:
         for r in rows
     }
     return {"state": "done", "rows": [r.summary() for r in rows]}, lines
+
+
+def hole_turn_table(rows: Sequence[HoleTurn]) -> Table:
+    """Rotations of the hole pattern with holes filled, a row per set."""
+    lines = {
+        f"{r.filled} filled": f"of {r.scans} scans: {r.right} right, {r.wrong} wrong, {r.left_open} left open, "
+        f"{r.no_pattern} without a pattern"
+        for r in rows
+    }
+    return _rows("rows", rows), lines
 
 
 def parts_table(rows: Sequence[PartRow]) -> Table:
