@@ -31,6 +31,8 @@ class DepthNoise:
     quantum_m          depths come in steps of this size (0: continuous)
     warp_m, device     largest value of a smooth error over the image that stays the same for one device (a seed), at
                        the reference depth; it grows with depth like the noise
+    scale_error        relative error of every depth, and with it of every point, in a calibrated device
+    gradient_per_m     further relative error per metre of x and of y (true, camera frame)
     """
 
     sigma_m: float = 0.0
@@ -48,6 +50,8 @@ class DepthNoise:
     quantum_m: float = 0.0
     warp_m: float = 0.0
     device: int = 0
+    scale_error: float = 0.0
+    gradient_per_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         chances = (self.flying, self.edge_dropout, self.dropout, self.dark_dropout)
@@ -56,6 +60,15 @@ class DepthNoise:
             raise InputError("The chances of a depth noise model lie between 0 and 1: correct flying or a dropout.")
         if not (self.reference_m > 0.0 and self.edge_step_m > 0.0 and all(v >= 0.0 for v in sizes)):
             raise InputError("Depth noise sizes cannot be negative: correct a sigma, step, warp or quantum.")
+        if not (
+            abs(self.scale_error) < 0.1 and len(self.gradient_per_m) == 2 and np.isfinite(self.gradient_per_m).all()
+        ):
+            raise InputError("A scanner's scale error must be below 0.1 and its gradient two finite numbers.")
+
+    @property
+    def distorts(self) -> bool:
+        """Whether the device has errors that stay the same from scan to scan."""
+        return self.warp_m > 0.0 or self.scale_error != 0.0 or any(self.gradient_per_m)
 
 
 def noisy_depth(
@@ -89,8 +102,8 @@ def noisy_depth(
         if dark is not None and noise.dark_gain > 0.0:
             sigma *= (1.0 + noise.dark_gain * dark).astype(np.float32)
         out += unit * sigma
-    if noise.warp_m > 0.0:
-        out += device_warp(perfect.shape, noise.warp_m, noise.device) * scale
+    if noise.distorts:
+        out += _distortion(perfect, noise, fx, fy, cx, cy, scale)
 
     if noise.flying > 0.0 or noise.edge_dropout > 0.0:
         nearest, farthest = _neighbourhood(perfect)
@@ -132,6 +145,41 @@ def incidence_cosine(depth: Depth, fx: float, fy: float, cx: float, cy: float) -
     return np.asarray(np.clip(cosine, np.float32(0.02), np.float32(1.0)), dtype=np.float32)
 
 
+def _distortion(perfect: Depth, noise: DepthNoise, fx: float, fy: float, cx: float, cy: float, growth: Depth) -> Depth:
+    """The device's own errors (H,W) of a depth map, m."""
+    gx, gy = noise.gradient_per_m
+    height, width = perfect.shape
+    u = (np.arange(width, dtype=np.float32) - np.float32(cx))[None, :] * np.float32(gx / fx)
+    v = (np.arange(height, dtype=np.float32) - np.float32(cy))[:, None] * np.float32(gy / fy)
+    out = np.asarray(perfect * (np.float32(noise.scale_error) + perfect * (u + v)), dtype=np.float32)
+    if noise.warp_m > 0.0:
+        out += device_warp(perfect.shape, noise.warp_m, noise.device) * growth
+    return out
+
+
+def measured_points(
+    points_C: npt.NDArray[np.floating], noise: DepthNoise, pixels: tuple[float, float, float, float, int, int]
+) -> npt.NDArray[np.float64]:
+    """Where the device's own errors, without noise, put points (..., 3) m of its camera frame.
+
+    `pixels` is (fx, fy, cx, cy, width, height). For studies and ground truth.
+    """
+    p = np.asarray(points_C, dtype=np.float64)
+    fx, fy, cx, cy, width, height = pixels
+    gx, gy = noise.gradient_per_m
+    z = p[..., 2]
+    depth = z * (1.0 + noise.scale_error + gx * p[..., 0] + gy * p[..., 1])
+    if noise.warp_m > 0.0:
+        weights, x, y = _warp_weights(noise.warp_m, noise.device), fx * p[..., 0] / z + cx, fy * p[..., 1] / z + cy
+        wave_x, wave_y = (
+            np.cos(np.pi * np.multiply.outer(np.arange(3), (t + 0.5) / n)) for t, n in ((x, width), (y, height))
+        )
+        depth = (
+            depth + np.einsum("i...,ij,j...->...", wave_y, weights, wave_x) * (z / noise.reference_m) ** noise.growth
+        )
+    return np.asarray(p * (depth / z)[..., None])
+
+
 def device_warp(shape: tuple[int, ...], amplitude_m: float, device: int) -> Depth:
     """A smooth error (H,W) in metres with |error| <= amplitude, the same at every resolution for one device.
 
@@ -139,14 +187,19 @@ def device_warp(shape: tuple[int, ...], amplitude_m: float, device: int) -> Dept
     deformation that is left after a scanner's factory calibration.
     """
     height, width = shape
+    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    wave_x, wave_y = (np.cos(np.pi * np.arange(3)[:, None] * t[None, :]) for t in (x, y))
+    return np.asarray(wave_y.T @ _warp_weights(amplitude_m, device) @ wave_x, dtype=np.float32)
+
+
+def _warp_weights(amplitude_m: float, device: int) -> npt.NDArray[np.float64]:
+    """Weights (3, 3) m of the cosines along y and x."""
     rng = np.random.default_rng([device, 0x77617270])
     weights = rng.standard_normal((3, 3)) * np.array([[0.3, 1.0, 0.7], [1.0, 0.7, 0.4], [0.7, 0.4, 0.2]])
     grid = np.linspace(0.0, 1.0, 33)
     waves = np.cos(np.pi * np.arange(3)[:, None] * grid[None, :])
     peak = float(np.abs(waves.T @ weights @ waves).max())
-    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-    wave_x, wave_y = (np.cos(np.pi * np.arange(3)[:, None] * t[None, :]) for t in (x, y))
-    return np.asarray(wave_y.T @ (weights * amplitude_m / peak) @ wave_x, dtype=np.float32)
+    return np.asarray(weights * amplitude_m / peak)
 
 
 def _least_slope(depth: Depth, axis: int) -> Depth:

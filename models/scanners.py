@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from weldcal.models.depth_noise import Depth, DepthNoise, noisy_depth
+from weldcal.models.depth_noise import Depth, DepthNoise, measured_points, noisy_depth
 from weldcal.models.errors import InputError
 
 Floats = npt.NDArray[np.float64]
@@ -48,6 +48,10 @@ class ScannerPreset:
     def footprint_m(self, distance_m: float) -> tuple[float, float]:
         """Width and height of the scanned area on a plane at that distance, m."""
         return self.width * distance_m / self.fx, self.height * distance_m / self.fy
+
+    def measured(self, points_C: Floats) -> Floats:
+        """Where the device's own errors, without noise, put points (..., 3) m of its camera frame."""
+        return measured_points(points_C, self.noise, (self.fx, self.fy, self.cx, self.cy, self.width, self.height))
 
     def resized(self, width: int, height: int | None = None) -> ScannerPreset:
         """The same view in another resolution; the image corners, not the pixel centres, stay where they are."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.observation import Observation
@@ -143,8 +144,14 @@ class CalibrationStatus(Message):
 
     @property
     def X_BC(self) -> RigidTransform | None:
-        """The pose of the scanner in the base; None before the first estimate."""
+        """The pose of the scanner in the base, which applies to corrected points; None before the first estimate."""
         return None if self.estimate is None else self.estimate.X_BC
+
+    @property
+    def correction(self) -> ScannerCorrection:
+        """The correction of scanned points; the identity where none was estimated."""
+        found = None if self.estimate is None else self.estimate.scanner
+        return ScannerCorrection() if found is None else found
 
 
 @dataclass(frozen=True, eq=False)

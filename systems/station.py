@@ -19,7 +19,7 @@ from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_e
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
-from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
+from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import SECOND, PlacedArm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
@@ -40,6 +40,8 @@ class Truth(Message):
     X_LC: RigidTransform | None = None  # the scanner on what carries it, where that is not the base
     X_BD: RigidTransform | None = None  # the second arm's base
     profiler: ProfilerTruth | None = None
+    scanner: TrueScanner | None = None  # the device with its own errors
+    arm: ArmModel | None = None  # with its true kinematics
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -173,12 +175,13 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
     builder = DiagramBuilder()
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot)
     furnishing = Furnishing()
-    world = None
+    world, true_arm = None, robot.arm
     if any(config.SIMULATED for config in devices.values()):
         furnishing = Furnishing() if furnish is None else furnish(scenario, rng, real, X_BP)
+        true_arm = scenario.robot.true_arm(robot.arm, robot.q_start, rng)
         world = build_world(
             builder,
-            robot.arm,
+            true_arm,
             tool,
             robot.q_start,
             flange=scenario.flange,
@@ -210,6 +213,8 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
         X_LC,
         None if furnishing.second is None else furnishing.second.X_BD,
         build.find(ProfilerTruth),
+        build.find(TrueScanner),
+        None if world is None else true_arm,
     )
     _export(build, world, truth, scenario)
     diagram = builder.Build()

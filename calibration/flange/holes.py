@@ -176,7 +176,7 @@ def _phase(xy: Array, angles: Array, standard: FlangeStandard) -> float | None:
 
 
 def _other_turns(
-    xy: Array, start: complex, gain: complex, standard: FlangeStandard, seen: Array, pitch: float
+    xy: Array, start: complex, gain: complex, standard: FlangeStandard, seen: NDArray[np.intp], pitch: float
 ) -> tuple[float, ...]:
     """Rotations (rad, -pi to pi) that take the threads onto themselves and that the dowel hole does not exclude.
 

@@ -4,6 +4,9 @@ import dataclasses as dc
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
+import numpy as np
+
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.scanners import ScannerPreset
 from weldcal.models.tool import FingerCamera
 
@@ -21,6 +24,10 @@ class DriverConfig:
     FOR: ClassVar[tuple[str, ...]] = ()  # some of DEVICES
     DEFAULT_FOR: ClassVar[tuple[str, ...]] = ()  # devices for which it is used where a scenario does not name one
     SIMULATED: ClassVar[bool] = False  # needs the simulated world
+
+    def true_arm(self, arm: ArmModel, q_start: np.ndarray, rng: np.random.Generator) -> ArmModel:
+        """The arm that a simulated world holds in place of the controller's model; the model itself by default."""
+        return arm
 
 
 @dc.dataclass

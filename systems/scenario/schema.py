@@ -48,6 +48,7 @@ class CalibrationConfig:
     required_error_mm: float = 0.10  # e_required, for the estimate's expected error at the work point
     minimum_scans: int = 6
     maximum_scans: int = 10  # k_max, without the verification scans
+    correct_scanner: bool = True  # estimate scale, gradient and bends of the scanner with X_BC
     verification_scans: int = 1
     verification_limit_mm: float = 0.5  # a larger error at a held-out pose holds the job
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation

@@ -119,10 +119,10 @@ class CellVisualizer(LeafSystem):
             return
         points = scan.points_C.reshape(-1, 3)
         points = points[np.isfinite(points[:, 2])]
-        points = points[:: max(1, len(points) // self._config.cloud_points)]
+        points = points[:: max(1, len(points) // self._config.cloud_points)].astype(float)
         X_BC = status.X_BC or self._X_BC_guess
         cloud = PointCloud(len(points), Fields(BaseField.kXYZs))
-        cloud.mutable_xyzs()[:] = (points @ X_BC.rotation().matrix().T + X_BC.translation()).T
+        cloud.mutable_xyzs()[:] = (status.correction.points(points) @ X_BC.rotation().matrix().T + X_BC.translation()).T
         if self._drawn.scan:
             self._meshcat.SetProperty(f"{ROOT}/scan/{self._drawn.scan:02d}", "visible", False, time)
         path = f"{ROOT}/scan/{scan.sequence:02d}"
@@ -139,7 +139,9 @@ class CellVisualizer(LeafSystem):
         angle = np.linspace(0.0, 2.0 * np.pi, 73)
         ring = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)]) * self._circle_radius_m
         path = f"{ROOT}/circle/{estimate.sequence:02d}"
-        self._meshcat.SetLine(path, R @ ring + (X_BC @ estimate.fit.center_C)[:, None], 4.0, CIRCLE)
+        self._meshcat.SetLine(
+            path, R @ ring + (X_BC @ status.correction.points(estimate.fit.center_C))[:, None], 4.0, CIRCLE
+        )
         self._show(path, time)
         self._drawn.fit = estimate.sequence
 

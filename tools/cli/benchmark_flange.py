@@ -173,7 +173,25 @@ def holes(
     return _figures(call, hole_turn_table(rows))
 
 
-COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes)
+@command("benchmark flange-imperfect")
+def imperfect(
+    call: Call,
+    scenario: Annotated[
+        str, typer.Argument(metavar="[SCENARIO]", help="A scenario with simulated arm and scanner.")
+    ] = "s_groove",
+    runs: Annotated[int, option("--runs", "N", "Number of calibrations, each in its own world.", min=10)] = 200,
+) -> Outcome:
+    """Calibrate with an imperfect scanner and arm, without rendering: errors at the work point, and how often they lie in the
+    stated 95 % region."""
+    from weldcal.systems.scenario.loading import load_scenario
+    from weldcal.tools.studies.flange.imperfect import study_light_runs
+    from weldcal.tools.studies.flange.tables import light_runs_table
+
+    found = study_light_runs(load_scenario(scenario), runs, seed=call.seed, progress=call.progress)
+    return _figures(call, light_runs_table(found))
+
+
+COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect)
 
 
 def _figures(call: Call, table: "Table") -> Outcome:

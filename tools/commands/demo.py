@@ -2,7 +2,6 @@
 
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.runner import Progress, Run, no_progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
@@ -11,7 +10,7 @@ from weldcal.tools.commands.run import JobRun, run_job
 from weldcal.tools.commands.run_files import weld_record, write_calibration, write_scans, write_weld_log
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.outcomes.weld import calibration_error, weld_outcome
+from weldcal.tools.outcomes.weld import live_calibration_error, weld_outcome
 from weldcal.tools.report.demo import demo_pictures, demo_report
 from weldcal.tools.report.render import write_atomic
 
@@ -68,10 +67,7 @@ def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = n
 def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
     """Compare the run with the ground truth of its simulation."""
     cell, status = run.cell, run.cell.job.calibration_status(run.root)
-    error = None
-    truth = cell.station.truth.X_BC
-    if status.estimate is not None and truth is not None:
-        error = calibration_error(status.estimate.X_BC, truth, work_point(cell.scenario))
+    error = None if status.estimate is None else live_calibration_error(cell, status.estimate)
     return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
 
 

@@ -46,6 +46,8 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
         sigma_position_mm=1e3 * estimate.sigma_position_m,
         sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
         seed=seed,
+        scanner_correction=None if estimate.scanner is None else estimate.scanner.document(),
+        joint_covariance=estimate.joint,
     )
 
 

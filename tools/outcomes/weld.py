@@ -1,6 +1,6 @@
 """Errors of the weld and of the calibration of a run against the ground truth of the simulation."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,13 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M
+from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
+from weldcal.tools.outcomes.arm_frame import true_work_point
 from weldcal.welding.record.process import (
     PathError,
     SpeedStatistics,
@@ -80,6 +82,25 @@ def calibration_error(X_BC: RigidTransform, X_BC_true: RigidTransform, p_BWork: 
         rotation_rad=float(abs(turn)),
         at_work_m=float(np.linalg.norm(landed - p_BWork)),
     )
+
+
+def live_calibration_error(cell: Cell[WeldJob], estimate: CalibrationEstimate) -> CalibrationError | None:
+    """Error of a live calibration in a simulated world whose scanner and arm have errors of their own; None without truth.
+
+    `at_work_m` is the distance between where scanner and calibration put the work point and where the arm reports it.
+    """
+    station, scenario = cell.station, cell.scenario
+    truth, work = station.truth, work_point(scenario)
+    if truth.X_BC is None or truth.arm is None:
+        return None
+    X_FT = None if station.tool is None else station.tool.X_FT
+    poses = [p.q for p in cell.job.poses]
+    p_true = true_work_point(station.arm, truth.arm, X_FT, work, np.deg2rad(scenario.home_deg), poses)
+    p_C = truth.X_BC.inverse().multiply(p_true)
+    seen = p_C if truth.scanner is None else truth.scanner.device.measured(p_C)
+    corrected = seen if estimate.scanner is None else estimate.scanner.points(seen)
+    off = calibration_error(estimate.X_BC, truth.X_BC, work)
+    return replace(off, at_work_m=float(np.linalg.norm(estimate.X_BC.multiply(corrected) - work)))
 
 
 def true_seam(cell: Cell[WeldJob]) -> SeamCurve | None:

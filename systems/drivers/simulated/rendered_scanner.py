@@ -24,11 +24,12 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
+from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
-from weldcal.systems.messages import Scan
+from weldcal.systems.messages import Message, Scan
 
 
 @dc.dataclass
@@ -46,6 +47,11 @@ class RenderedScanner(ScannerConfig):
     mounting_rotation_deg: float = 1.5
     exposure_s: float = 0.25  # from the trigger to the cloud
     field_of_view_deg: float | None = None  # horizontal; null: the scanner's own
+    # the device's own errors, the same in every scan: relative error of all lengths, the same per metre of x and y, and
+    # the largest error of a smooth warp at the optimum distance, drawn from the seed
+    scale_error: float = 0.0
+    gradient_error_per_m: list[float] = dc.field(default_factory=lambda: [0.0, 0.0])
+    warp_mm: float = 0.0
     # base, or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
     mounted_on: str = "base"
 
@@ -56,6 +62,21 @@ class RenderedScanner(ScannerConfig):
             return preset
         fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * self.field_of_view_deg))
         return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
+
+    def device(self, rng: np.random.Generator) -> ScannerPreset:
+        """The scanner with the errors of one device; ``rng`` draws its warp."""
+        preset = self.scanner()
+        if len(self.gradient_error_per_m) != 2:
+            raise InputError("scanner.gradient_error_per_m must be two numbers, along x and along y.")
+        noise = dc.replace(
+            preset.noise,
+            scale_error=self.scale_error,
+            gradient_per_m=(self.gradient_error_per_m[0], self.gradient_error_per_m[1]),
+            warp_m=self.warp_mm * 1e-3,
+            # no draw where it is not needed: the other devices' random numbers stay the same
+            device=int(rng.integers(2**31)) if self.warp_mm else 0,
+        )
+        return dc.replace(preset, noise=noise)
 
 
 def random_pose_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
@@ -161,13 +182,20 @@ def _show_housing(world: SimulatedWorld, X_BC: RigidTransform, carrier: RigidBod
     scene_graph.RegisterAnchoredGeometry(source, housing)
 
 
+@dc.dataclass(frozen=True, eq=False)
+class TrueScanner(Message):
+    """The simulated scanner with its device's own errors, for reports and tests only."""
+
+    device: ScannerPreset
+
+
 def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
-    """Mount a depth camera at the scanner's true pose (exported by `cheat.*` only) and add the scanner's noise model.
+    """Mount a depth camera at the scanner's true pose (exported by `cheat.*` only) and add the scanner's errors.
 
     Returns the true pose of the scanner in its carrier's frame: X_BC, X_FC or X_LC.
     """
     world = build.require(SimulatedWorld)
-    preset = config.scanner()
+    preset = config.device(build.rng)
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
     error = random_pose_error(
         build.rng, config.mounting_translation_mm * 1e-3, np.deg2rad(config.mounting_rotation_deg)
@@ -195,4 +223,5 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     build.builder.Connect(sensor.color_image_output_port(), scanner.GetInputPort("color_image"))
     build.inputs["scanner.trigger"] = scanner.GetInputPort("trigger")
     build.outputs["scanner.scan"] = scanner.GetOutputPort("scan")
+    build.parts = (*build.parts, TrueScanner(preset))
     return X_BC

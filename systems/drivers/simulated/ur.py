@@ -11,6 +11,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
+from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
@@ -34,6 +35,12 @@ class SimulatedUr(DriverConfig):
     following_error_rad: float = 0.05  # a larger following error stops the arm
     # rms distance of the true flange position from the reported one, drawn for each stop; 0: the report is exact
     repeatability_mm: float = 0.0
+    # rms distance of the true flange position from that of the controller's model; drawn once; 0: the model is exact
+    kinematic_error_mm: float = 0.0
+
+    def true_arm(self, arm: ArmModel, q_start: np.ndarray, rng: np.random.Generator) -> ArmModel:
+        """See DriverConfig."""
+        return draw_true_arm(arm, self.kinematic_error_mm, q_start, rng)
 
 
 class SpeedJointServo(LeafSystem):

@@ -9,7 +9,10 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
+from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, estimate_eye_on_base, point_error_covariance
+from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.published.algorithm1 import (
     COST_AXES,
@@ -38,6 +41,7 @@ class CalibratorConfig:
     cost: str = "translation"
     work_radius_m: float = 0.2
     cost_axes: tuple[str, ...] = COST_AXES
+    correct_scanner: bool = True
 
 
 class IterativeCalibrator(LeafSystem):
@@ -52,7 +56,8 @@ class IterativeCalibrator(LeafSystem):
         output_ports:
         - calibration_status
 
-    It is done when the estimate's expected error at the work point is within the required one. Algorithm 1's figure is kept
+    The estimate contains a correction of the scanner's own errors, unless `correct_scanner` is off. It is done when the
+    expected error at the work point is within the required one. Algorithm 1's figure is kept
     for display only, because it does not measure the remaining error (docs/calibration.md).
     """
 
@@ -118,7 +123,7 @@ def digest(
     observations = (*status.observations, observation)
     status = dc.replace(status, observations=observations, algorithm_1=_algorithm_1(status, observation, config))
     try:
-        estimate = estimate_eye_on_base(observations)
+        estimate = estimate_jointly(observations) if config.correct_scanner else estimate_eye_on_base(observations)
     except WeldcalError as error:
         return dc.replace(status, message=str(error))
     predicted = expected_error(estimate, config.p_BWork)
@@ -143,10 +148,11 @@ def verify_at(status: CalibrationStatus, seen: FlangeEstimate, X_BR: RigidTransf
     """Position error (m) and tilt (rad) of the calibration at one held-out scan."""
     if status.estimate is None or seen.fit is None:
         return VerificationResult(seen.label, np.inf, np.inf)
+    seen_at = [corrected_observation(status.correction, observation_from_fit(seen.label, X_BR, seen.fit))]
     X_BC = status.estimate.X_BC
-    error = float(np.linalg.norm(X_BC @ seen.fit.center_C - X_BR.translation()))
-    cosine = float(np.dot(X_BC.rotation().matrix() @ seen.fit.normal_C, X_BR.rotation().matrix()[:, 2]))
-    return VerificationResult(seen.label, error, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    return VerificationResult(
+        seen.label, float(position_errors(X_BC, seen_at)[0]), float(tilt_errors(X_BC, seen_at)[0])
+    )
 
 
 def _algorithm_1(

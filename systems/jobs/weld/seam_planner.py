@@ -8,6 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, State
 
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
@@ -34,7 +35,7 @@ class SeamPlanner(LeafSystem):
         output_ports:
         - planned_seam
 
-    Without calibration in the job, `X_BC_known` is used.
+    Without calibration in the job, `X_BC_known` is used, with the scan as it is.
     """
 
     def __init__(
@@ -69,17 +70,20 @@ class SeamPlanner(LeafSystem):
         newest: PlannedSeam = context.get_abstract_state(self._state).get_value()
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
             return
-        X_BC = self._X_BC_known if self._X_BC_known is not None else self._status.Eval(context).X_BC
-        state.get_mutable_abstract_state(self._state).set_value(self._plan(scan, X_BC))
+        X_BC, correction = self._X_BC_known, ScannerCorrection()
+        if X_BC is None:
+            status: CalibrationStatus = self._status.Eval(context)
+            X_BC, correction = status.X_BC, status.correction
+        state.get_mutable_abstract_state(self._state).set_value(self._plan(scan, X_BC, correction))
 
-    def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
+    def _plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> PlannedSeam:
         if X_BC is None:
             return PlannedSeam(
                 sequence=scan.sequence, reason="The seam cannot be computed in the base: the scanner is not calibrated."
             )
         points_C = scan.points_C.reshape(-1, 3).astype(float)
         points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
-        points_B = points_C @ X_BC.rotation().matrix().T + X_BC.translation()
+        points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
         try:
             found = plan_root(points_B, self._workpiece, self._X_BP_guess, self._method, X_BC.translation())
             seam = seam_above(found, self._tool, self._seam_length_m)
@@ -179,7 +183,7 @@ class DrawnSeamPlanner(SeamPlanner):
         - planned_seam
     """
 
-    def _plan(self, scan: Scan, X_BC: RigidTransform | None) -> PlannedSeam:
+    def _plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> PlannedSeam:
         try:
             seam = tip_seam(self._workpiece, self._X_BP_guess, self._tool, self._seam_length_m)
             check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)

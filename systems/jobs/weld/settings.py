@@ -122,4 +122,5 @@ def calibrator_config(scenario: Scenario) -> CalibratorConfig:
         cost=c.cost,
         work_radius_m=c.work_radius_mm * 1e-3,
         cost_axes=tuple(c.cost_axes),
+        correct_scanner=c.correct_scanner,
     )

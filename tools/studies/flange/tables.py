@@ -9,6 +9,7 @@ from weldcal.tools.studies.flange.coverage import Coverage
 from weldcal.tools.studies.flange.found import Found, Hidden
 from weldcal.tools.studies.flange.halves import PartRow
 from weldcal.tools.studies.flange.hole_turn import HoleTurn
+from weldcal.tools.studies.flange.imperfect import LightRuns
 from weldcal.tools.studies.flange.live import TARGET_M, TARGET_RAD, LiveRow, joined
 from weldcal.tools.studies.flange.recorded import Draws, Ingredient
 from weldcal.tools.studies.flange.speed import Timing
@@ -69,6 +70,29 @@ def hole_turn_table(rows: Sequence[HoleTurn]) -> Table:
         for r in rows
     }
     return _rows("rows", rows), lines
+
+
+def light_runs_table(found: LightRuns) -> Table:
+    """Errors of light calibrations in the imperfect world, and their coverage."""
+    low, high = found.chance()
+    ours, rigid = 1e3 * found.error_m, 1e3 * found.rigid_m
+    summary: dict[str, object] = {
+        "state": "done",
+        "runs": len(ours),
+        "scans_mean": float(np.mean(found.scans)),
+        "at_work_mm": {"mean": float(ours.mean()), "p95": float(np.percentile(ours, 95)), "worst": float(ours.max())},
+        "expected_mm": float(1e3 * np.sqrt(np.mean(found.expected_m**2))),
+        "inside_95": found.share_inside,
+        "inside_95_chance": [low, high],
+        "rigid_at_work_mm": {"mean": float(rigid.mean()), "worst": float(rigid.max())},
+    }
+    return summary, {
+        "error at the work point": f"{ours.mean():.3f} mm mean, {np.percentile(ours, 95):.3f} 95 %, {ours.max():.3f} at most "
+        f"({_rms(ours):.3f} rms; {summary['expected_mm']:.3f} expected), from {np.mean(found.scans):.1f} scans",
+        "in the stated 95 % region": f"{100 * found.share_inside:.1f} % of {len(ours)} (exact regions: {100 * low:.1f} to "
+        f"{100 * high:.1f} %)",
+        "without a scanner correction": f"{rigid.mean():.3f} mm mean, {rigid.max():.3f} at most",
+    }
 
 
 def parts_table(rows: Sequence[PartRow]) -> Table:

@@ -1,0 +1,142 @@
+"""Coverage of the live calibration's stated error with an imperfect scanner and arm, without rendering."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform
+from scipy.stats import binom, chi2
+
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
+from weldcal.models.arrays import Array
+from weldcal.models.scanners import ScannerPreset
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner, random_pose_error
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.jobs.weld.iterative_calibrator import expected_error
+from weldcal.systems.jobs.weld.settings import feature_on_flange, plan_poses, work_point
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import make_station
+from weldcal.tools.outcomes.arm_frame import true_work_point
+
+LEVEL = 0.95
+_CENTRE_M, _NORMAL_RAD = 2e-5, 1e-4  # noise of a fit, an axis, as fits of rendered PhoXi M scans state it
+_FACE_M = 0.025  # a fitted normal is that of a plane through a ring of this radius
+
+
+@dataclass(frozen=True, eq=False)
+class LightRuns:
+    """Calibrations (k): scans that each took, error and expected error (m) at the work point, and whether the error lies in
+    the stated 95 % region. ``rigid_m`` are the errors of the same scans without a scanner correction."""
+
+    scans: Array
+    error_m: Array
+    expected_m: Array
+    inside: Array
+    rigid_m: Array
+
+    @property
+    def share_inside(self) -> float:
+        """Share of the calibrations whose error lies in the stated region."""
+        return float(np.mean(self.inside))
+
+    def chance(self) -> tuple[float, float]:
+        """Shares between which 95 % of such studies fall where the region is exact."""
+        n = len(self.inside)
+        low, high = (binom.ppf(q, n, LEVEL) / n for q in (0.025, 0.975))
+        return float(low), float(high)
+
+
+@dataclass(frozen=True, eq=False)
+class _World:
+    """One draw: the arm as it reports and as it is, the device, and its true pose."""
+
+    arm: ArmModel
+    true_arm: ArmModel
+    device: ScannerPreset
+    X_BC: RigidTransform
+    repeatability_m: float
+    X_FR: RigidTransform
+
+
+def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: Progress = no_progress) -> LightRuns:
+    """Calibrate ``runs`` times in the scenario's simulated world, with a device, an arm and a mounting of its own each time.
+
+    The job's own poses and stopping rule; the rendering and the flange fit are replaced by their stated noise. The arm's
+    links and the scanner's warp are drawn from models that the estimator does not contain. Deterministic for ``seed``.
+    """
+    assert isinstance(scenario.robot, SimulatedUr)
+    scanner = scenario.scanner_config()
+    assert isinstance(scanner, RenderedScanner)
+    station = make_station(scenario, seed)
+    poses = [p.q for p in plan_poses(scenario, station, seed)]
+    station.close()
+    home, work = np.deg2rad(scenario.home_deg), work_point(scenario)
+    X_FT = None if station.tool is None else station.tool.X_FT
+    limits, rows = scenario.calibration, []
+    for k in range(runs):
+        progress("light calibrations", k / runs)
+        rng = np.random.default_rng([seed, k])
+        world = _draw(scenario, station.arm, feature_on_flange(scenario, station), rng)
+        observed = [_observe(world, q, f"p{i}", rng) for i, q in enumerate(poses[: limits.maximum_scans])]
+        n, estimate = _calibrate(observed, scenario, work)
+        p_true = true_work_point(world.arm, world.true_arm, X_FT, work, home, poses[:n])
+        p_C = world.device.measured(world.X_BC.inverse().multiply(p_true))
+        error = _landed(estimate, p_C) - work
+        S = point_error_covariance(estimate, work)
+        inside = float(error @ np.linalg.solve(S, error)) < chi2.ppf(LEVEL, 3)
+        rigid = _rigid(observed[:n], p_C) - work
+        rows.append((n, np.linalg.norm(error), np.sqrt(np.trace(S)), inside, np.linalg.norm(rigid)))
+    columns = np.array(rows, dtype=float).T
+    return LightRuns(columns[0], columns[1], columns[2], columns[3].astype(bool), columns[4])
+
+
+def _draw(scenario: Scenario, arm: ArmModel, X_FR: RigidTransform, rng: np.random.Generator) -> _World:
+    robot, scanner = scenario.robot, scenario.scanner_config()
+    assert isinstance(robot, SimulatedUr)
+    assert isinstance(scanner, RenderedScanner)
+    nominal = scenario.calibration.mounting_guess.pose()
+    error = random_pose_error(rng, 1e-3 * scanner.mounting_translation_mm, np.deg2rad(scanner.mounting_rotation_deg))
+    X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
+    true_arm = robot.true_arm(arm, np.deg2rad(scenario.home_deg), rng)
+    return _World(arm, true_arm, scanner.device(rng), X_BC, 1e-3 * robot.repeatability_mm, X_FR)
+
+
+def _observe(world: _World, q: Array, id: str, rng: np.random.Generator) -> Observation:
+    """The observation at reported joints q (6,) rad."""
+    sigma = world.repeatability_m / float(np.linalg.norm(jacobian(world.arm, q)[3:]))
+    X_CR = world.X_BC.inverse() @ forward_kinematics(world.true_arm, q + sigma * rng.standard_normal(6)) @ world.X_FR
+    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+    ring = _FACE_M * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(12)])
+    face = world.device.measured(X_CR.multiply(ring.T).T)
+    n = np.linalg.svd(face - face.mean(axis=0))[2][2]
+    n = n * np.sign(n @ X_CR.rotation().matrix()[:, 2])
+    lean = _NORMAL_RAD * rng.standard_normal(3)
+    n = exp_rotation(lean - n * float(n @ lean)) @ n
+    p = world.device.measured(np.asarray(X_CR.translation())) + _CENTRE_M * rng.standard_normal(3)
+    X_BR = forward_kinematics(world.arm, q) @ world.X_FR
+    return Observation(id, X_BR, p, n, _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
+
+
+def _calibrate(observed: Sequence[Observation], scenario: Scenario, work: Array) -> tuple[int, CalibrationEstimate]:
+    """Calibrate as the job does: from the least number of scans on, until the expected error is small enough."""
+    limits = scenario.calibration
+    for n in range(limits.minimum_scans, len(observed) + 1):
+        estimate = estimate_jointly(observed[:n])
+        if expected_error(estimate, work) <= 1e-3 * limits.required_error_mm:
+            break
+    return n, estimate
+
+
+def _landed(estimate: CalibrationEstimate, p_C: Array) -> Array:
+    """Where the estimate puts a measured point (3,) m in B."""
+    return np.asarray(estimate.X_BC.multiply(p_C if estimate.scanner is None else estimate.scanner.points(p_C)))
+
+
+def _rigid(observed: Sequence[Observation], p_C: Array) -> Array:
+    return np.asarray(estimate_eye_on_base(list(observed), SolveConfig(leave_one_out=False)).X_BC.multiply(p_C))
