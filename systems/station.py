@@ -178,7 +178,10 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
     world, true_arm = None, robot.arm
     if any(config.SIMULATED for config in devices.values()):
         furnishing = Furnishing() if furnish is None else furnish(scenario, rng, real, X_BP)
-        true_arm = scenario.robot.true_arm(robot.arm, robot.q_start, rng)
+        true_arm, true_second = scenario.robot.true_arm(robot.arm, robot.q_start, rng), furnishing.second
+        if true_second is not None:
+            of_second = scenario.robot_2.true_arm(true_second.arm, true_second.q_start, rng)
+            true_second = dc.replace(true_second, arm=of_second)
         world = build_world(
             builder,
             true_arm,
@@ -189,7 +192,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
             workpiece=real,
             X_BP=X_BP,
             fittings=furnishing.fittings,
-            second=furnishing.second,
+            second=true_second,
             foot=furnishing.foot,
             profiler=furnishing.profiler,
             time_step_s=furnishing.time_step_s,

@@ -7,6 +7,7 @@ from functools import cache
 
 import pytest
 
+from tests.perfect_world import perfect
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
@@ -18,9 +19,10 @@ SHORT_JOB_SEED = 5
 
 
 def short_job_scenario(preset: str) -> Scenario:
-    """The S groove with another scanner, calibrated from as few scans as there may be; its first 30 mm are welded."""
+    """The S groove with another scanner, calibrated from as few scans as there may be, in a perfect world; its first 30 mm are
+    welded."""
     scanner = f"scanner: !RenderedScanner {{preset: {preset}, width: 824, height: 616}}"
-    return load_scenario("s_groove", f"{SHORTER}\n{scanner}")
+    return perfect(load_scenario("s_groove", f"{SHORTER}\n{scanner}"))
 
 
 @pytest.fixture(scope="session")

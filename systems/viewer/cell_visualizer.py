@@ -117,9 +117,9 @@ class CellVisualizer(LeafSystem):
             self._meshcat.SetProperty(f"{ROOT}/scan/{self._drawn.scan:02d}", "visible", False, time)
         if scan.sequence <= self._drawn.scan:
             return
-        points = scan.points_C.reshape(-1, 3)
+        points = scan.points_C.reshape(-1, 3).astype(np.float64)
         points = points[np.isfinite(points[:, 2])]
-        points = points[:: max(1, len(points) // self._config.cloud_points)].astype(float)
+        points = points[:: max(1, len(points) // self._config.cloud_points)]
         X_BC = status.X_BC or self._X_BC_guess
         cloud = PointCloud(len(points), Fields(BaseField.kXYZs))
         cloud.mutable_xyzs()[:] = (status.correction.points(points) @ X_BC.rotation().matrix().T + X_BC.translation()).T

@@ -10,6 +10,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
+from tests.perfect_world import perfect
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.cell import Cell, build_cell
@@ -41,8 +42,8 @@ Q_HOME = np.deg2rad([190.0, -120.0, 135.0, -105.0, -90.0, 90.0])
 
 
 def scenario(*overrides: str) -> Scenario:
-    """The shipped S groove with changes."""
-    return load_scenario("s_groove", "\n".join((WELD_ONLY, *overrides)))
+    """The shipped S groove with changes, in a perfect world."""
+    return perfect(load_scenario("s_groove", "\n".join((WELD_ONLY, *overrides))))
 
 
 @lru_cache(maxsize=1)

@@ -195,12 +195,12 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     Returns the true pose of the scanner in its carrier's frame: X_BC, X_FC or X_LC.
     """
     world = build.require(SimulatedWorld)
-    preset = config.device(build.rng)
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
     error = random_pose_error(
         build.rng, config.mounting_translation_mm * 1e-3, np.deg2rad(config.mounting_rotation_deg)
     )
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
+    preset = config.device(build.rng)
     k = drake_intrinsics(preset)
     carrier = _carrier(world, config.mounted_on)
     _show_housing(world, X_BC, carrier)
