@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.published.calibration import hand_to_touch, tablet_stage1, tablet_stage2
 from weldcal.calibration.tablet.published.chain import DH_NAMES, HTM_NAMES, place_landmarks, search_range
@@ -56,8 +56,7 @@ def reproduction(tmp_path_factory: pytest.TempPathFactory) -> Reproduction:
 
 
 def test_the_typed_tables_are_those_of_the_shared_file(touches: TabletTouches) -> None:
-    if not PUBLISHED.is_file():
-        pytest.skip("the measured data (shared/data beside the repository) is not here")
+    require_data(PUBLISHED)
     d = np.load(PUBLISHED)
     for mine, theirs in (
         (touches.uv_px, d["uv"]),
