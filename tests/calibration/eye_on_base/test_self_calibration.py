@@ -193,14 +193,14 @@ def test_the_covariance_holds_what_the_correction_leaves_open() -> None:
     assert np.mean(points) / 3.0 > 0.5
 
 
-FIELD_M, REFERENCE_M, WARP_M = 0.5, 0.4, 0.8e-3
-"""Half the width that the scanner sees over its distance; where the warp is stated; 0.2 % of the distance, as measured on a real one."""
+FIELD, REFERENCE_M, WARP_M = 0.5, 0.4, 1.6e-3
+"""Half the width that the scanner sees over its distance; where the warp is stated; 0.4 % of that, twice what a real one showed."""
 
 
 def _warped(p_C: np.ndarray, device: int) -> np.ndarray:
     """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x and y."""
     image = device_warp((401, 401), WARP_M, device)
-    column, row = ((1.0 + p_C[k] / p_C[2] / FIELD_M) * 200.0 for k in (0, 1))
+    column, row = ((1.0 + p_C[k] / p_C[2] / FIELD) * 200.0 for k in (0, 1))
     off = float(map_coordinates(image, [[row], [column]], order=3, mode="nearest")[0])
     return np.asarray(p_C * (1.0 + off * (p_C[2] / REFERENCE_M) ** 2 / p_C[2]))
 
@@ -229,24 +229,24 @@ def _warped_cell(device: int, n: int, seed: int) -> tuple[list[Observation], dic
 
 def test_held_out_errors_are_those_of_new_scans_where_no_correction_of_ours_is_exact() -> None:
     """The scanner errs by another model than the one that is fitted."""
-    told, corrected = [], 0
-    for device in range(5):
-        observations, patterns = _warped_cell(device, 18, 0)
+    told = []
+    for device in range(10):
+        observations, patterns = _warped_cell(device, 10, 0)
         rigid = estimate_eye_on_base(observations)
         scanner, _, estimate = apply_self_calibration(observations, rigid, patterns)
         assert scanner is not None
-        corrected += scanner.accepted is not None
+        if scanner.accepted is None:
+            continue
         new, _ = _warped_cell(device, 60, 1)
-        seen = new if scanner.accepted is None else [corrected_observation(scanner.accepted, o) for o in new]
         before, after = (
-            float(np.sqrt(np.mean(e**2)))
-            for e in (position_errors(rigid.X_BC, new), position_errors(estimate.X_BC, seen))
+            position_errors(rigid.X_BC, new),
+            position_errors(estimate.X_BC, [corrected_observation(scanner.accepted, o) for o in new]),
         )
-        assert after <= 1.05 * before, f"the correction of device {device} does harm: {scanner.sentence}"
-        told.append(float(np.sqrt(np.mean(estimate.held_out.position_m**2))) / after)
-    assert corrected >= 1, "the case is about corrections"
-    # 18 poses know an rms to some 14 %, five devices to 6 %; the order is chosen by the errors that are told, which makes them
-    # 14 % too small at most (flange_real_data); a fit of 17 poses is a few per cent worse than one of 18.
+        assert np.mean(after**2) <= 1.1 * np.mean(before**2), f"device {device} is made worse: {scanner.sentence}"
+        told.append(float(np.sqrt(np.mean(estimate.held_out.position_m**2) / np.mean(after**2))))
+    assert len(told) >= 4, "the case is about corrections"
+    # What chooses the order is told as well, which makes it 14 % too small at most on real scans; the rest is chance: ten
+    # poses know an rms to some 20 %, five devices to 10 %. Errors of poses that were fitted would be 0.62 of the true ones.
     assert 0.72 <= np.mean(told) <= 1.25
 
 
