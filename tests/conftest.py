@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.browser import browser
+from tests.places import SHARED_DATA, require_data
 from tests.short_job import short_jobs
 from tests.ur_rtde import NEEDS_UR_RTDE
 
@@ -20,6 +21,19 @@ __all__ = ["browser", "short_jobs"]
 
 # Imports and collected tests stay for good: to look through all of them again and again takes a third of what collecting takes.
 gc.disable()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The mark `needs` of tests.places."""
+    config.addinivalue_line("markers", "needs_data(path): skipped where the measured data are absent, and failed in CI")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Before any fixture is made, the data must be there."""
+    for mark in item.iter_markers("needs_data"):
+        require_data(*mark.args)
+
 
 SLOWEST = ("test_cell.py", "test_readme.py")  # a core that is left with one of these at the end keeps the other waiting
 
@@ -49,11 +63,9 @@ def repository() -> Path:
 
 @pytest.fixture(scope="session")
 def shared_data(repository: Path) -> Path:
-    """The folder of measured data beside the repository; the test is skipped where there is none."""
-    folder = repository.parent / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip("the measured data (shared/data beside the repository) is not here")
-    return folder
+    """The folder of measured data beside the repository; where there is none the test is skipped, and fails in CI."""
+    require_data(SHARED_DATA)
+    return SHARED_DATA
 
 
 @dataclass(frozen=True)

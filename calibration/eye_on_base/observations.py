@@ -15,7 +15,6 @@ from weldcal.calibration.flange.holes import HolePattern, find_holes
 from weldcal.calibration.flange.observation import Observation, observation_from_fit
 from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arrays import Array
-from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 
 _SEARCH_M = 0.06  # about where a calibration expects the flange; a larger error is searched for in the whole scan
@@ -45,14 +44,13 @@ def see_flanges(
     """Fit the flange in every cloud of a dataset, or use its pairs as they are.
 
     ``X_BC`` is a calibration that says where to look first; a scan in which it leads nowhere is searched whole. Without
-    ``holes`` no hole pattern is looked for. Deterministic for ``seed``. ``tell`` is told the fraction done. Raises
-    InputError, before any work, naming the first cloud file that is damaged.
+    ``holes`` no hole pattern is looked for. Deterministic for ``seed``. ``tell`` is told the fraction done. A damaged file
+    is refused with its reason, as is a scan that shows no flange.
     """
     if data.pairs:
         return FlangeObservations(
             tuple(Observation(p.id, p.X_BR, p.p_CR) for p in data.pairs), {}, {}, {}, data.refused
         )
-    _check_clouds(data)
     observations: list[Observation] = []
     fits: dict[str, FlangeFit] = {}
     patterns: dict[str, HolePattern] = {}
@@ -60,10 +58,10 @@ def see_flanges(
     refused = list(data.refused)
     for k, id in enumerate(data.clouds):
         tell(k / len(data.clouds))
-        points = data.cloud(id)
         try:
+            points = data.cloud(id)
             fit = _fit(points, standard, _guess(data, id, standard, X_BC), seed, whole=X_BC is not None)
-        except FlangeNotFound as e:
+        except (CloudError, FlangeNotFound) as e:
             refused.append((id, e.reason))
             continue
         fits[id] = fit
@@ -92,23 +90,6 @@ def _fit(points: Array, standard: FlangeStandard, guess: FlangeGuess | None, see
         if guess is None or not whole:
             raise
         return fit_flange(points, standard, config=config)
-
-
-def _check_clouds(data: Dataset) -> None:
-    """Read every file before any work: the user must replace a damaged one, unlike a scan in which no flange is found.
-
-    Raises:
-        InputError: naming the first such file, what is wrong with it and how many there are.
-    """
-    bad: list[str] = []
-    for id in data.clouds:
-        try:
-            data.cloud(id)
-        except CloudError as e:
-            bad.append(f"{id}: {e.reason}")
-    if bad:
-        more = f" ({len(bad) - 1} more clouds are damaged too)" if len(bad) > 1 else ""
-        raise InputError(f"A cloud cannot be used{more}; replace it, or remove it together with its pose: {bad[0]}")
 
 
 def _guess(data: Dataset, id: str, standard: FlangeStandard, X_BC: RigidTransform | None) -> FlangeGuess | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.hardware.computer_pauses import PauseWatch
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
@@ -21,7 +22,15 @@ from weldcal.tools.outcomes.options import RunOptions
 
 # An address of its own: this module waits for no other.
 HOST = "127.0.0.41"
-SAME_MM = 0.05
+# Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the edge of
+# the flange, 0.02 mm of the fit (test_cell). The largest error of a torch is a single tick's: 2 ms at 16 mm/s are 0.03 mm more.
+SAME_MM = {
+    "X_BC_error_mm": 0.02,
+    "X_BC_error_at_work_mm": 0.02,
+    "torch_mean_mm": 0.02,
+    "torch_max_mm": 0.05,
+    "plan_max_mm": 0.04,
+}
 PACE = 0.5  # a faster one leaves the link less time than a busy machine of two cores may take
 # how it shows that the computer stood still: in the worker, in the cell, or in the controller while the worker's core did
 STOOD_STILL = (
@@ -30,6 +39,7 @@ STOOD_STILL = (
     "GUARD: the script on the controller stopped the arm, because no new command",
 )
 FELL_BEHIND_S = 1.0  # of the job's forty
+WATCH = PauseWatch()
 NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 
 
@@ -51,13 +61,16 @@ def finished_job(folder: Path, robot: str, pace: float | None) -> DemoResult:
 def emulated_job(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
     """The job on the emulated controller.
 
-    Where the computer as a whole stands still for a tenth of a second the link stops the arm, as it must; then the job is
-    done again. So it is where the computer had no time for the cell, and the arm went on for long with what it was told last.
+    Where the computer as a whole stands still for a tenth of a second the link stops the arm, as it must; the job is done
+    once more only where a bystander saw that.
     """
-    for _ in range(3):
-        job = finished_job(tmp_path_factory.mktemp("emulated") / "run", f"emulated@{HOST}", PACE)
+    for _ in range(2):
+        WATCH.pauses.clear()
+        with WATCH:
+            job = finished_job(tmp_path_factory.mktemp("emulated") / "run", f"emulated@{HOST}", PACE)
         assert job.run.clock is not None
-        if not str(job.summary().get("reason")).startswith(STOOD_STILL) and job.run.clock.lost_s < FELL_BEHIND_S:
+        stopped = str(job.summary().get("reason")).startswith(STOOD_STILL) or job.run.clock.lost_s > FELL_BEHIND_S
+        if not (stopped and WATCH.pauses):
             break
     return job
 
@@ -67,16 +80,17 @@ def test_the_same_job_on_the_emulated_robot_ends_with_the_same_figures(
 ) -> None:
     emulated = emulated_job.summary()
     simulated = finished_job(tmp_path / "run", "simulated", None).summary()
-    assert emulated["state"] == "done", emulated.get("reason")
+    assert emulated["state"] == "done", f"{emulated.get('reason')} ({WATCH.sentence})"
     assert simulated["state"] == "done", simulated.get("reason")
-    for key in ("X_BC_error_mm", "X_BC_error_at_work_mm", "torch_mean_mm", "torch_max_mm", "plan_max_mm"):
-        assert emulated[key] == pytest.approx(simulated[key], abs=SAME_MM), key
-    # The demo's promise, with a perfect scanner.
+    for key, same_mm in SAME_MM.items():
+        assert emulated[key] == pytest.approx(simulated[key], abs=same_mm), key
+    # The demo's promise.
     assert simulated["X_BC_error_mm"] < 0.15
-    assert simulated["torch_max_mm"] < 0.8
+    assert simulated["torch_mean_mm"] <= 0.10
+    assert simulated["torch_max_mm"] <= 0.30
     # Not only are the errors of one size: it is the same scanner at the same place.
     ours, theirs = np.array(emulated["X_BC"]), np.array(simulated["X_BC"])
-    assert np.linalg.norm(ours[:3, 3] - theirs[:3, 3]) < 1e-3 * SAME_MM
+    assert np.linalg.norm(ours[:3, 3] - theirs[:3, 3]) < 1e-3 * SAME_MM["X_BC_error_mm"]
     assert emulated["n_scans"] == simulated["n_scans"]
     assert emulated["robot"] == "an emulated controller"
 

@@ -9,7 +9,7 @@ import numpy as np
 import open3d
 import pytest
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import PAPER_RADIUS_M, STANDARDS, face_points, flange_mesh, flange_ring, get_flange
 
@@ -111,7 +111,7 @@ def test_face_points_fill_the_flat_face_and_nothing_else() -> None:
     assert len(p) == pytest.approx(area / (spacing**2 * math.sqrt(0.75)), rel=0.01)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the vendors' CAD is not on this machine")
+@needs(DATA)
 def test_the_holes_lie_where_a_vendor_drew_them() -> None:
     p = np.asarray(open3d.io.read_point_cloud(str(DATA / "cad_flange_aubo_i5_sampled_m.pcd")).points)
     p = p[np.isfinite(p).all(axis=1)]

@@ -88,8 +88,9 @@ def test_the_torch_keeps_to_a_seam_that_the_plan_got_wrong(short_job: DemoResult
     assert weld.error is not None
     assert weld.plan_error.max_m > 0.5e-3, "the groove is not where the drawing says"
     distance = np.hypot(weld.error.lateral, weld.error.height)
-    assert distance.mean() < 0.3e-3
-    assert distance.max() < 0.8e-3
+    # The demo's targets, in space; 0.03 and 0.05 mm are typical.
+    assert distance.mean() <= 0.10e-3
+    assert distance.max() <= 0.30e-3
     assert weld.error.s[-1] - weld.error.s[0] > 0.028, "nearly all of the 30 mm is welded"
 
 

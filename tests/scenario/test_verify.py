@@ -14,7 +14,7 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result, save_result
 from weldcal.calibration.eye_on_base.observations import see_flanges
@@ -31,7 +31,7 @@ from weldcal.tools.outcomes.calibration import VerifyReport
 
 DATA = SHARED_DATA / "flange"
 AUBO, UR10E = DATA / "aubo_i5_phoxi_s", DATA / "ur10e_phoxi_m"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
+pytestmark = needs(DATA)
 
 
 def _part(source: Path, folder: Path, rows: slice) -> Path:

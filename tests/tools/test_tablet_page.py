@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
+import http.client
 import io
 import re
+import socket
 import threading
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from tests.browser import Browser
 from tests.places import ROOT
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
-from weldcal.tools.commands.tablet.page.serve import TabletServer, addresses, is_loopback, open_server, page
+from weldcal.tools.commands.tablet.page.serve import LARGEST_CSV, TabletServer, open_server, page, tablet_host
 
 PAGE = ROOT / "tools/commands/tablet/page/tablet.html"
 WIDTH, HEIGHT = 1000, 700
@@ -193,7 +193,7 @@ def server(tmp_path: Path) -> Iterator[TabletServer]:
 
 
 def test_touches_sent_to_the_computer_are_a_file_there(browser: Browser, server: TabletServer) -> None:
-    address = f"http://127.0.0.1:{server.server_address[1]}/"
+    address = server.address("127.0.0.1")
     opened(browser, 1.0, address)
     landmarks = enter(browser)
     for k in range(4):
@@ -204,21 +204,90 @@ def test_touches_sent_to_the_computer_are_a_file_there(browser: Browser, server:
     assert path.read_text() == browser.run("return csv()")
 
 
-def test_the_server_takes_nothing_but_touches(server: TabletServer) -> None:
-    address = f"http://127.0.0.1:{server.server_address[1]}/"
-    assert "default-src 'none'" in urllib.request.urlopen(address).read().decode()
-    for path, kind, body in (
-        ("touches", "text/plain", b"landmark,time_utc,\n"),
-        ("touches", "text/csv", b"something else"),
-        ("elsewhere", "text/csv", b"landmark,time_utc,\n"),
-    ):
-        request = urllib.request.Request(address + path, body, {"Content-Type": kind}, method="POST")
-        with pytest.raises(urllib.error.HTTPError) as refused:
-            urllib.request.urlopen(request)
-        refused.value.close()
-    with pytest.raises(urllib.error.HTTPError) as missing:
-        urllib.request.urlopen(address + "../serve.py")
-    missing.value.close()
+TOUCHES = b"landmark,time_utc,\n"
+
+
+def answered(
+    server: TabletServer, method: str, path: str, body: bytes = b"", length: str | None = None, **headers: str
+) -> tuple[int, str]:
+    """Status and text of one request, sent as written; `Host` and `Content-Length` are right unless given."""
+    port = server.server_address[1]
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    connection.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+    sent = {"Host": f"127.0.0.1:{port}"} | ({"Content-Length": str(len(body))} if body else {}) | headers
+    for name, value in sent.items():
+        connection.putheader(name.replace("_", "-"), value)
+    connection.endheaders()
+    connection.send(body)
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, text
+
+
+def test_the_page_is_found_under_its_token_only(server: TabletServer) -> None:
+    status, text = answered(server, "GET", f"/{server.token}/")
+    assert status == 200
+    assert "default-src 'none'" in text
+    assert len(server.token) >= 20
+    other = open_server("127.0.0.1", 0, server.folder, lambda _: None)
+    other.server_close()
+    assert other.token != server.token
+    paths = (
+        "/",
+        "/tablet.html",
+        f"/{server.token}",
+        f"/{server.token}/../serve.py",
+        f"/{server.token}x/",
+        "/" + "x" * 22 + "/",
+    )
+    for path in paths:
+        status, text = answered(server, "GET", path)
+        assert status == 404, path
+        assert server.token not in text
+    for method in ("PUT", "DELETE", "OPTIONS", "HEAD", "TRACE"):
+        assert answered(server, method, f"/{server.token}/")[0] == 501
+
+
+def test_the_server_takes_nothing_but_touches_from_its_own_page(server: TabletServer) -> None:
+    port, path = server.server_address[1], f"/{server.token}/touches"
+    csv = {"Content_Type": "text/csv"}
+    refused = [
+        (path, TOUCHES, {"Content_Type": "text/plain"}, 415),
+        (path, b"something else", csv, 400),
+        ("/touches", TOUCHES, csv, 404),
+        (f"/{server.token}/elsewhere", TOUCHES, csv, 404),
+        (path, TOUCHES, csv | {"Origin": "http://example.org"}, 403),
+        (path, TOUCHES, csv | {"Origin": "null"}, 403),
+        (path, TOUCHES, csv | {"Origin": f"http://127.0.0.1:{port + 1}"}, 403),
+        (path, TOUCHES, csv | {"Host": f"example.org:{port}"}, 421),
+        (path, TOUCHES, csv | {"Host": "127.0.0.1"}, 421),
+        (path, TOUCHES, csv | {"Host": f"0.0.0.0:{port}"}, 421),
+        (path, b"", csv, 411),
+        (path, b"", csv | {"Content_Length": "-1"}, 411),
+        (path, b"", csv | {"Transfer_Encoding": "chunked"}, 411),
+        (path, b"", csv | {"Content_Length": "0"}, 413),
+        (path, b"", csv | {"Content_Length": str(LARGEST_CSV + 1)}, 413),
+        (path, b"", csv | {"Content_Length": "9" * 4000}, 413),
+    ]
+    for where, body, headers, status in refused:
+        assert answered(server, "POST", where, body, **headers)[0] == status, (where, headers)
+    assert not server.folder.exists()
+    for origin in ({}, {"Origin": f"http://127.0.0.1:{port}"}, {"Origin": f"http://localhost:{port}"}):
+        assert answered(server, "POST", path, TOUCHES, **csv, **origin)[0] == 200
+    assert answered(server, "POST", path, TOUCHES, **csv, Host=f"localhost:{port}")[0] == 200
+    assert len(list(server.folder.iterdir())) == 4
+
+
+def test_a_list_that_was_cut_on_its_way_is_not_written(server: TabletServer) -> None:
+    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=5) as line:
+        head = (
+            f"POST /{server.token}/touches HTTP/1.1\r\nHost: 127.0.0.1:{server.server_address[1]}\r\n"
+            "Content-Type: text/csv\r\nContent-Length: 500\r\n\r\n"
+        )
+        line.sendall(head.encode() + TOUCHES)
+        line.shutdown(socket.SHUT_WR)
+        assert b" 400 " in line.recv(1000)
     assert not server.folder.exists()
 
 
@@ -229,15 +298,19 @@ def test_a_taken_port_is_one_sentence(server: TabletServer, tmp_path: Path) -> N
     assert f"Port {port} is in use on 127.0.0.1. Choose another with --port." in finished.output
     with pytest.raises(InputError, match="not an address of this machine"):
         open_server("203.0.113.7", 0, tmp_path, lambda _: None)
+    for host in ("999.1.1.1", "192.168.1", "my-computer", "http://127.0.0.1", "127.0.0.1 ", ""):
+        with pytest.raises(InputError, match="is not an IP address"):
+            open_server(host, 0, tmp_path, lambda _: None)
     with pytest.raises(InputError, match="from 0 to 65535"):
         open_server("127.0.0.1", 70000, tmp_path, lambda _: None)
 
 
-def test_only_this_machine_is_let_in_unless_told_otherwise() -> None:
-    assert is_loopback("127.0.0.1")
-    assert is_loopback("localhost")
-    assert not is_loopback("0.0.0.0")
-    assert addresses("::1", 80) == ["http://[::1]:80/"]
+def test_only_this_machine_is_let_in_unless_told_otherwise(tmp_path: Path) -> None:
+    assert tablet_host("127.0.0.1") == "127.0.0.1"
+    assert tablet_host("0.0.0.0") != "0.0.0.0"
+    with open_server("localhost", 0, tmp_path, lambda _: None) as made:
+        assert made.server_address[0] == "127.0.0.1"
+        assert made.address("::1").startswith("http://[::1]:")
 
 
 def test_the_page_names_no_outside_address() -> None:

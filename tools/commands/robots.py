@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
+from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
@@ -46,7 +47,7 @@ def chosen_robot(
         pace: controller seconds per second of the wall clock; other than 1 only for an emulated controller.
 
     Raises:
-        InputError: the options cannot be combined.
+        InputError: the options cannot be combined, or the address is none.
         RobotRefused: the controller does not answer, or does not allow the job; nothing has moved.
     """
     if word is None and not isinstance(scenario.robot, UrRtde) and not scenario.robot.SIMULATED:
@@ -67,7 +68,8 @@ def chosen_robot(
         return
     kind, _, address = word.partition("@")
     emulated = kind == EMULATED
-    if pace is not None and not emulated and not word.startswith("127."):
+    host = loopback_address(address or EMULATOR_HOST) if emulated else controller_address(word)
+    if pace is not None and not emulated and not is_loopback(host):
         raise InputError("A real controller runs in real time: --pace is for an emulated one, at a loopback address.")
     if pace is None:
         pace = EMULATED_PACE if emulated else 1.0
@@ -75,9 +77,8 @@ def chosen_robot(
     if not dry_run:
         require_ur_rtde()
     if not emulated:
-        yield _at(word, f"the controller at {word}", scenario, dry_run=dry_run, pace=pace)
+        yield _at(host, f"the controller at {host}", scenario, dry_run=dry_run, pace=pace)
         return
-    host = address or EMULATOR_HOST
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
     with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace):

@@ -1,5 +1,6 @@
 """Guards that keep motion bounded: seam conditioning, arm singularity and joint slew limits."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -45,19 +46,17 @@ class ArmGuardConfig:
     Attributes:
         sigma_slow, sigma_stop: least singular value of the length-scaled Jacobian where slowing begins, and the stop.
         characteristic_length_m: what makes m/s and rad/s comparable: translations are divided by it.
-        damping: lambda of the damped least squares at sigma = 0; it fades to none at sigma_slow.
     """
 
     sigma_slow: float = 0.08
     sigma_stop: float = 0.03
     characteristic_length_m: float = 0.5
-    damping: float = 0.01
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.sigma_stop < self.sigma_slow:
+        if not 0.0 < self.sigma_stop < self.sigma_slow < math.inf:
             raise GuardError("The arm guard needs 0 < sigma_stop < sigma_slow.")
-        if self.characteristic_length_m <= 0.0 or self.damping < 0.0:
-            raise GuardError("The arm guard needs a positive characteristic length and a damping of zero or more.")
+        if not 0.0 < self.characteristic_length_m < math.inf:
+            raise GuardError("The arm guard needs a positive characteristic length.")
 
     @cached_property
     def row_scale(self) -> Array:
@@ -108,8 +107,8 @@ def guarded_joint_velocity(
         text = f"The arm was stopped {sigma_min:.3f} from a singularity; start from another arm configuration."
         return GuardedVelocity(rest, sigma_min, 0.0, True, text)
     scale = min(1.0, (sigma_min - limits.sigma_stop) / (limits.sigma_slow - limits.sigma_stop))
-    damping = limits.damping * max(0.0, 1.0 - sigma_min / limits.sigma_slow)
-    q_dot = scale * (Vt.T @ ((sigma / (sigma**2 + damping**2)) * (U.T @ (row_scale * velocity))))
+    # Not damped, which would turn the twist: sigma is above sigma_stop here, and the scale ends at zero there.
+    q_dot = scale * (Vt.T @ ((U.T @ (row_scale * velocity)) / sigma))
     reason = f"Near a singularity: the arm moves at {scale:.0%}." if scale < 1.0 else None
     excess = float(np.max(np.abs(q_dot) / np.maximum(bound, 1e-9)))
     if excess > 1.0:

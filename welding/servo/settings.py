@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from numbers import Real
 
 import numpy as np
 
@@ -17,10 +18,17 @@ class ServoConfigError(InputError):
     """A servo setting that cannot be used."""
 
 
-def _require_positive(group: str, settings: object, signed: tuple[str, ...] = ()) -> None:
-    """Raise ServoConfigError unless every float of a group is finite and positive; those in `signed` are not checked."""
+def _check_numbers(group: str, settings: object, signed: tuple[str, ...] = (), zero: tuple[str, ...] = ()) -> None:
+    """Raise ServoConfigError unless every number of a group is finite and positive; `zero` may be 0, `signed` anything."""
     for name, value in vars(settings).items():
-        if name not in signed and isinstance(value, float) and not (math.isfinite(value) and value > 0.0):
+        if isinstance(value, bool) or not isinstance(value, Real):
+            continue
+        number = float(value)
+        if not math.isfinite(number):
+            raise ServoConfigError(f"The servo setting '{group}{name}' must be a finite number, not {value}.")
+        if name in zero and number < 0.0:
+            raise ServoConfigError(f"The servo setting '{group}{name}' must be zero or more, not {value}.")
+        if name not in (*signed, *zero) and number <= 0.0:
             raise ServoConfigError(f"The servo setting '{group}{name}' must be a positive number, not {value}.")
 
 
@@ -43,6 +51,15 @@ class ToolGeometry:
     tip_drop_m: float = 3.97e-3
     torch_clearance_m: float | None = None
     side_offset_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        # A plan of the tip's own line has no seat; the least torch offset is the servo's to check.
+        _check_numbers(
+            "tool.",
+            self,
+            signed=("torch_offset_m", "torch_height_m", "torch_clearance_m", "side_offset_m"),
+            zero=("tip_seat_height_m",),
+        )
 
 
 @dataclass(frozen=True)
@@ -82,6 +99,11 @@ class TouchConfig:
     zero_frames: int = 0
     zero_limit_m: float = 1.0e-3
 
+    def __post_init__(self) -> None:
+        _check_numbers("touch.", self, signed=("offset_m",), zero=("zero_frames", "settle_s"))
+        if self.press_ratio <= 1.0:
+            raise ServoConfigError(f"The servo setting 'touch.press_ratio' must be above 1, not {self.press_ratio}.")
+
 
 @dataclass(frozen=True)
 class ContactConfig:
@@ -103,7 +125,7 @@ class ContactConfig:
     regain_after_s: float = 0.12
 
     def __post_init__(self) -> None:
-        _require_positive("contact.", self)
+        _check_numbers("contact.", self)
 
 
 @dataclass(frozen=True)
@@ -121,7 +143,7 @@ class GapConfig:
     end_window_m: float = 6.0e-3
 
     def __post_init__(self) -> None:
-        _require_positive("gap.", self)
+        _check_numbers("gap.", self)
 
 
 @dataclass(frozen=True)
@@ -143,7 +165,7 @@ class FaultLimits:
     torch_error_m: float = 4.0e-3
 
     def __post_init__(self) -> None:
-        _require_positive("faults.", self)
+        _check_numbers("faults.", self)
 
 
 @dataclass(frozen=True)
@@ -165,7 +187,7 @@ class DeflectionControl:
     slew_m_s2: float = 40.0e-3
 
     def __post_init__(self) -> None:
-        _require_positive("deflection.", self)
+        _check_numbers("deflection.", self)
 
 
 @dataclass(frozen=True)
@@ -175,7 +197,8 @@ class TorchControl:
     Attributes:
         k_b, k_h: feedback of its lateral and height error, 1/s; feedback_limit_m: error at which it saturates.
         k_roll: work-angle feedback, 1/s; work_angle_rad: wanted roll about the chord.
-        ignition_error_m: the arc starts only with the torch this close to the seam.
+        ignition_error_m: the arc starts only with the torch this close to the seam; ignition_window_m: a weld whose arc
+            does not start within so much of the seam is a fault.
     """
 
     k_b: float = 4.0
@@ -184,9 +207,10 @@ class TorchControl:
     k_roll: float = 2.0
     work_angle_rad: float = 0.0
     ignition_error_m: float = 1.5e-3
+    ignition_window_m: float = 10.0e-3
 
     def __post_init__(self) -> None:
-        _require_positive("torch.", self, signed=("work_angle_rad",))
+        _check_numbers("torch.", self, signed=("work_angle_rad",))
 
 
 @dataclass(frozen=True)
@@ -217,7 +241,7 @@ class MotionLimits:
     ramp_s: float = 0.15
 
     def __post_init__(self) -> None:
-        _require_positive("limits.", self)
+        _check_numbers("limits.", self)
 
 
 @dataclass(frozen=True)
@@ -230,7 +254,7 @@ class LawWeights:
     omega: float = 1.0e-3
 
     def __post_init__(self) -> None:
-        _require_positive("weights.", self)
+        _check_numbers("weights.", self)
 
 
 @dataclass(frozen=True)
@@ -249,7 +273,7 @@ class SteeringConfig:
     reach_m: float = 8.0e-3
 
     def __post_init__(self) -> None:
-        _require_positive("steering.", self)
+        _check_numbers("steering.", self)
 
 
 @dataclass(frozen=True)
@@ -267,7 +291,7 @@ class FeltPathConfig:
     full_rad: float = math.radians(30.0)
 
     def __post_init__(self) -> None:
-        _require_positive("felt_path.", self)
+        _check_numbers("felt_path.", self)
 
 
 @dataclass(frozen=True)
@@ -301,11 +325,14 @@ class ServoConfig:
     law: str = "guarded"
 
     def __post_init__(self) -> None:
-        _require_positive("", self)
-        if self.weave.peak_speed_m_s > 0.7 * self.limits.omega_max_rad_s * self.tool.torch_offset_m:
-            raise ServoConfigError("The weave needs more turning than the limit allows: make it slower or smaller.")
+        _check_numbers("", self)
+        for group in ("refinement", "plan_fit", "windows"):
+            _check_numbers(f"{group}.", getattr(self, group), zero=("frames_to_commit", "back_up_m"))
+        _check_numbers("refinement.corner.", self.refinement.corner)
         if self.tool.torch_offset_m < 0.010:
             raise ServoConfigError("The torch must trail the tip by at least 10 mm (tool.torch_offset_m).")
+        if self.weave.peak_speed_m_s > 0.7 * self.limits.omega_max_rad_s * self.tool.torch_offset_m:
+            raise ServoConfigError("The weave needs more turning than the limit allows: make it slower or smaller.")
 
     @property
     def clearance_m(self) -> float:

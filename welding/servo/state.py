@@ -167,4 +167,4 @@ class WeldingState:
     lit_at: float = math.nan
     V: Array = field(default_factory=lambda: np.zeros(6))
     V_stop: Array = field(default_factory=lambda: np.zeros(6))
-    stopped_at: float = 0.0
+    stopped_ticks: int = 0

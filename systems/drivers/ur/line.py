@@ -8,7 +8,7 @@ import threading
 import time
 from types import TracebackType
 
-from weldcal.models.errors import InputError
+from weldcal.systems.addresses import controller_address
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
 
 RELEASE_WAIT_S = 0.3
@@ -18,12 +18,11 @@ class Line:
     """One connection; each read or write call ends within `timeout_s`, even where data arrive byte by byte.
 
     Raises (all methods):
-        RobotUnreachable: nothing answers; the message says what to check.
+        AddressError: the host is not an address. RobotUnreachable: nothing answers; the message says what to check.
     """
 
     def __init__(self, host: str, port: int, service: str, timeout_s: float) -> None:
-        if not host.strip():
-            raise InputError("Give the robot's host name or IP address, such as 192.168.56.101.")
+        host = controller_address(host)
         self._host, self._port, self._service, self._timeout_s = host, port, service, timeout_s
         self._inbox = bytearray()
         address = _resolve(host, port, timeout_s)

@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSys
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import InputError
+from weldcal.systems.addresses import controller_address, is_loopback
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
@@ -135,7 +136,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     require_ur_rtde()
     if not config.host:
         raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
-    if config.pace != FULL_PACE and not config.host.startswith("127."):
+    if config.pace != FULL_PACE and not is_loopback(controller_address(config.host)):
         raise InputError("Only the emulator can run at another pace: leave pace at 1 for a robot.")
     if config.process_output is not None and not 0 <= config.process_output < N_OUTPUTS:
         raise InputError(

@@ -71,7 +71,7 @@ class WeldingVelocityServo(LeafSystem):
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(ServoReport()))
         ticket = {self.abstract_state_ticket(self._state)}
-        self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket)
+        self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket | {self._job.ticket()})
         self.DeclareStateOutputPort("servo_report", self._state)
         self.DeclareVectorOutputPort("telemetry", len(TELEMETRY), self._telemetry, ticket)
         self.DeclareVectorOutputPort("torch_on", 1, self._torch, ticket | {self._job.ticket()})
@@ -96,8 +96,10 @@ class WeldingVelocityServo(LeafSystem):
         state.get_mutable_abstract_state(self._state).set_value(report)
 
     def _velocity(self, context: Context, output: BasicVector) -> None:
+        # The last report stays after a fault; its motion must not, when the job leaves the weld before the ramp has ended.
+        job: JobCommand = self._job.Eval(context)
         command = context.get_abstract_state(self._state).get_value().command
-        output.SetFromVector(np.zeros(6) if command is None else command.V_BT)
+        output.SetFromVector(np.zeros(6) if command is None or job.mode != "weld" else command.V_BT)
 
     def _telemetry(self, context: Context, output: BasicVector) -> None:
         report: ServoReport = context.get_abstract_state(self._state).get_value()

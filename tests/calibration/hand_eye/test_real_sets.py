@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.hand_eye.files import read_pairs
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, opencv_held_out
 from weldcal.models.errors import InputError
@@ -33,8 +33,7 @@ BARS = {
 
 @pytest.fixture(scope="module")
 def report() -> HandEyeBenchmark:
-    if not DATA.is_dir():
-        pytest.skip("The hand-eye data of others are not here.")
+    require_data(DATA)
     return run_hand_eye_benchmark(DATA, quick=True)
 
 
@@ -46,8 +45,7 @@ def test_every_set_is_as_good_as_the_best_opencv_method_of_each_column(report: H
 
 def test_opencv_reaches_the_published_bar_on_the_same_folds() -> None:
     path = DATA / "ros_industrial_charuco_static_camera"
-    if not path.is_dir():
-        pytest.skip("The hand-eye data of others are not here.")
+    require_data(path)
     pairs = read_pairs(path)
     held = {m: opencv_held_out(m, pairs.F, pairs.G) for m in METHODS}
     deg, mm = min(h.rms_deg for h in held.values()), min(1e3 * h.rms_translation for h in held.values())

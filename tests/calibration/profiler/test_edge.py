@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.profiler.edge.features import extract_edge
 from weldcal.calibration.profiler.edge.joint import EdgeEstimate, edge_crb, edge_joint
 from weldcal.calibration.profiler.edge.linear import edge_linear
@@ -26,7 +26,7 @@ from weldcal.models.errors import InputError
 DATA = SHARED_DATA / "profiler"
 MM = 1e-3
 SIGMA_ROBOT, SIGMA_XZ = 0.03 * MM, (0.05 * MM, 0.06 * MM)
-needs_data = pytest.mark.skipif(not DATA.exists(), reason="The published profiler data are not here.")
+needs_data = needs(DATA)
 
 TRUTH = EdgeState(
     Rotation.from_euler("xyz", [170.0, -9.0, 52.0], degrees=True).as_matrix(),

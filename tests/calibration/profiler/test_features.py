@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.errors import FeatureNotFound
 from weldcal.calibration.profiler.features.frustum import fit_frustum, without_spikes
@@ -19,7 +19,7 @@ from weldcal.models.errors import InputError
 
 DATA = SHARED_DATA / "profiler"
 MM = 1e-3
-needs_data = pytest.mark.skipif(not DATA.exists(), reason="The published profiler data are not here.")
+needs_data = needs(DATA)
 
 
 def groove(

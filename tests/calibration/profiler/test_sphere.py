@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.profiler.arm_errors import ARM_ERRORS, ArmErrors, DhArm
 from weldcal.calibration.profiler.errors import (
@@ -37,7 +37,7 @@ from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereTrial, 
 DATA = SHARED_DATA / "profiler"
 MM = 1e-3
 SIGMAS = SphereSigmas(sensor_m=0.05 * MM, robot_m=0.04 * MM, touch_m=0.04 * MM)
-needs_data = pytest.mark.skipif(not DATA.exists(), reason="The published profiler data are not here.")
+needs_data = needs(DATA)
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, require_data
 from weldcal.calibration.tablet.errors import CollinearLandmarks, EqualRotations, TooFewLandmarks
 from weldcal.calibration.tablet.planar.fit import PlanarConfig, fit_planar, fit_plane_motion, hand_over, refine_rounded
 from weldcal.calibration.tablet.planar.linear import fit_linear, solve_closed_form, touched_rays
@@ -74,8 +74,7 @@ def test_unseen_queries_are_met_within_the_target_for_other_seeds(seed: int) -> 
 
 
 def test_unseen_queries_of_the_shared_trials_are_met_within_the_target() -> None:
-    if not SYNTH.is_file():
-        pytest.skip("the measured data (shared/data beside the repository) is not here")
+    require_data(SYNTH)
     s = np.load(SYNTH)
     linear, squares, rounded = [], [], []
     for k in range(len(s["uv"])):

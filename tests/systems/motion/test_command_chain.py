@@ -229,6 +229,20 @@ def test_a_tag_that_is_not_seen_faults_the_weld_and_the_reason_stays() -> None:
     assert "Tag hidden" in (servo.report().reason or "")
 
 
+def test_a_hold_in_the_middle_of_the_stop_leaves_no_motion_behind() -> None:
+    servo = Servo()
+    feed(servo.system, servo.context, job=WELD)
+    for k in range(1, 30):
+        feed(servo.system, servo.context, deformation=servo.deformation(0.01 * k, True))
+        servo.run(0.01 * k)
+    feed(servo.system, servo.context, sample_time=float("nan"))
+    servo.simulator.AdvanceTo(0.31)
+    assert servo.report().phase == "FAULT"
+    assert np.linalg.norm(servo.out("V_BT")) > 1e-3, "it still slows down"
+    feed(servo.system, servo.context, job=dc.replace(WELD, mode="hold", held=True))
+    assert np.all(servo.out("V_BT") == 0.0)
+
+
 def test_a_job_that_takes_the_weld_back_leaves_no_motion_behind() -> None:
     servo = Servo()
     feed(servo.system, servo.context, job=WELD)

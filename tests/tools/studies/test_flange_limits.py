@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
@@ -84,13 +84,13 @@ def test_the_spread_of_a_median_is_that_of_many_medians() -> None:
     assert np.mean(stated) == pytest.approx(np.std(medians), rel=0.25)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
+@needs(DATA)
 def test_a_comparison_of_ingredients_needs_a_dozen_scans() -> None:
     with pytest.raises(TooFewPoses, match="needs 12 usable scans, and there are 1"):
         study_ingredients(DATA / "franka_phoxi_m")
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="The real flange scans are not beside this checkout.")
+@needs(DATA)
 def test_few_scans_calibrate_to_tenths_on_the_scans_not_drawn_and_more_of_them_better() -> None:
     one, four = study_few_scans(DATA / "aubo_i5_phoxi_s", draws=6, sizes=(1, 4))
     assert (one.scans, four.scans, one.refused, four.refused) == (1, 4, 0, 0)

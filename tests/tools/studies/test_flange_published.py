@@ -10,7 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset, save_dataset
 from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.flange.observation import Observation
@@ -42,7 +42,7 @@ from weldcal.tools.studies.flange.published.simulation import (
 )
 
 DATA = SHARED_DATA / "flange"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the recorded flange data are not there")
+needs_data = needs(DATA)
 
 
 def test_the_batch_is_algorithm_1_run_by_run() -> None:

@@ -5,22 +5,28 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.weld.budgets import HARD, NOMINAL, PERFECT, planned_seam, roughness
-from weldcal.tools.studies.weld.groove import DROP_M, SEAT_M, Groove, Tip, floor
+from weldcal.tools.studies.weld.budgets import BUDGETS, HARD, NOMINAL, PERFECT, planned_seam, roughness
+from weldcal.tools.studies.weld.groove import DRAWN, DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.weld.metrics import RunMetrics
+from weldcal.tools.studies.weld.plant import simulate
 from weldcal.tools.studies.weld.rows import ROWS, Case, Target, UnknownRow, get_rows
 from weldcal.tools.studies.weld.seams import NAMES, UnknownSeam, get_seam
-from weldcal.tools.studies.weld.study import CaseResult, hold_against, run_case
+from weldcal.tools.studies.weld.stamps import Stamps
+from weldcal.tools.studies.weld.study import CaseResult, hold_against, run_case, study_config
 from weldcal.tools.studies.weld.turns import run_turn
+from weldcal.tools.studies.weld.unknowns import World, draw_world
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.servo.state import DeflectionSample
 
 MM = 1e-3
 TARGETS = {row.key: row for row in ROWS}
@@ -38,6 +44,79 @@ def holds(key: str, case: Case, seed: int = 0) -> RunMetrics:
 @pytest.mark.parametrize("seam", ["s_r60", "l_r20_concave"])
 def test_a_gentle_seam_holds_the_nominal_targets(seam: str) -> None:
     holds("nominal", Case(seam), 1)
+
+
+def test_the_imperfect_world_holds_its_targets() -> None:
+    holds("imperfect", Case("s_r60", "imperfect"), 1)
+
+
+@pytest.mark.parametrize(
+    ("budget", "side_mm", "height_mm"),
+    [
+        # r/sin of 23.25 deg against r/sin of 22.5 deg, r 2.5 mm
+        ("wedge_open", 0.0, 2.5 / math.sin(math.radians(23.25)) - 2.5 / math.sin(math.radians(22.5))),
+        ("wedge_side", 2.5 / math.sin(math.radians(22.5)) * math.sin(math.radians(0.75)), 0.0),
+        ("wear", 0.0, -0.1 / math.sin(math.radians(22.5))),
+        ("seat", 0.0, 0.1),
+    ],
+)
+def test_what_the_servo_does_not_know_of_its_groove_shows_in_full(
+    budget: str, side_mm: float, height_mm: float
+) -> None:
+    """A servo that were told of it would correct it."""
+    run = simulate(get_seam("straight"), BUDGETS[budget], study_config(Case("straight", budget)), 0, time_limit_s=25.0)
+    known = simulate(get_seam("straight"), NOMINAL, study_config(Case("straight")), 0, time_limit_s=25.0)
+    off = []
+    for weld in (run, known):
+        error = path_error(weld.points("torch")[weld.column("torch_on") > 0.5], weld.torch_line)
+        inside = error.s > 0.02
+        off.append(1e3 * np.array((error.lateral[inside].mean(), error.height[inside].mean())))
+    # Two welds with the same noise: a mean over 80 mm is the same to a few micrometres.
+    np.testing.assert_allclose(off[0] - off[1], (side_mm, height_mm), atol=0.03)
+
+
+def test_a_picture_gets_the_pose_of_its_stamp() -> None:
+    stamps = Stamps(World(image_bias_s=-0.010, pose_bias_s=0.008), 0)
+    told = []
+    for k in range(40):
+        c, s = math.cos(0.5 * 0.008 * k), math.sin(0.5 * 0.008 * k)
+        R, p = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0))), np.array((0.008 * 0.008 * k, 0.0, 0.0))
+        told.append(stamps.pose(0.008 * k, R, p))
+    np.testing.assert_allclose(told, 0.008 * np.arange(40) + 0.008)
+    taken = DeflectionSample(0.2, RigidTransform(), np.zeros(3), True)
+    seen = stamps.picture(taken)
+    assert seen.capture_time == pytest.approx(0.190)
+    # 18 ms before the exposure, at 8 mm/s and 0.5 rad/s.
+    assert seen.X_BT_at_capture.translation()[0] == pytest.approx(0.008 * 0.182, abs=1e-9)
+    turn = RollPitchYaw(seen.X_BT_at_capture.rotation()).yaw_angle()
+    assert turn == pytest.approx(0.5 * 0.182, abs=1e-6)
+    exact = Stamps(World(), 0)
+    assert exact.pose(0.3, np.eye(3), np.zeros(3)) == 0.3
+    assert exact.picture(taken) is taken
+
+
+def test_a_world_is_drawn_within_its_ranges_and_is_that_of_its_seed() -> None:
+    ranges = BUDGETS["imperfect"].unknown
+    worlds = [draw_world(ranges, seed) for seed in range(200)]
+    for field in fields(World):
+        low, high = getattr(ranges, field.name)
+        drawn = np.array([getattr(w, field.name) for w in worlds])
+        assert drawn.min() >= low
+        assert drawn.max() <= high
+        # 200 even draws come to within a tenth of both ends.
+        assert drawn.max() - drawn.min() >= 0.8 * (high - low)
+    assert draw_world(ranges, 7) == worlds[7]
+    assert draw_world(NOMINAL.unknown, 7).wedge == DRAWN
+    assert draw_world(NOMINAL.unknown, 7).lag_s(0.020, 0.025) == 0.020
+    assert draw_world(BUDGETS["lag_double"].unknown, 7).lag_s(0.020, 0.025) == 0.050
+
+
+def test_the_stamps_jitter_has_its_sigma_and_the_clock_never_runs_back() -> None:
+    stamps = Stamps(World(pose_jitter_s=0.002, image_jitter_s=0.002), 3)
+    told = np.array([stamps.pose(0.008 * k, np.eye(3), np.zeros(3)) for k in range(2000)])
+    assert np.all(np.diff(told) > 0.0)
+    # 2000 stamps know their sigma to 2 %; the few that would run back are held.
+    assert np.std(told - 0.008 * np.arange(2000)) == pytest.approx(0.002, rel=0.08)
 
 
 def test_the_hard_budget_holds_its_targets() -> None:
@@ -148,8 +227,8 @@ def test_the_tip_sits_in_the_groove_lags_by_friction_and_relaxes_beyond_the_end(
     for _ in range(100):
         centre = free.step(beyond, 0.008)
     np.testing.assert_allclose(centre, beyond, atol=1e-6)
-    assert floor(0.0) == (0.0, pytest.approx(1.0 / math.tan(math.radians(22.5))))
-    assert floor(20.0 * MM) == (DROP_M, 0.0)
+    assert DRAWN.floor(0.0) == (0.0, pytest.approx(1.0 / math.tan(math.radians(22.5))))
+    assert DRAWN.floor(20.0 * MM) == (DROP_M, 0.0)
 
 
 def test_the_command_writes_table_runs_and_report(tmp_path: Path) -> None:

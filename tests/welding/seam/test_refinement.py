@@ -105,10 +105,14 @@ def test_a_tip_that_is_held_up_does_not_advance_the_path() -> None:
         * 1e-3
     )
     arc = 0.25e-3 * np.arange(len(x))
+    # The way is the mean over six frames, and it counts where it is under half of the progress of 0.25 mm: from the fourth
+    # of the twelve slow frames on (0.117 and 0.083 mm, then seven of 0.05 mm) to the second quick one (0.083 and 0.117 mm).
+    expected = -(2.0 * (0.25 - 0.7 / 6.0) + 2.0 * (0.25 - 0.5 / 6.0) + 7.0 * 0.20) * 1e-3
+    assert felt(np.column_stack([x, 0 * x, 0 * x]), arc).jumped == pytest.approx(expected, abs=1e-9)
     noise = np.random.default_rng(3).normal(0.0, 0.05e-3, (len(x), 2))
     seam = felt(np.column_stack([x, noise]), arc)
-    # Six frames pass before it is seen to be slow, and six more until it is seen to be quick again.
-    assert seam.jumped == pytest.approx(-2.4e-3, abs=1.2e-3)
+    # Sideways noise lengthens a way of 0.3 mm by 0.1^2/(2 0.3) in the mean, a sixth of that a frame: 0.03 mm in eleven.
+    assert seam.jumped == pytest.approx(expected, abs=0.1e-3)
     assert np.all(np.diff(seam.arc) > 0.0)
     # What comes after a gap of 30 mm is no tip that was held up.
     on = np.concatenate([np.arange(0.0, 10e-3, 0.25e-3), np.arange(40e-3, 50e-3, 0.25e-3)])

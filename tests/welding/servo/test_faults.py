@@ -13,10 +13,13 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.studies.weld.budgets import NOMINAL
+from weldcal.tools.studies.weld.metrics import judge
 from weldcal.tools.studies.weld.plant import simulate
+from weldcal.tools.studies.weld.rows import Case
 from weldcal.tools.studies.weld.seams import TrueSeam, arcs
+from weldcal.tools.studies.weld.study import study_config
 from weldcal.welding.seam.curve import SeamCurve, SeamError
-from weldcal.welding.servo.settings import ServoConfig, TouchConfig
+from weldcal.welding.servo.settings import ServoConfig, TorchControl, TouchConfig
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
 from weldcal.welding.servo.step import welding_step
 from weldcal.welding.servo.touch import touch_start_pose
@@ -161,10 +164,14 @@ def test_a_plan_two_centimetres_off_never_lights_the_arc() -> None:
 
 
 @pytest.mark.parametrize("length", [0.030, 0.050])
-def test_a_seam_shorter_than_the_chord_is_welded_or_stopped_by_name(length: float) -> None:
-    run = simulate(straight(length), NOMINAL, CONFIG, 2, time_limit_s=60.0)
-    assert run.phase in (Phase.DONE, Phase.FAULT)
-    assert run.phase == Phase.DONE or run.reason
+def test_a_seam_shorter_than_the_chord_is_welded(length: float) -> None:
+    case = Case("short")
+    run = simulate(straight(length), NOMINAL, study_config(case), 2, time_limit_s=60.0)
+    figures = judge(run, case.speed_m_s, case.chord_m)
+    assert figures.completed, run.reason
+    # The study's mean; all of it lies near an end, so the largest is held to the demo's 0.3 mm.
+    assert figures.mean_mm <= 0.04
+    assert figures.max_mm <= 0.30
 
 
 def test_a_seam_too_short_to_be_felt_is_refused() -> None:
@@ -210,6 +217,37 @@ def test_a_clock_that_stands_still_stops_the_weld(half_way: tuple[WeldingState, 
     assert "clock has stood still" in (command.reason or "")
     assert 0.3 <= len(torch) * CONFIG.period_s < 0.33
     assert not torch[-1]
+
+
+@pytest.mark.parametrize("clock", ["frozen", "not a number", "backwards"])
+def test_a_fault_of_the_clock_brings_the_motion_to_rest(
+    half_way: tuple[WeldingState, RigidTransform, SeamCurve], clock: str
+) -> None:
+    """The ramp cannot run on the clock that is broken."""
+    state, X, plan = half_way
+    time, speeds = float(state.time or 0.0), []
+    for k in range(100):
+        now = {"frozen": time, "not a number": math.nan, "backwards": time - 0.008 * (k + 1)}[clock]
+        state, command = welding_step(state, ServoSample(now, X, None), plan, CONFIG)
+        if command.phase == Phase.FAULT:
+            speeds.append(float(np.linalg.norm(command.V_BT)))
+    assert speeds[0] > 0.5 * CONFIG.weld_speed_m_s, "it moved when the fault came"
+    assert np.all(np.diff(speeds) <= 0.0)
+    ramp = math.ceil(CONFIG.limits.ramp_s / CONFIG.period_s)
+    assert len(speeds) > ramp
+    assert not any(speeds[ramp:])
+
+
+@pytest.mark.parametrize("length", [0.04, 0.15])
+def test_a_weld_that_never_lights_is_not_done(length: float) -> None:
+    config = ServoConfig(torch=TorchControl(ignition_error_m=1e-9))
+    run = simulate(straight(length), NOMINAL, config, 1, time_limit_s=60.0)
+    assert run.phase == Phase.FAULT
+    assert (run.reason or "").startswith("Not welded: ")
+    assert not run.column("torch_on").any()
+    # Not dragged on over the whole seam either.
+    torch = run.torch_line.project(run.points("torch")[-1])
+    assert torch <= config.torch.ignition_window_m + 6.0 * MM
 
 
 def test_the_tags_own_bias_goes_with_its_zero() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 
 import numpy as np
@@ -19,11 +19,18 @@ from weldcal.tools.studies.weld.seams import s_curve
 from weldcal.welding.record.process import PathError, SpeedStatistics, path_error, speed_statistics
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.settings import (
+    ContactConfig,
     DeflectionControl,
     FaultLimits,
+    FeltPathConfig,
+    GapConfig,
+    LawWeights,
+    MotionLimits,
     ServoConfig,
     ServoConfigError,
+    SteeringConfig,
     ToolGeometry,
+    TorchControl,
     TouchConfig,
 )
 from weldcal.welding.servo.state import DeflectionSample, Phase, ServoSample, WeldingState
@@ -287,12 +294,45 @@ def test_every_command_is_finite_wherever_the_tool_stands() -> None:
             )
 
 
-def test_settings_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ServoConfigError, match="weld_speed_m_s"):
-        ServoConfig(weld_speed_m_s=0.0)
-    with pytest.raises(ServoConfigError, match="k_p"):
-        DeflectionControl(k_p=math.nan)
-    with pytest.raises(ServoConfigError, match="hidden_s"):
-        FaultLimits(hidden_s=math.nan)
+GROUPS = (
+    *(ToolGeometry, TouchConfig, ContactConfig, GapConfig, FaultLimits, DeflectionControl, TorchControl),
+    *(MotionLimits, LawWeights, SteeringConfig, FeltPathConfig, ServoConfig),
+)
+SIGNED = {"torch_height_m", "side_offset_m", "offset_m", "work_angle_rad"}  # a side, or a direction
+MAY_BE_ZERO = {"tip_seat_height_m", "zero_frames", "settle_s"}
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_no_setting_takes_a_number_that_makes_no_sense(group: type) -> None:
+    tried = 0
+    for field in fields(group):
+        default = field.default
+        if isinstance(default, bool) or not isinstance(default, int | float):
+            continue
+        bad = [math.nan, math.inf, -math.inf]
+        bad += [] if field.name in SIGNED else [-default if default else -1]
+        bad += [] if field.name in SIGNED | MAY_BE_ZERO else [0 * default]
+        for value in bad:
+            # Too small a chord has a sentence of its own in the whole.
+            where = group if field.name != "torch_offset_m" else lambda **k: ServoConfig(tool=ToolGeometry(**k))
+            with pytest.raises(ServoConfigError, match=field.name):
+                where(**{field.name: value})
+            tried += 1
+    assert tried >= 10
+
+
+@pytest.mark.parametrize(
+    ("group", "name"), [("refinement", "fit_sigma_m"), ("plan_fit", "sigma_m"), ("windows", "travel_rad")]
+)
+def test_settings_of_the_seam_are_checked_where_the_servo_takes_them(group: str, name: str) -> None:
+    for value in (math.nan, -1.0, 0.0):
+        part = replace(getattr(ServoConfig(), group), **{name: value})
+        with pytest.raises(ServoConfigError, match=f"{group}.{name}"):
+            ServoConfig(**{group: part})
+
+
+def test_a_chord_too_short_to_trail_and_a_press_that_does_not_press_are_refused() -> None:
     with pytest.raises(ServoConfigError, match="trail"):
         ServoConfig(tool=ToolGeometry(torch_offset_m=0.0))
+    with pytest.raises(ServoConfigError, match="press_ratio"):
+        TouchConfig(press_ratio=1.0)

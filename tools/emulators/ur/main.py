@@ -14,6 +14,7 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
+from weldcal.systems.addresses import loopback_address
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
@@ -65,8 +66,7 @@ def run_emulator(
     Raises:
         InputError: unknown arm or version, a pace or address that is not allowed, or a port that is taken.
     """
-    if not host.startswith("127."):
-        raise InputError(f"The emulator listens on loopback only; give an address 127.x.y.z, not {host}.")
+    host = loopback_address(host)
     if len(q) != 6:
         raise InputError("Give six joint angles, in radians.")
     if not SLOWEST <= pace <= FASTEST:

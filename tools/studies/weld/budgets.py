@@ -8,6 +8,7 @@ from pydrake.math import RotationMatrix
 from scipy.ndimage import gaussian_filter1d
 
 from weldcal.tools.studies.weld.seams import TrueSeam
+from weldcal.tools.studies.weld.unknowns import NOTHING_UNKNOWN, Unknowns
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 
@@ -23,6 +24,7 @@ class Budget:
         friction: between tip and walls; roughness_m: of the wall, one sigma; roughness_length_m: its correlation.
         plan_shift_m, plan_angle_rad, plan_height_m: how the plan is displaced as a whole; plan_warp_m: largest bend of it;
             plan_smoothing_m: sigma of the vision's smoothing; plan_noise_m: of each of its points, a millimetre apart.
+        unknown: what the servo believes wrongly.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Budget:
     plan_warp_m: float = 0.5e-3
     plan_smoothing_m: float = 3.0e-3
     plan_noise_m: float = 0.15e-3
+    unknown: Unknowns = NOTHING_UNKNOWN
 
 
 NOMINAL = Budget("nominal")
@@ -60,7 +63,39 @@ HARD = Budget(
 PERFECT = Budget("perfect", 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2e-3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 KINEMATIC = replace(PERFECT, name="kinematic", lag_s=0.020, tag_sigma_m=0.02e-3)
 QUIETER = tuple(replace(KINEMATIC, name=f"kinematic_{um}um", tag_sigma_m=1e-6 * um) for um in (0, 5, 10))
-BUDGETS = {b.name: b for b in (NOMINAL, HARD, KINEMATIC, *QUIETER, PERFECT)}
+
+# docs/weld_law.md, section 9, says where each size comes from.
+_WALL = math.radians(0.75)
+_STAMPS = Unknowns(
+    image_bias_s=(-0.010, 0.010), image_jitter_s=(0.002, 0.002), pose_bias_s=(0.0, 0.008), pose_jitter_s=(0.002, 0.002)
+)
+IMPERFECT = replace(
+    NOMINAL,
+    name="imperfect",
+    unknown=replace(
+        _STAMPS,
+        left_wall_rad=(-_WALL, _WALL),
+        right_wall_rad=(-_WALL, _WALL),
+        wear_m=(0.0, 0.1e-3),
+        seat_m=(-0.1e-3, 0.1e-3),
+        lag_share=(0.5, 2.0),
+    ),
+)
+SINGLE = tuple(
+    replace(NOMINAL, name=name, unknown=unknown)
+    for name, unknown in (
+        ("stamp_bias", Unknowns(image_bias_s=(-0.010, -0.010), pose_bias_s=(0.008, 0.008))),
+        ("stamp_jitter", Unknowns(image_jitter_s=(0.002, 0.002), pose_jitter_s=(0.002, 0.002))),
+        ("wedge_open", Unknowns(left_wall_rad=(_WALL, _WALL), right_wall_rad=(_WALL, _WALL))),
+        ("wedge_side", Unknowns(left_wall_rad=(_WALL, _WALL), right_wall_rad=(-_WALL, -_WALL))),
+        ("wear", Unknowns(wear_m=(0.1e-3, 0.1e-3))),
+        ("seat", Unknowns(seat_m=(0.1e-3, 0.1e-3))),
+        ("lag_half", Unknowns(lag_share=(0.5, 0.5))),
+        ("lag_1_5", Unknowns(lag_share=(1.5, 1.5))),
+        ("lag_double", Unknowns(lag_share=(2.0, 2.0))),
+    )
+)
+BUDGETS = {b.name: b for b in (NOMINAL, IMPERFECT, *SINGLE, HARD, KINEMATIC, *QUIETER, PERFECT)}
 
 
 def planned_seam(seam: TrueSeam, budget: Budget, rng: np.random.Generator) -> SeamCurve:

@@ -2,35 +2,76 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from weldcal.welding.numerics import Array, dot
 from weldcal.welding.seam.curve import SeamCurve
 
-RADIUS_M = 2.5e-3
-HALF_ANGLE_RAD = math.radians(22.5)
-DEPTH_M = 8.0e-3
-SEAT_M = RADIUS_M / math.sin(HALF_ANGLE_RAD)  # centre of the seated tip above the groove's root
-DROP_M = DEPTH_M + RADIUS_M - SEAT_M  # how much lower it sits than on the face
 STEP_S = 2.0e-3
-_HALF_WIDTH_M = DEPTH_M * math.tan(HALF_ANGLE_RAD)
 _STIFF_LATERAL, _STIFF_AXIAL = 600.0, 300.0  # N/m
-_STEEP = 1.0 / math.tan(HALF_ANGLE_RAD)
 _SHARE = 1.0 - math.exp(-STEP_S / 0.030)  # a free or sliding tip relaxes in 30 ms
 _MAX_SLIDE_M = 0.3e-3  # per step: 150 mm/s, the snap round a corner
 
 
-def floor(y: float) -> tuple[float, float]:
-    """Lowest height m of the tip's centre over its seat at lateral place y m, and the slope there."""
-    x = abs(y)
-    if x <= _HALF_WIDTH_M - RADIUS_M * math.cos(HALF_ANGLE_RAD):
-        return x * _STEEP, math.copysign(_STEEP, y)
-    if x >= _HALF_WIDTH_M:
-        return DROP_M, 0.0
-    # The centre rolls round the sharp upper edge.
-    rise = math.sqrt(RADIUS_M**2 - (_HALF_WIDTH_M - x) ** 2)
-    return DEPTH_M - SEAT_M + rise, math.copysign((_HALF_WIDTH_M - x) / rise, y)
+@dataclass(frozen=True)
+class Wedge:
+    """The section of the groove and the ball that sits in it.
+
+    Attributes:
+        radius_m: of the tip; half_angle_rad: between the walls' bisector and each wall; depth_m: root to face.
+        tilt_rad: of the bisector to the left. The contact keeps the surface's axes: it is a degree at most.
+    """
+
+    radius_m: float = 2.5e-3
+    half_angle_rad: float = math.radians(22.5)
+    depth_m: float = 8.0e-3
+    tilt_rad: float = 0.0
+
+    @cached_property
+    def seat_m(self) -> float:
+        """Distance of the seated tip's centre from the groove's root."""
+        return self.radius_m / math.sin(self.half_angle_rad)
+
+    @cached_property
+    def drop_m(self) -> float:
+        """How much lower the seated tip sits than on the face."""
+        return self.depth_m + self.radius_m - self.seat_m
+
+    @cached_property
+    def steep(self) -> float:
+        """Slope of the walls, height over width."""
+        return 1.0 / math.tan(self.half_angle_rad)
+
+    @cached_property
+    def half_width_m(self) -> float:
+        """From the middle to the sharp upper edge."""
+        return self.depth_m * math.tan(self.half_angle_rad)
+
+    @cached_property
+    def wall_end_m(self) -> float:
+        """Lateral place of the centre at which the tip leaves the wall for its edge."""
+        return self.half_width_m - self.radius_m * math.cos(self.half_angle_rad)
+
+    def seat_line(self, root: SeamCurve) -> SeamCurve:
+        """The line of the seated tip's centre above a root line."""
+        return root.raised(self.seat_m * math.cos(self.tilt_rad), self.seat_m * math.sin(self.tilt_rad))
+
+    def floor(self, y: float) -> tuple[float, float]:
+        """Lowest height m of the tip's centre over its seat at lateral place y m, and the slope there."""
+        x = abs(y)
+        if x <= self.wall_end_m:
+            return x * self.steep, math.copysign(self.steep, y)
+        if x >= self.half_width_m:
+            return self.drop_m, 0.0
+        # The centre rolls round the sharp upper edge.
+        rise = math.sqrt(self.radius_m**2 - (self.half_width_m - x) ** 2)
+        return self.depth_m - self.seat_m + rise, math.copysign((self.half_width_m - x) / rise, y)
+
+
+DRAWN = Wedge()  # as the drawing says, and as the servo believes
+SEAT_M, DROP_M = DRAWN.seat_m, DRAWN.drop_m
 
 
 @dataclass(frozen=True)
@@ -39,13 +80,14 @@ class Groove:
 
     Attributes:
         rough: (N,) m to the left, evenly over the line's length.
-        friction: Coulomb's coefficient.
+        friction: Coulomb's coefficient; wedge: the section as it really is.
     """
 
     line: SeamCurve
     gaps: tuple[tuple[float, float], ...] = ()
     rough: Array = field(default_factory=lambda: np.zeros(4))
     friction: float = 0.2
+    wedge: Wedge = DRAWN
 
     def present(self, s: float) -> bool:
         """Whether there is work under the tip at arc length s m."""
@@ -57,6 +99,7 @@ class Tip:
 
     def __init__(self, rest: Array, groove: Groove) -> None:
         self._groove = groove
+        self._wedge = groove.wedge
         self._rough = groove.rough.tolist()
         self.s = float(groove.line.project(rest))
         f = groove.line.frame(self.s)
@@ -74,12 +117,12 @@ class Tip:
             f = line.frame(self.s)
             gap = rest - f.position
             gt, gn, gb = dot(gap, f.tangent), dot(gap, f.normal) - self.y, dot(gap, f.up) - self.z
-            low, slope = floor(self.y)
+            low, slope = self._wedge.floor(self.y)
             if not self._groove.present(self.s) or (self.z > low + 1e-9 and self.z + _SHARE * gb > low):
                 self.touching = False
                 self.s, self.y, self.z = self.s + _SHARE * gt, self.y + _SHARE * gn, self.z + _SHARE * gb
                 if self._groove.present(self.s):
-                    self.z = max(self.z, floor(self.y)[0])
+                    self.z = max(self.z, self._wedge.floor(self.y)[0])
                 continue
             self.touching = True
             self._slide(gt, gn, gb, low, slope, f.curvature)
@@ -92,23 +135,23 @@ class Tip:
         return np.asarray(f.position + side * f.normal + self.z * f.up)
 
     def _slide(self, gt: float, gn: float, gb: float, low: float, slope: float, curvature: float) -> None:
-        friction = self._groove.friction
+        friction, wedge = self._groove.friction, self._wedge
         press, push = max(0.0, -_STIFF_AXIAL * gb), _STIFF_LATERAL * gn
-        total = press / math.sin(HALF_ANGLE_RAD) if low < DROP_M - 1e-9 else press
+        total = press / math.sin(wedge.half_angle_rad) if low < wedge.drop_m - 1e-9 else press
         hold = friction * total / _STIFF_LATERAL
         # The spring's force along a bent groove stiffens or yields with the lateral pull: below zero the tip snaps.
         yielding = 1.0 - curvature * (gn + self.y)
         way = max(0.0, abs(gt) - hold) / max(yielding, 0.05)
         self.s += math.copysign(min(way, _MAX_SLIDE_M), gt)
         seated = abs(self.y) < 1e-7
-        if seated and abs(push) <= press * _STEEP:
+        if seated and abs(push) <= press * wedge.steep:
             self.y = self.z = 0.0
             return
-        drive = push - press * (math.copysign(_STEEP, push) if seated else slope)
+        drive = push - press * (math.copysign(wedge.steep, push) if seated else slope)
         drag = friction * press * math.sqrt(1.0 + slope * slope)
         if abs(drive) > drag:
             stiff = _STIFF_LATERAL + _STIFF_AXIAL * slope * slope
             move = _SHARE * math.copysign(abs(drive) - drag, drive) / stiff
             y = self.y + max(-_MAX_SLIDE_M, min(_MAX_SLIDE_M, move))
             self.y = 0.0 if y * self.y < 0.0 else y
-        self.z = floor(self.y)[0]
+        self.z = self._wedge.floor(self.y)[0]

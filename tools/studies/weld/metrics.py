@@ -31,7 +31,7 @@ class RunMetrics:
         omega_rad_s, tip_speed_mm_s: largest commanded; end_step_mm_s: largest step between ticks from the seam's end on.
         work_deg: largest lean across the chord against the normal at the torch; travel_deg: largest pitch of the chord
             against the surface at the torch; travel_error_deg: against what the chord map of the plan predicts.
-        space_mm: largest distance in space; start_mm, stop_mm: where the arc went on and off, along the true seam
+        space_mean_mm, space_mm: mean and largest distance in space; start_mm, stop_mm: where the arc went on and off, along the true seam
             (from its start, and past its end).
         gain: the tag's gain as calibrated.
     """
@@ -43,6 +43,7 @@ class RunMetrics:
     mean_mm: float = math.nan
     max_mm: float = math.nan
     height_mm: float = math.nan
+    space_mean_mm: float = math.nan
     space_mm: float = math.nan
     end_mm: float = math.nan
     gap_mm: float = math.nan
@@ -94,6 +95,7 @@ def judge(
         "mean_mm": 1e3 * float(side.mean()),
         "max_mm": 1e3 * float(side.max()),
         "height_mm": 1e3 * float(height.max()),
+        "space_mean_mm": 1e3 * float(np.hypot(side, height).mean()),
         "space_mm": 1e3 * float(np.hypot(side, height).max()),
         "gain": run.state.gain,
         **extremes,

@@ -10,6 +10,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.tools.studies.weld.budgets import Budget, planned_seam, roughness
 from weldcal.tools.studies.weld.groove import DROP_M, SEAT_M, Groove, Tip
 from weldcal.tools.studies.weld.seams import TrueSeam
+from weldcal.tools.studies.weld.stamps import Stamps
+from weldcal.tools.studies.weld.unknowns import draw_world
 from weldcal.welding.numerics import Array
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.feel_start import with_touch_place
@@ -68,7 +70,7 @@ class StudyRun:
 
 
 def groove_config(config: ServoConfig) -> ServoConfig:
-    """The settings with the study's groove in them: seat and drop of the tip."""
+    """The settings with the drawn groove in them: seat and drop that a new tip would have there."""
     return replace(config, tool=replace(config.tool, tip_seat_height_m=SEAT_M, tip_drop_m=DROP_M))
 
 
@@ -84,6 +86,9 @@ def simulate(
 ) -> StudyRun:
     """One weld of a seam in a budget; everything random follows from the seed. The servo is the cell's own, unchanged.
 
+    The servo's settings come from the drawn groove; what the world really is (`budget.unknown`) reaches it through its
+    samples only. The torch is judged against the line at its wanted height above the true root.
+
     Args:
         gaps: (from, to) m of the groove that are missing; plan: in place of the budget's; hidden_s: from when to when
             the tag is not seen.
@@ -94,8 +99,13 @@ def simulate(
     root = SeamCurve.from_points(seam.points, seam.up)
     plan = planned_seam(seam, budget, rng) if plan is None else plan
     settings = with_touch_place(plan, groove_config(config))
-    groove = Groove(root.raised(SEAT_M), gaps, roughness(root.length, budget, rng), budget.friction)
-    torch_line = groove.line.raised(settings.clearance_m) if settings.clearance_m else groove.line
+    world = draw_world(budget.unknown, seed)
+    wedge = world.wedge
+    line = wedge.seat_line(root)
+    line = line.raised(world.seat_m) if world.seat_m else line
+    groove = Groove(line, gaps, roughness(root.length, budget, rng), budget.friction, wedge)
+    wanted = root.raised(SEAT_M)
+    torch_line = wanted.raised(settings.clearance_m) if settings.clearance_m else wanted
     reason: str | None = None
     dt = settings.period_s
     X_BT = touch_start_pose(plan, settings)
@@ -105,20 +115,22 @@ def simulate(
     bias = np.array((0.0, 0.0, budget.tag_bias_m))
     queue: list[DeflectionSample] = []
     newest: DeflectionSample | None = None
-    blend = 1.0 if budget.lag_s <= 0.0 else 1.0 - math.exp(-dt / budget.lag_s)
+    lag = world.lag_s(budget.lag_s, settings.lag_s)
+    blend = 1.0 if lag <= 0.0 else 1.0 - math.exp(-dt / lag)
+    stamps = Stamps(world, seed)
     next_frame, stopped, rows = 0.0, 0, []
     commands: list[WeldingCommand] = []
     for k in range(int(time_limit_s / dt)):
         t = k * dt
         centre = tip.step(p, dt)
-        X_BT = RigidTransform(RotationMatrix(R), p)
+        X_BT, now = RigidTransform(RotationMatrix(R), p), stamps.pose(t, R, p)
         if t >= next_frame - 1e-9:
             next_frame += FRAME_PERIOD_S
             deflection = yaw @ (R.T @ (centre - p)) + rng.normal(0.0, 1.0, 3) * budget.tag_sigma_m + bias
             queue.append(DeflectionSample(t, X_BT, deflection, not hidden_s[0] <= t < hidden_s[1]))
         while queue and queue[0].capture_time + budget.latency_s <= t + 1e-9:
-            newest = queue.pop(0)
-        state, command = welding_step(state, ServoSample(t, X_BT, newest), plan, settings)
+            newest = stamps.picture(queue.pop(0))
+        state, command = welding_step(state, ServoSample(now, X_BT, newest), plan, settings)
         commands.append(command)
         d = command.diagnostics
         rows.append(

@@ -14,7 +14,8 @@ from weldcal.tools.studies.weld.study import CaseResult, RowResult, study_config
 from weldcal.tools.studies.weld.turns import TurnResult
 
 FIGURE_NAMES = {
-    "mean_mm": "torch, mean", "max_mm": "torch, largest", "space_mm": "torch in space, largest", "end_mm": "last chord, largest",
+    "mean_mm": "torch, mean", "max_mm": "torch, largest", "space_mm": "torch in space, largest",
+    "height_mm": "torch height, largest", "end_mm": "last chord, largest",
     "gap_mm": "gap and 60 mm after, largest", "cv_percent": "torch speed CV", "time_ratio": "time over L/V",
     "omega_rad_s": "turning rate", "tip_speed_mm_s": "tip speed", "end_step_mm_s": "robot's velocity step",
     "work_deg": "work angle", "travel_error_deg": "travel angle against prediction",
@@ -97,7 +98,12 @@ TITLES = {
     "l_r20_concave": "Corner of 20 mm, concave", "l_r5_convex": "Corner of 5 mm, convex", "l_r5_concave": "Corner of 5 mm, concave",
     "l_r1_convex": "Corner of 1 mm, convex", "l_r1_concave": "Corner of 1 mm, concave", "arc_r60_end": "Ending on an arc of 60 mm",
 }  # fmt: skip
-_CARDS = (("nominal", "mean_mm"), ("nominal", "max_mm"), ("hard", "max_mm"), ("r1_convex", "max_mm"))
+_CARDS = (
+    ("imperfect", "mean_mm"),
+    ("imperfect", "max_mm"),
+    ("imperfect", "height_mm"),
+    ("imperfect_corners", "max_mm"),
+)
 
 
 def study_report(study: Study) -> str:

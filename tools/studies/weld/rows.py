@@ -60,10 +60,39 @@ _EASY = ("straight", "s_r60", "l_r20_convex", "l_r20_concave")
 _BOUNDED = (Target("omega_rad_s", 0.8, unit="rad/s"), Target("tip_speed_mm_s", 40.0, unit="mm/s"))
 _GAP_10, _GAP_25 = ((0.145, 0.155),), ((0.1375, 0.1625),)
 
+_WRONG = (Target("mean_mm", 0.10, "mean"), Target("max_mm", 0.30), Target("height_mm", 0.65))
+_SINGLE = {
+    "stamp_bias": "only: pictures stamped 10 ms early, poses 8 ms late",
+    "stamp_jitter": "only: each stamp off by 2 ms (one sigma)",
+    "wedge_open": "only: both walls 0.75 deg farther open",
+    "wedge_side": "only: both walls turned by 0.75 deg to the left",
+    "wear": "only: tip worn by 0.1 mm of radius",
+    "seat": "only: tip sits 0.1 mm higher than believed",
+    "lag_half": "only: robot's lag half of the believed 25 ms",
+    "lag_1_5": "only: robot's lag 1.5 times as long",
+    "lag_double": "only: robot's lag twice as long",
+}
+
 ROWS: tuple[Row, ...] = (
     Row(
+        "imperfect",
+        "imperfect world: straight, S R60, L R20",
+        tuple(Case(seam, "imperfect") for seam in _EASY),
+        (*_WRONG, *_BOUNDED),
+    ),
+    Row(
+        "imperfect_corners",
+        "imperfect world: R5 and R1 corners",
+        tuple(Case(f"l_{r}_{side}", "imperfect") for r in ("r5", "r1") for side in ("convex", "concave")),
+        (Target("mean_mm", 0.12, "mean"), Target("max_mm", 0.50), Target("height_mm", 0.65), *_BOUNDED),
+    ),
+    *(
+        Row(name, f"S R60, L R20; {label}", tuple(Case(seam, name) for seam in ("s_r60", "l_r20_convex")), _WRONG)
+        for name, label in _SINGLE.items()
+    ),
+    Row(
         "nominal",
-        "straight, S R60, L R20; chord 40, 60, 80 mm; nominal",
+        "perfectly known world: straight, S R60, L R20; chord 40, 60, 80 mm; nominal",
         tuple(Case(seam, chord_m=d) for seam in _EASY for d in _CHORDS),
         (
             Target("mean_mm", 0.04, "mean"),
@@ -75,7 +104,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "hard",
-        "the same, hard budget, chord 60 mm",
+        "perfectly known world, hard budget, chord 60 mm",
         tuple(Case(seam, "hard") for seam in _EASY),
         (Target("mean_mm", 0.12, "mean"), Target("max_mm", 0.45), *_BOUNDED),
     ),

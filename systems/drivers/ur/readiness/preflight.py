@@ -130,7 +130,7 @@ def preflight(
         nominal: the expected arm; a UR10e where None.
 
     Raises:
-        InputError: the host name is empty. All other problems are failed checks.
+        InputError: the host is empty or not an address. All other problems are failed checks.
     """
     look = _Look(host, timeout_s, nominal or load_arm("ur10e"))
     look.run(upper_registers)
