@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import f as f_distribution
 
-from weldcal.calibration.data.scanner_correction import EXPONENTS
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
@@ -19,9 +19,9 @@ _SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a
 _UNKNOWN_M = 5e-3  # one sigma of an axis from which on it is not known
 _SURE_SIGMAS = 4.0
 _LEAST_FREE = 5  # spare numbers of the test
-_SCANNER_TERMS = ((12, 6), (7, 3), (0, 1))
-"""From how many poses on so many terms of the scanner's own error are left open: a scale error looks like a TCP along z where every
-pose faces the scanner, and must not be called one."""
+_SCANNER_ORDERS = ((12, 2), (7, 1), (0, 0))
+"""From how many poses on the scanner's own error is left open to which power of x, y and z: a scale error looks like a TCP along z
+where every pose faces the scanner. Depth is among them: triangulation errs with its square, time of flight in waves over it."""
 _GATE = 6.5  # sigmas of a pose that takes no part, as in the calibration
 _USUAL_SPREAD_M = 1e-4
 _SINGULAR = 1e-6
@@ -82,10 +82,11 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
     longer than arms are off. ``start`` of the camera's pose where one is known.
     """
     n = len(observations)
-    terms = next(k for least, k in _SCANNER_TERMS if n >= least)
+    order = next(k for least, k in _SCANNER_ORDERS if n >= least)
+    terms = (1, 4, 10)[order]
     if n < 5 or 3 * n - 9 - terms < _LEAST_FREE:
         return None
-    data = _Data.of(observations, terms)
+    data = _Data.of(observations, order)
     starts = [one for one in (start, _linear_start(data), _rigid_start(data)) if one is not None]
     fitted = [_fit(data, one, offset=True) for one in starts]
     best = min(fitted, key=lambda one: float(np.median(one.norms)))
@@ -122,14 +123,17 @@ class _Data:
     weight: Array
 
     @staticmethod
-    def of(observations: Sequence[Observation], terms: int) -> "_Data":
+    def of(observations: Sequence[Observation], order: int) -> "_Data":
         c = np.array([o.p_CR for o in observations])
+        # about their middle, in their spread: powers of metres would be nearly alike
+        at = (c - c.mean(axis=0)) / np.maximum(c.std(axis=0), 1e-3)
+        powers = [e for e in product(range(order + 1), repeat=3) if sum(e) <= order]
         noise = [0.0 if o.center_covariance is None else np.trace(o.center_covariance) / 3.0 for o in observations]
         return _Data(
             c,
             np.array([o.p_BR for o in observations]),
             np.array([o.X_BR.rotation().matrix() for o in observations]),
-            np.stack([c[:, 0] ** i * c[:, 1] ** j for i, j in EXPONENTS[:terms]], axis=1),
+            np.stack([np.prod(at ** np.array(e), axis=1) for e in powers], axis=1),
             1.0 / np.sqrt(1.0 + np.array(noise) / _USUAL_SPREAD_M**2),
         )
 

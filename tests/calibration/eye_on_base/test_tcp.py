@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from pydrake.math import RigidTransform
 
 from tests.calibration.eye_on_base.test_solve import displaced, make_observations
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.tcp import FALSE_ALARM, find_tcp
 from weldcal.calibration.flange.observation import Observation
+from weldcal.tools.commands.calibrate import calibrate_dataset
 
 
 def with_tcp(observations: list[Observation], tcp_m: list[float]) -> list[Observation]:
@@ -72,3 +75,37 @@ def test_a_tcp_is_found_beside_outliers() -> None:
     found = find_tcp(observations)
     assert found is not None
     np.testing.assert_allclose(found.offset_m, [0.0, -0.03, -0.12], atol=2e-3)
+
+
+def _pairs(folder: Path, observations: list[Observation]) -> Path:
+    folder.mkdir()
+    (folder / "dataset.yaml").write_text(
+        "schema: 1\nrobot: ur10e\nflange: iso9409-1-50-4-m6\nscanner: any\nconfiguration: eye_on_base\nunits: {clouds: m, poses: m}\n"
+    )
+    rows = [
+        [o.id, *o.p_BR, *o.p_CR, *o.X_BR.rotation().ToQuaternion().wxyz()] for o in observations
+    ]  # fmt: skip
+    header = "id,base_x,base_y,base_z,camera_x,camera_y,camera_z,base_qw,base_qx,base_qy,base_qz"
+    (folder / "pairs.csv").write_text("\n".join([header, *(",".join(map(str, r)) for r in rows)]) + "\n")
+    return folder
+
+
+def test_calibrate_refuses_a_tcp_longer_than_the_flange_and_warns_of_a_shorter_one(tmp_path: Path) -> None:
+    poses = make_observations(12, 7, turn=0.4, normals=False)
+    for tcp_m in (0.15, 0.06):
+        data = _pairs(tmp_path / f"long{tcp_m}", with_tcp(poses, [0.0, 0.0, tcp_m]))
+        with pytest.raises(
+            InconsistentPoses, match=rf"TCP of \(-?0\.\d, -?0\.\d, {1e3 * tcp_m - 1:.0f}\.\d|{1e3 * tcp_m:.0f}\.\d\) mm"
+        ):
+            calibrate_dataset(data, tmp_path / "none")
+        assert not (tmp_path / "none").exists()
+    short = calibrate_dataset(_pairs(tmp_path / "short", with_tcp(poses, [0.0, 0.0, 0.012])), tmp_path / "out")
+    assert any("look as if a TCP of" in w for w in short.result.warnings)
+    none = calibrate_dataset(_pairs(tmp_path / "none_set", poses), tmp_path / "bare")
+    assert not any("TCP" in w for w in none.result.warnings)
+
+
+def test_calibrate_says_that_poses_of_one_orientation_cannot_show_a_tcp(tmp_path: Path) -> None:
+    data = _pairs(tmp_path / "data", with_tcp(make_observations(12, 8, turn=0.0, normals=False), [0.0, 0.0, 0.15]))
+    report = calibrate_dataset(data, tmp_path / "out")
+    assert any("it would shift X_BC by its own length" in w for w in report.result.warnings)
