@@ -15,6 +15,7 @@ KNOWN = 0.03  # one sigma of a radius, as a share of it, that is known at all
 BETTER = 0.4  # what another radius must leave of chi-square, and below which it must then be
 WORST_CHI2 = 100.0  # as sphere_joint has it: beyond it no sphere explains the profiles
 NAMED = 0.05  # of a ratio of radii that is called the diameter
+GOOD_CHI2 = 4.0  # of a fit whose sigmas are wrong by two at most
 ROUNDS, SETTLED = 12, 1e-3
 STARTS = (1.0, 0.5, 2.0)  # times the stated radius: as given, a diameter given, half of it given
 
@@ -63,13 +64,15 @@ def check_radius(data: SphereData, sigmas: SphereSigmas, stated: SphereEstimate 
     """
     R = data.radius_m
     allowed = SCALE_SIGMAS * sigmas.affine * R
-    if stated is not None and abs(stated.radius_change_m) <= allowed + NOISE_SIGMAS * stated.radius_sigma_m:
+    # what a poor fit says of the radius, to first order, says nothing
+    near = stated is not None and abs(stated.radius_change_m) <= allowed + NOISE_SIGMAS * stated.radius_sigma_m
+    if stated is not None and near and stated.reduced_chi2 < GOOD_CHI2:
         return
     tried = [one for k in STARTS if (one := free_radius(data, k * R, sigmas)) is not None]
     known = [one for one in tried if one.sigma_m < KNOWN * one.radius_m and one.reduced_chi2 < WORST_CHI2]
     best = min(known, key=lambda one: one.reduced_chi2, default=None)
     if best is None:
-        if stated is None:
+        if stated is None or near:
             return  # whatever the fit itself refuses for
         raise RadiusError(
             f"The profiles contradict a sphere of {1e3 * R:.2f} mm radius and show no other one. Check the radius, the poses and that "

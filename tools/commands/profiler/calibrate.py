@@ -306,6 +306,7 @@ def calibrate_compensate(
             "The compensation needs touches. Give 'touch_T' and 'tip' in the file, or --touches and --tip."
         )
     _check_number(data.poses, sign.shape, "signs")
+    check_radius(data, SphereSigmas(), None)
     if "translated" in file.arrays:
         translated = file.arrays["translated"] > 0.5
     else:
