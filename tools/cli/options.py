@@ -156,6 +156,8 @@ def command(
             json, debug = shared.get("json", False), shared["debug"]
             with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:
                 call = Call(title, shared, stack)
+                if call.out is not None:
+                    check_writable(call.out)
                 outcome = body(call, **given)
             if outcome is not None:
                 report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)

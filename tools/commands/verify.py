@@ -133,7 +133,7 @@ def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observa
 def _verdict(new: list[PoseError], limit_mm: float | None, source: str, doubts: list[str]) -> Verdict:
     """The verdict on the new scans alone; ``doubts`` are sentences that leave it at "use with care"."""
     if not new:
-        return Verdict(NONE, limit_mm, "The calibration used all of these scans. Take new scans to verify it.")
+        return Verdict(NONE, None, "The calibration used all of these scans. Take new scans to verify it.")
     median = float(np.median([p.error_mm for p in new]))
     scans = f"{len(new)} new scan{'' if len(new) == 1 else 's'}"
     said = f"The median error on {scans} is {median:.3f} mm"
