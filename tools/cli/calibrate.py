@@ -37,9 +37,10 @@ def calibrate(
     ] = None,
 ) -> Outcome:
     """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
+    from weldcal.tools.outcomes.poses import pose_rows
+
     if dataset is not None and scenario is None:
         from weldcal.tools.commands.calibrate import calibrate_dataset
-        from weldcal.tools.outcomes.poses import pose_rows
 
         report = calibrate_dataset(
             dataset,
@@ -59,4 +60,6 @@ def calibrate(
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
     from weldcal.tools.commands.procedures import calibrate_live
 
-    return Outcome(calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress))
+    found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)
+    X_BC = found.get("X_BC")
+    return Outcome(found, rows=pose_rows(X_BC) if X_BC is not None else {})

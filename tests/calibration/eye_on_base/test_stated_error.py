@@ -11,15 +11,16 @@ import pytest
 from pydrake.math import RigidTransform
 from typer.testing import CliRunner
 
-from tests.calibration.eye_on_base.test_solve import X_BC, make_observations
+from tests.calibration.eye_on_base.test_solve import make_observations
 from tests.calibration.eye_on_base.test_tcp import _pairs
-from weldcal.calibration.data.results import CalibrationResult, PoseRecord, load_result, save_result
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_ur_pose, load_result, save_result
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.outcomes.poses import pose_rows
 
 SIGMA = 2e-4
 
@@ -131,14 +132,20 @@ def test_the_scans_of_the_calibration_are_no_verification(tmp_path: Path) -> Non
 
 
 def test_the_terminal_prints_the_verdict_and_the_pose(tmp_path: Path) -> None:
-    folder, data = verified(tmp_path, calibrated(14, 20))
-    run = CliRunner().invoke(app, ["verify", str(folder), str(data), "--out", str(tmp_path / "out")])
-    text = " ".join(run.stdout.split())
-    assert "verdict use it" in text
-    x, y, z = 1e3 * load_result(folder).X_BC.translation()
-    assert f"position {x:+.3f} {y:+.3f} {z:+.3f} mm" in text
-    assert "UR pose p[" in text
-    assert np.linalg.norm(load_result(folder).X_BC.translation() - X_BC.translation()) < 2e-3
+    _, data = verified(tmp_path, calibrated(14, 20), n=12)
+    _, new = verified(tmp_path, calibrated(14, 20), seed=9)
+    result = tmp_path / "made"
+    made = CliRunner().invoke(app, ["calibrate", str(data), "--out", str(result)])
+    judged = CliRunner().invoke(app, ["verify", str(result), str(new), "--out", str(tmp_path / "out")])
+    found = load_result(result).X_BC
+    x, y, z = 1e3 * found.translation()
+    for run in (made, judged):
+        text = " ".join(run.stdout.split())
+        assert f"position {x:+.3f} {y:+.3f} {z:+.3f} mm" in text
+        assert f"UR pose {export_ur_pose(found).strip()}" in text
+    assert "verdict use it" in " ".join(judged.stdout.split())
+    live = pose_rows(found.GetAsMatrix4().tolist())
+    assert live["UR pose"] == export_ur_pose(found).strip()
 
 
 @pytest.mark.parametrize("limit", [0.0, -1.0, float("nan")])

@@ -60,6 +60,12 @@ def test_urdf_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
     same(RigidTransform(RollPitchYaw(*rpy), xyz), report.result.X)
 
 
+def test_the_terminal_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
+    report, folder = written
+    for symbol in ("X_FC", "X_BM"):
+        assert f"UR pose      {(folder / f'{symbol}.ur_pose.script').read_text().strip()}" in report.text()
+
+
 def test_ros_2_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
     report, folder = written
     words = shlex.split((folder / "X_FC.static_transform.sh").read_text())
