@@ -66,9 +66,10 @@ def calibrate_dataset(
     tell("solving", 0.7)
     few = len(observations) < ENOUGH
     X_FR = None if data.pairs else data.X_FR
+    tcp: tuple[str, ...] = ()
     if few:
         turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
-        estimate, tcp = calibrate_from_few(observations, seen.patterns, turn, seed=seed), ()
+        estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
     else:
         config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
         estimate, tcp = _estimate(observations, config, X_FR, 0.5 * standard.outer_m)
