@@ -153,8 +153,13 @@ def run_cell(
                 around.enter_context(real_time_priority())
             simulator.Initialize()
             simulator.AdvanceTo(cell.job.maximum_time_s + OVERTIME_S)
-    except KeyboardInterrupt:
-        run.interrupted = f"A person stopped the run with Ctrl-C, in the phase '{run.command.phase}'."
+    except KeyboardInterrupt as stop:
+        who = (
+            "The operating system ended the run (SIGTERM)"
+            if "SIGTERM" in stop.args
+            else "A person stopped the run with Ctrl-C"
+        )
+        run.interrupted = f"{who}, in the phase '{run.command.phase}'."
     finally:
         station.close()
     run.wall_seconds = time.perf_counter() - start

@@ -60,6 +60,7 @@ NAMES = {
     "held_out_mm": "held-out error",
     "k_fold_mm": "k-fold error",
     "tilt_deg": "tilt error",
+    "model_reason": "why this model",
     "torch_speed_cv": "torch speed variation",
     "peak_omega": "peak turning rate (rad/s)",
     "next_pose": "next best pose",

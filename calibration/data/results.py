@@ -189,14 +189,20 @@ def load_result(path: Path) -> CalibrationResult:
     )
 
 
-def export_urdf(X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame") -> str:
-    """A URDF/xacro snippet: fixed joint from the controller's base frame to the scanner's optical frame."""
+def export_urdf(
+    X_BC: RigidTransform, parent: str = "base", child: str = "scanner_optical_frame", note: str | None = None
+) -> str:
+    """A xacro file for `xacro:include` into a robot that has the parent link: the child link on a fixed joint, one root element."""
     roll, pitch, yaw = X_BC.rotation().ToRollPitchYaw().vector()
     x, y, z = X_BC.translation()
+    # two hyphens may not stand in an XML comment
+    said = "" if note is None else f"  <!-- {note.replace('--', '')} -->\n"
     return (
-        f'<link name="{child}"/>\n<joint name="{parent}_to_{child}" type="fixed">\n'
-        f'  <parent link="{parent}"/>\n  <child link="{child}"/>\n'
-        f'  <origin xyz="{x:.9f} {y:.9f} {z:.9f}" rpy="{roll:.9f} {pitch:.9f} {yaw:.9f}"/>\n</joint>\n'
+        f'<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="{child}">\n'
+        f"  <!-- Include this file in the description of the robot, which defines the link {parent}. -->\n{said}"
+        f'  <link name="{child}"/>\n  <joint name="{parent}_to_{child}" type="fixed">\n'
+        f'    <parent link="{parent}"/>\n    <child link="{child}"/>\n'
+        f'    <origin xyz="{x:.9f} {y:.9f} {z:.9f}" rpy="{roll:.9f} {pitch:.9f} {yaw:.9f}"/>\n  </joint>\n</robot>\n'
     )
 
 
@@ -251,9 +257,7 @@ def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
     note = correction_note(result)
     comment = "" if note is None else f"# {note}\n"
     files = {
-        # two hyphens may not stand in an XML comment
-        "scanner.urdf.xacro": ("" if note is None else f"<!-- {note.replace('--', '')} -->\n")
-        + export_urdf(result.X_BC),
+        "scanner.urdf.xacro": export_urdf(result.X_BC, note=note),
         "static_transform.sh": comment + export_ros2(result.X_BC),
         "ur_pose.script": comment + export_ur_pose(result.X_BC),
         "X_BC.json": export_json(result),

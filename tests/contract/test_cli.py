@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import typer.main
 from pydrake.math import RigidTransform
+from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
@@ -100,6 +101,52 @@ def test_with_json_a_mistake_is_json_too(tmp_path: Path) -> None:
     finished = weldcal("view", "no_such", "--json", cwd=tmp_path)
     assert finished.returncode == 1
     assert json.loads(finished.stdout.splitlines()[-1])["state"] == "failed"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["demo"],
+        ["calibrate", "data"],
+        ["verify", "result", "data"],
+        ["hand-eye", "ax-yb", "poses.csv"],
+        ["profiler", "sphere", "scans.npz"],
+        ["tablet", "calibrate", "touches.csv"],
+        ["benchmark", "flange"],
+    ],
+)
+@pytest.mark.parametrize("place", ["file/result", "file", "/proc/result"])
+def test_a_folder_that_cannot_be_written_is_refused_before_any_work(
+    arguments: list[str], place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before the files are looked at: none of them exists, and the sentence is not about them."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    finished = CliRunner().invoke(app, [*arguments, "--out", place])
+    assert finished.exit_code == 1
+    assert f"'{place}'" in finished.stderr
+    assert "Give a" in finished.stderr
+    assert "folder" in finished.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_sigterm_leaves_the_result_folder_as_ctrl_c_does(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys\nfrom weldcal.systems import runner\nfrom weldcal.tools.cli import app\n"
+        "from weldcal.tools.commands import run\nwhole = run.run_cell\n"
+        "def ended(cell, progress, *rest):\n"
+        "    def tell(stage, fraction):\n"
+        "        os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    return whole(cell, tell, *rest)\n"
+        "run.run_cell = ended\n"
+        f"sys.argv = ['weldcal', 'weld', '--no-browser', '--json', '--out', {str(tmp_path / 'run')!r}]\napp.main()\n"
+    )
+    finished = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
+    assert finished.returncode == 1, finished.stderr
+    said = json.loads(finished.stdout.splitlines()[-1])
+    assert said["state"] == "held"
+    assert "SIGTERM" in said["reason"]
+    assert (tmp_path / "run" / "report.html").is_file()
 
 
 def test_view_finds_the_pages_of_a_result(tmp_path: Path) -> None:

@@ -74,7 +74,10 @@ def _result(folder: Path, result: CalibrationResult) -> Path:
 
 def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(verified: VerifyReport) -> None:
     d = verified.summary()
-    assert set(d) == {"state", "position_error_mm", "tilt_deg", "per_pose", "warnings"}
+    figures = {"position_error_mm", "tilt_deg", "per_pose", "warnings"}
+    assert set(d) == {"state", "verdict", "limit_mm", "reason"} | figures
+    assert d["verdict"] == "use with care"  # because the orientations hardly vary
+    assert d["position_error_mm"]["median"] < d["limit_mm"] < 0.6
     assert len(d["per_pose"]) == 9
     # nine scans: the paper's method leaves 0.63 on poses it did not use, good centres 0.29, and a corrected scanner 0.16
     assert d["position_error_mm"]["median"] < 0.2
@@ -148,6 +151,7 @@ def test_a_scanner_that_was_pushed_shows(halves: tuple[Path, Path], tmp_path: Pa
     )
     assert report.position_error_mm["median"] == pytest.approx(3.0, abs=0.5)
     assert any("calibrate again" in w for w in report.warnings)
+    assert report.verdict.verdict == "do not use"
 
 
 def test_scans_that_made_the_calibration_are_named(halves: tuple[Path, Path], tmp_path: Path) -> None:
@@ -158,6 +162,7 @@ def test_scans_that_made_the_calibration_are_named(halves: tuple[Path, Path], tm
     assert report.poses[0].id in given
     assert report.poses[1].id not in given
     assert any("Only 3 scans were used" in w for w in report.warnings)
+    assert "on 1 new scan is" in report.verdict.reason
 
 
 def test_a_scan_without_a_flange_is_named_and_the_rest_is_judged(halves: tuple[Path, Path], tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """The command line: every command in its group, in the order of the help text."""
 
+import signal
 from typing import Annotated
 
 import typer
@@ -39,7 +40,15 @@ GROUPS = {
 
 
 def main() -> None:
-    """Entry point of the `weldcal` console script and of `python -m weldcal.tools`."""
+    """Entry point of the `weldcal` console script and of `python -m weldcal.tools`.
+
+    SIGTERM ends a command as Ctrl-C does: a run is held and leaves its result folder.
+    """
+
+    def end(*_: object) -> None:
+        raise KeyboardInterrupt("SIGTERM")
+
+    signal.signal(signal.SIGTERM, end)
     app(prog_name="weldcal")
 
 

@@ -37,6 +37,8 @@ def calibrate(
     ] = None,
 ) -> Outcome:
     """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
+    from weldcal.tools.outcomes.poses import pose_rows
+
     if dataset is not None and scenario is None:
         from weldcal.tools.commands.calibrate import calibrate_dataset
 
@@ -52,9 +54,12 @@ def calibrate(
             axis_turn_deg=axis_turn,
         )
         algorithm1 = report.algorithm1
-        return Outcome(report.summary(), rows={} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence})
+        rows = {} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence}
+        return Outcome(report.summary(), rows=rows | pose_rows(report.result.X_BC))
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
     from weldcal.tools.commands.procedures import calibrate_live
 
-    return Outcome(calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress))
+    found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)
+    X_BC = found.get("X_BC")
+    return Outcome(found, rows=pose_rows(X_BC) if X_BC is not None else {})

@@ -1,6 +1,7 @@
 """What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
 import inspect
+import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from weldcal.models.errors import InputError
 from weldcal.tools import console
 
 
@@ -104,8 +106,13 @@ class Call:
         return found | ({"browser": found["browser"] and not self.json} if "browser" in found else {})
 
     def folder(self, command: str, name: str) -> Path:
-        """Where the result is written: --out, or a new folder named after the command and what it works on."""
+        """Where the result is written: --out, or a new folder named after the command and what it works on.
+
+        Raises:
+            InputError: nothing can be written there. Nothing is created.
+        """
         self.written = self.out or fresh_folder(command, name, self.seed)
+        check_writable(self.written)
         return self.written
 
     def progress(self, stage: str, fraction: float) -> None:
@@ -149,6 +156,8 @@ def command(
             json, debug = shared.get("json", False), shared["debug"]
             with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:
                 call = Call(title, shared, stack)
+                if call.out is not None:
+                    check_writable(call.out)
                 outcome = body(call, **given)
             if outcome is not None:
                 report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)
@@ -174,6 +183,25 @@ def fresh_folder(command: str, name: str, seed: int) -> Path:
         number += 1
         folder = first.with_name(f"{first.name}-{number}")
     return folder
+
+
+def check_writable(folder: Path) -> None:
+    """Try whether files can be written in a folder, or in the nearest one above it that exists; leaves nothing.
+
+    Raises:
+        InputError: they cannot.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"'{folder}' is a file. Give a folder for the result.")
+    there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), folder)
+    try:
+        # the only test that holds for every file system, and for root
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as problem:
+        raise InputError(
+            f"Nothing can be written to '{folder}' ({problem.strerror or problem}). Give another folder with --out."
+        ) from problem
 
 
 def report(title: str, outcome: Outcome, call: Call) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -63,7 +63,7 @@ def edge(
     sigmas = Sigmas(robot, x, z, stated=any(v is not None for v in given))
     data = read_profiler_file(file, unit=unit, dataset=dataset, trial=trial)
     record, found = calibrate_edge(data, sigmas, method=method, feature=feature, side=side, plan=plan, seed=call.seed)
-    return _calibrated(call, file, record, found)
+    return _calibrated(call, file, record, _with(data, found))
 
 
 @command("profiler sphere", short_help="Calibrate by a sphere, with or without touches of it.")
@@ -91,7 +91,7 @@ def sphere(
     lost: list[int] = []
     data, measured = _sphere(call, file, unit, dataset, trial, radius, touches, tip, arm, lost)
     record, found = calibrate_sphere(measured, data.digest, sigmas, model=model, plan=plan, seed=call.seed)
-    return _calibrated(call, file, record, found | {"without_sphere": lost})
+    return _calibrated(call, file, record, _with(data, found) | {"without_sphere": lost})
 
 
 @command("profiler compensate", short_help="Calibrate by the published sphere method, with compensation by touches.")
@@ -117,7 +117,7 @@ def compensate(
         console.emit_warning(
             f"The side of the sphere's centre is likely wrong in scans {found['wrong_sides']}. Check their sign."
         )
-    return _calibrated(call, file, record, found)
+    return _calibrated(call, file, record, _with(data, found))
 
 
 @command("profiler seam", short_help="Map a V-groove in the base frame.")
@@ -133,7 +133,8 @@ def seam(
     from weldcal.tools.commands.profiler.files import read_profiler_file
 
     folder = call.folder("profiler", file.stem)
-    return _outcome(map_seam(read_profiler_file(file, unit=unit, trial=trial), calibration, folder), folder)
+    data = read_profiler_file(file, unit=unit, trial=trial)
+    return _outcome(_with(data, map_seam(data, calibration, folder)), folder)
 
 
 def _sphere(
@@ -156,6 +157,11 @@ def _sphere(
     felt = None if touches is None else read_profiler_file(touches, unit=unit)
     radius_m = None if radius is None else 1e-3 * radius
     return data, sphere_data(data, radius_m=radius_m, arm=arm, tip_m=tip_m, touches=felt, lost=lost, seed=call.seed)
+
+
+def _with(data: ProfilerFile, found: Mapping[str, Any]) -> dict[str, Any]:
+    """What was found, with the warnings about the file first."""
+    return {**found, **({"warnings": [*data.warnings, *found.get("warnings", [])]} if data.warnings else {})}
 
 
 def _calibrated(call: Call, file: Path, record: ProfilerRecord, found: Mapping[str, object]) -> Outcome:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, command, option, switch
+from weldcal.tools.cli.options import Call, check_writable, command, option, switch
 
 
 @command("tablet serve", common=("debug",))
@@ -23,6 +23,7 @@ def serve(
     """Serve the target page to a tablet until interrupted: landmarks at true scale, touches to a tenth of a pixel."""
     from weldcal.tools.commands.tablet.page.serve import run_server
 
+    check_writable(out)
     run_server(host, port, out, typer.echo)
 
 

@@ -1,12 +1,11 @@
-"""weldcal verify: the errors of a calibration on scans that it did not use."""
+"""weldcal verify: a verdict on a calibration, from scans that it did not use."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, command
+from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
 
 
 @command("verify", short_help="Verify a calibration on scans that it did not use.")
@@ -16,11 +15,25 @@ def verify(
     dataset: Annotated[Path, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/, or pairs.csv.")],
     flange: FlangeOption = None,
     scanner_correction: CorrectionOption = True,
-) -> Mapping[str, object]:
-    """Verify a calibration on scans that it did not use: position error and tilt per pose, at the flange."""
-    from weldcal.tools.commands.verify import verify_dataset
+    limit_mm: Annotated[
+        float | None,
+        option(
+            "--limit-mm",
+            "MM",
+            "Largest median error of the new scans.",
+            show_default="from what the calibration states; 1 % false alarms",
+        ),
+    ] = None,
+) -> Outcome:
+    """Verify a calibration on scans that it did not use: a verdict, position error and tilt per pose, at the flange.
 
-    return verify_dataset(
+    The exit code is 1 where the verdict is "do not use".
+    """
+    from weldcal.tools.commands.verify import verify_dataset
+    from weldcal.tools.outcomes.calibration import DO_NOT
+    from weldcal.tools.outcomes.poses import pose_rows
+
+    report = verify_dataset(
         result,
         dataset,
         call.folder("verify", dataset.resolve().name),
@@ -28,4 +41,11 @@ def verify(
         seed=call.seed,
         progress=call.progress,
         correct_scanner=scanner_correction,
-    ).summary()
+        limit_mm=limit_mm,
+    )
+    verdict = report.verdict
+    return Outcome(
+        report.summary(),
+        rows={"because": verdict.reason, **pose_rows(report.result.X_BC)},
+        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
+    )

@@ -9,12 +9,13 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
-from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.errors import InconsistentPoses, TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration, calibrate_corrected
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
+from weldcal.calibration.eye_on_base.tcp import find_tcp
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -64,13 +65,14 @@ def calibrate_dataset(
     _enough(observations, refused)
     tell("solving", 0.7)
     few = len(observations) < ENOUGH
-    estimate = (
-        calibrate_from_few(
-            observations, seen.patterns, None if axis_turn_deg is None else float(np.radians(axis_turn_deg)), seed=seed
-        )
-        if few
-        else estimate_eye_on_base(observations, SolveConfig(seed=seed, allow_coplanar=bool(fits)))
-    )
+    X_FR = None if data.pairs else data.X_FR
+    tcp: tuple[str, ...] = ()
+    if few:
+        turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
+        estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
+    else:
+        config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
+        estimate, tcp = _estimate(observations, config, X_FR, 0.5 * standard.outer_m)
     tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
@@ -102,14 +104,15 @@ def calibrate_dataset(
     tell("Algorithm 1 for comparison", 0.8)
     algorithm1, verifier, icp = compare_algorithm1(observations, inliers, clouds, fits, standard, seed)
     curve = convergence(inliers, verifier, orders=8, seed=seed)
-    warnings = list(estimate.warnings)
+    warnings = [*tcp, *estimate.warnings]
     if data.pairs and not any(p.has_orientation for p in data.pairs):
         warnings.append(
             "The pairs have no orientations. A constant error of the flange centre would not show in these figures."
         )
     elif turn_deg([o.X_BR for o in inliers]) < _TURN_DEG:
         warnings.append(
-            "The poses hardly differ in orientation. A constant error of the flange centre would not show in these figures."
+            "The poses hardly differ in orientation, so they cannot show a TCP that is set at the robot: it would shift X_BC by its own "
+            "length, and no figure here would tell. Check that the TCP is zero, or tilt the flange in some poses."
         )
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
@@ -162,6 +165,27 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+def _estimate(
+    observations: list[Observation], config: SolveConfig, X_FR: RigidTransform | None, flange_m: float
+) -> tuple[CalibrationEstimate, tuple[str, ...]]:
+    """The estimate, and a sentence where the poses look as if a TCP were set.
+
+    Raises:
+        InconsistentPoses: the TCP is surely longer than the flange's radius ``flange_m``, or explains why no calibration is found.
+    """
+    try:
+        estimate = estimate_eye_on_base(observations, config)
+    except InconsistentPoses as refusal:
+        tcp = find_tcp(observations)
+        if tcp is None:
+            raise
+        raise InconsistentPoses(tcp.sentence(X_FR)) from refusal
+    tcp = find_tcp(observations, estimate.X_BC)
+    if tcp is not None and tcp.surely_beyond(flange_m):
+        raise InconsistentPoses(tcp.sentence(X_FR))
+    return estimate, () if tcp is None else (tcp.sentence(X_FR),)
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:

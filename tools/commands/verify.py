@@ -1,4 +1,4 @@
-"""`weldcal verify RESULT DATASET`: measures the errors of a calibration at the flange on scans that it did not use."""
+"""`weldcal verify RESULT DATASET`: judges a calibration by its errors at the flange on scans that it did not use."""
 
 import json
 from pathlib import Path
@@ -9,13 +9,14 @@ from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
+from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
-from weldcal.tools.outcomes.calibration import PoseError, VerifyReport
+from weldcal.tools.outcomes.calibration import CARE, DO_NOT, NONE, USE, PoseError, Verdict, VerifyReport
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.report.verify import verify_report
 
@@ -42,17 +43,21 @@ def verify_dataset(
     seed: int = 0,
     progress: Progress | None = None,
     correct_scanner: bool = True,
+    limit_mm: float | None = None,
 ) -> VerifyReport:
     """Verify a calibration (its folder or calibration.yaml) on a dataset folder; write verification.json and report.html.
 
     Errors are taken at the flange centre, in the base, after the result's scanner correction. A scan in which no flange
     is found is named and not used. Without ``correct_scanner`` the result's correction is not applied. ``flange``
-    overrides dataset.yaml; the fits follow ``seed``. Nothing is written unless at least one scan can be used.
+    overrides dataset.yaml; the fits follow ``seed``. ``limit_mm`` of the new scans' median replaces the one that follows from what
+    the calibration states. Nothing is written unless at least one scan can be used.
 
     Raises:
         InputError: the result, the dataset or the output folder cannot be used.
     """
     tell: Progress = progress or (lambda stage, fraction: None)
+    if limit_mm is not None and not (np.isfinite(limit_mm) and limit_mm > 0.0):
+        raise InputError(f"The limit must be a positive number of millimetres, not {limit_mm:g}.")
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the verification.")
     calibration = load_result(Path(result))
@@ -73,14 +78,33 @@ def verify_dataset(
     observations = tuple(o if correction is None else corrected_observation(correction, o) for o in seen.observations)
     poses = _judge(calibration, data, observations)
     uncorrected = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
+    differences = _differences(calibration, data, standard.designation)
+    gross = _gross(calibration, poses)
+    new = [k for k, p in enumerate(poses) if not p.used_before]
+    if limit_mm is None:
+        limit_mm = stated_median_limit(calibration, [observations[k] for k in new], correction)
+        source = f"which {100 * FALSE_ALARM:.0f} % of verifications of a calibration as good as it states exceed"
+    else:
+        source = "as given"
+    doubts = [*differences, *gross, *uncorrected, *_alike(data, observations)]
+    verdict = _verdict([poses[k] for k in new], limit_mm, source, doubts)
     warnings = (
         *uncorrected,
         *(f"{id} was not used: {reason}" for id, reason in seen.refused),
-        *_differences(calibration, data, standard.designation),
+        *differences,
         *_diagnostics(calibration, data, observations, poses),
     )
     report = VerifyReport(
-        calibration, correction, observations, seen.fits, poses, seen.refused, warnings, data.hashes, Path(out)
+        calibration,
+        correction,
+        observations,
+        seen.fits,
+        poses,
+        seen.refused,
+        warnings,
+        data.hashes,
+        Path(out),
+        verdict,
     )
     tell("writing the report", 0.9)
     write_atomic(Path(out) / "report.html", verify_report(report, dataset=Path(dataset).resolve().name))
@@ -104,6 +128,54 @@ def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observa
             again = again or data.hashes[f"clouds/{data.clouds[o.id].name}"] in known
         poses.append(PoseError(o.id, float(e), float(t) if np.isfinite(t) else None, again or same_pairs))
     return tuple(poses)
+
+
+def _verdict(new: list[PoseError], limit_mm: float | None, source: str, doubts: list[str]) -> Verdict:
+    """The verdict on the new scans alone; ``doubts`` are sentences that leave it at "use with care"."""
+    if not new:
+        return Verdict(NONE, None, "The calibration used all of these scans. Take new scans to verify it.")
+    median = float(np.median([p.error_mm for p in new]))
+    scans = f"{len(new)} new scan{'' if len(new) == 1 else 's'}"
+    said = f"The median error on {scans} is {median:.3f} mm"
+    tilts = [p.tilt_deg for p in new if p.tilt_deg is not None]
+    if tilts and float(np.median(tilts)) > _WORST_TILT_DEG:
+        return Verdict(
+            DO_NOT, limit_mm, f"The scanned faces are turned by {np.median(tilts):.0f} degrees from the poses."
+        )
+    if limit_mm is None:
+        return Verdict(CARE, None, f"{said}, and the calibration states no error of its own. Give a limit: --limit-mm.")
+    if median > limit_mm:
+        return Verdict(DO_NOT, limit_mm, f"{said}, above the limit of {limit_mm:.3f} mm, {source}. Calibrate again.")
+    said += f", within the limit of {limit_mm:.3f} mm, {source}"
+    if len(new) < _FEW:
+        return Verdict(CARE, limit_mm, f"{said}; fewer than {_FEW} new scans say little.")
+    if doubts:
+        return Verdict(CARE, limit_mm, f"{said}. But: {doubts[0]}")
+    return Verdict(USE, limit_mm, f"{said}.")
+
+
+def _alike(data: Dataset, observations: tuple[Observation, ...]) -> list[str]:
+    """A sentence where these scans cannot show an error that is constant in the flange's frame."""
+    if data.pairs and not all(p.has_orientation for p in data.pairs):
+        return ["The pairs have no orientations of the flange. Whether the orientation varies is not known."]
+    turned = [o.X_BR for o in observations]
+    if len(turned) > 1 and turn_deg(turned) < _TURN_DEG:
+        return [
+            f"The orientations hardly vary (by {turn_deg(turned):.1f} degrees). A constant error of the flange centre "
+            "would not show in these figures."
+        ]
+    return []
+
+
+def _gross(result: CalibrationResult, poses: tuple[PoseError, ...]) -> list[str]:
+    """A sentence on scans far off all others."""
+    n, median = len(poses), float(np.median([p.error_mm for p in poses]))
+    gross = [p for p in poses if p.error_mm > _GROSS * max(median, result.held_out_mm.get("p95") or 0.0)]
+    if not gross:
+        return []
+    names = ", ".join(f"{p.id} by {p.error_mm:.1f} mm" for p in gross[:8]) + (" ..." if len(gross) > 8 else "")
+    are = "is a gross outlier" if len(gross) == 1 else "are gross outliers"
+    return [f"{len(gross)} of the {n} scans {are}: {names}."]
 
 
 def _differences(result: CalibrationResult, data: Dataset, flange: str) -> list[str]:
@@ -137,14 +209,7 @@ def _diagnostics(
         )
     if n < _FEW:
         out.append(f"Only {n} scan{' was' if n == 1 else 's were'} used. Take {_FEW} or more across the work space.")
-    turned = [o.X_BR for o in observations]
-    if data.pairs and not all(p.has_orientation for p in data.pairs):
-        out.append("The pairs have no orientations of the flange. Whether the orientation varies is not known.")
-    elif n > 1 and turn_deg(turned) < _TURN_DEG:
-        out.append(
-            f"The orientations hardly vary (by {turn_deg(turned):.1f} degrees). A constant error of the flange centre "
-            "would not show in these figures."
-        )
+    out += _alike(data, observations)
     stated = result.held_out_mm.get("p95")
     median = float(np.median([p.error_mm for p in poses]))
     if stated is not None and median > (stated if n >= _FEW else _GROSS * stated):
@@ -152,12 +217,7 @@ def _diagnostics(
             f"The median error, {median:.2f} mm, is larger than the calibration's own held-out error at 95 % ({stated:.2f} mm). "
             "Scanner, robot or flange has changed, or these scans are in another region: calibrate again."
         )
-    gross = [p for p in poses if p.error_mm > _GROSS * max(median, stated or 0.0)]
-    if gross:
-        names = ", ".join(f"{p.id} by {p.error_mm:.1f} mm" for p in gross[:8]) + (" ..." if len(gross) > 8 else "")
-        out.append(
-            f"{len(gross)} of the {n} scans {'is a gross outlier' if len(gross) == 1 else 'are gross outliers'}: {names}."
-        )
+    out += _gross(result, poses)
     tilts = [p.tilt_deg for p in poses if p.tilt_deg is not None]
     if tilts and float(np.median(tilts)) > _WORST_TILT_DEG:
         out.append(

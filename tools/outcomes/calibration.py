@@ -124,6 +124,24 @@ class PoseError:
     used_before: bool
 
 
+USE, CARE, DO_NOT, NONE = "use it", "use with care", "do not use", "not a verification"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """The verdict of a verification (one of the four above), its limit for the median of the new scans in mm (None: the calibration
+    states none) and the reason, a sentence."""
+
+    verdict: str
+    limit_mm: float | None
+    reason: str
+
+    @property
+    def tone(self) -> str:
+        """The report's colour."""
+        return {USE: "good", DO_NOT: "bad"}.get(self.verdict, "warn")
+
+
 @dataclass(frozen=True)
 class VerifyReport:
     """The result of a verification. ``observations`` include the scanner correction where the result has one."""
@@ -137,6 +155,7 @@ class VerifyReport:
     warnings: tuple[str, ...]
     hashes: dict[str, str]
     out: Path
+    verdict: Verdict
 
     @property
     def position_error_mm(self) -> dict[str, float]:
@@ -153,6 +172,9 @@ class VerifyReport:
         """The JSON object of `verify`. A refused scan is named in the warnings."""
         return {
             "state": "done",
+            "verdict": self.verdict.verdict,
+            "limit_mm": self.verdict.limit_mm,
+            "reason": self.verdict.reason,
             "position_error_mm": self.position_error_mm,
             "tilt_deg": self.tilt_deg,
             "per_pose": [{"id": p.id, "error_mm": p.error_mm, "tilt_deg": p.tilt_deg} for p in self.poses],

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.planning.next_pose import NextPose
@@ -76,6 +77,7 @@ class HandEyeReport:
                 + "  ".join(f"{v:+.4f}" for v in rpy)
                 + "  deg  +- "
                 + _sigmas(np.degrees(sigma[:3]), 57.3),
+                f"  UR pose      {export_ur_pose(X).strip()}",
             ]
         lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():

@@ -32,6 +32,8 @@ def verify_report(report: VerifyReport, *, dataset: str) -> str:
         "verify.html.j2",
         dataset=dataset,
         r=report.result,
+        v=report.verdict,
+        n_new=int(fresh.sum()),
         error=report.position_error_mm,
         tilt=report.tilt_deg,
         stated=stated,

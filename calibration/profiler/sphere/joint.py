@@ -23,7 +23,6 @@ Model = Literal["rigid", "affine", "affine+joints"]
 MINIMUM_POSES = 5
 SINGULAR = 1e-5
 WRONG_POSE = 5.0  # times the others' residual (its mean, or its rms) at which a scan is named
-ARM_ALLOWED = 1.1  # times the best leave-one-out error
 MOST_WRONG = 0.25  # of the scans may be excluded as wrong
 RIVAL = 4.0  # sigmas: another optimum is excluded where it explains the points worse by more
 APART_RAD, OPEN_RAD = np.radians(1.0), np.radians(5.0)
@@ -60,6 +59,15 @@ class SphereEstimate(ProfilerEstimate):
     def flange(self, arm: DhArm, q: Floats) -> FlangePoses:
         """Flange poses of the arm (as it is drawn) with the errors that were found, at joints (n, 6) rad."""
         return arm.with_errors(q, self.arm_errors, arm.loads(q))
+
+
+@dataclass(frozen=True)
+class ModelChoice:
+    """The model taken, the rms (m) of held-out scans by each model, and the sentence that says why."""
+
+    model: Model
+    left_out_m: dict[Model, float]
+    reason: str
 
 
 def sphere_joint(
@@ -150,11 +158,15 @@ def leave_one_out_m(data: SphereData, model: Model, sigmas: SphereSigmas | None 
     return np.array(errors)
 
 
-def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> tuple[Model, dict[Model, float]]:
-    """The model with the least leave-one-scan-out error (rms m of each is returned); the simpler one where they are equal.
+def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> ModelChoice:
+    """The model that held-out scans ask for, by the one-standard-error rule on paired squared errors of the same scans.
 
-    The arm's own errors show where the arm goes afterwards and hardly in scans of one sphere. Their priors keep them from
-    explaining noise: the model that has them is taken unless it predicts held-out scans clearly worse.
+    Rigid or affine: the simpler one, unless affine predicts held-out scans better by more than one standard error of the
+    differences. The arm's own errors: their priors are what is known of the arm, so that leaving them out is the assumption (an
+    exact arm), and scans of one sphere hardly show them though they move the flange elsewhere. The model that has them is
+    taken, unless it predicts held-out scans worse by more than one standard error.
+
+    Source: one standard error, Breiman, Friedman, Olshen and Stone, "Classification and Regression Trees", 1984, 3.4.3.
     """
     names: list[Model] = ["rigid", "affine"]
     if data.arm is not None:
@@ -162,11 +174,27 @@ def choose_model(data: SphereData, sigmas: SphereSigmas | None = None) -> tuple[
     each = {name: leave_one_out_m(data, name, sigmas) for name in names}
     # no model predicts a wrong scan
     usual = each["rigid"] < WRONG_POSE * np.median(each["rigid"])
-    errors = {name: float(np.sqrt(np.mean(e[usual] ** 2))) for name, e in each.items()}
-    best = min(errors.values())
-    if errors.get("affine+joints", np.inf) <= ARM_ALLOWED * best:
-        return "affine+joints", errors
-    return next(name for name in names if errors[name] <= 1.02 * best), errors
+    square = {name: e[usual] ** 2 for name, e in each.items()}
+    errors = {name: float(np.sqrt(np.mean(e))) for name, e in square.items()}
+    chosen: Model = "affine" if _clearly_less(square["affine"], square["rigid"]) else "rigid"
+    why = f"affine is {'' if chosen == 'affine' else 'not '}clearly better than rigid"
+    if "affine+joints" in square:
+        if _clearly_less(square[chosen], square["affine+joints"]):
+            why += f", and affine+joints is clearly worse than {chosen}"
+        else:
+            why = (
+                f"affine+joints is not clearly worse than {chosen}: scans of one sphere hardly show the arm's errors, and to leave them out is "
+                "to call the arm exact"
+            )
+            chosen = "affine+joints"
+    figures = ", ".join(f"{name} {1e3 * v:.4f} mm" for name, v in errors.items())
+    return ModelChoice(chosen, errors, f"Held-out scans: {figures}; {why} (by one standard error of the differences).")
+
+
+def _clearly_less(a: Floats, b: Floats) -> bool:
+    """Whether paired values (n,) a are less than b on average, by more than one standard error of their differences."""
+    d = b - a
+    return bool(d.mean() > d.std(ddof=1) / np.sqrt(len(d))) if len(d) > 1 else False
 
 
 def _check(data: SphereData, model: Model) -> None:
@@ -224,7 +252,7 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     off = (np.abs(mean) > WRONG_POSE * spread) | (rms > WRONG_POSE * np.median(rms) + problem.sigmas.robot_m)
     wrong = tuple(int(k) for k in np.flatnonzero(off))
     by_radius = problem.by_radius()
-    step, sigma = _last_step(np.column_stack([J, by_radius]), r)
+    step, sigma = last_step(np.column_stack([J, by_radius]), r)
     whole = np.asarray(np.linalg.inv(H))
     return SphereEstimate(
         rotation=R,
@@ -247,8 +275,8 @@ def _estimate(problem: Problem, R0: Floats, x: Floats) -> SphereEstimate:
     )
 
 
-def _last_step(J: Floats, r: Floats) -> tuple[float, float]:
-    """How far the last unknown would go in one step of least squares, and its sigma."""
+def last_step(J: Floats, r: Floats) -> tuple[float, float]:
+    """(step, sigma): how far the last unknown would go in one step of least squares, and its sigma."""
     unit = np.linalg.norm(J, axis=0)
     C = np.linalg.pinv((J / unit).T @ (J / unit))
     return float(-(C @ ((J / unit).T @ r))[-1] / unit[-1]), float(np.sqrt(C[-1, -1]) / unit[-1])

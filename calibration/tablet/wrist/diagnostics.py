@@ -1,4 +1,4 @@
-"""Diagnoses touches from full robot poses: scale, single wrong landmarks and wrong order; changes nothing."""
+"""Diagnoses touches from full robot poses: scale, single wrong landmarks, wrong order; refuses what does not fit."""
 
 import dataclasses as dc
 
@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS
 from weldcal.calibration.tablet.wrist.fit import WristFit, WristTouches
 
@@ -14,6 +15,38 @@ _BAD_TOUCH_M, _BAD_PIXEL = 1.5e-3, 2.0  # residuals above these are no noise
 _GOOD_TOUCH_M = 3e-3  # what the others must come to where one landmark alone is to blame
 _LEAST_TO_DOUBT = 6  # landmarks
 _BETTER = 0.4  # what a change must leave of the residuals to be told
+_REFUSED_M = 3e-3
+"""Rms of the touches, or of the image on the page, beyond which nothing is written. A touch scatters by 0.3 mm an axis and an
+arm is 1 mm off over a page: 1.1 mm together, of which nine touches exceed 2.1 times once in 1e9 (chi-square, 18 free)."""
+_BEHIND_M, _BEHIND_SIGMAS = 1e-2, 4.0  # how far behind the page the pen may seem to be when the picture is taken
+
+
+def check_wrist(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> None:
+    """Refuse a fit that is none: touches, poses and image that contradict each other; `names` of the landmarks.
+
+    Raises:
+        TabletDataError: with the likeliest cause.
+    """
+    touch = float(np.sqrt((fit.touch_residuals_m**2).sum(axis=1).mean()))
+    if touch > _REFUSED_M:
+        raise TabletDataError(f"{_why_touches(data, touch, names)} Nothing is written.")
+    X_BF, _ = data.views[0]
+    X_TB = fit.X_BT.inverse()
+    p_TC = (X_TB @ X_BF @ fit.X_FC).translation()
+    across = float(X_TB.multiply(X_BF.multiply(fit.p_FP))[2])
+    # by how much an open pen length moves the tip, where the flange leaned otherwise for the picture than for the touches
+    n_B = fit.X_BT.rotation().matrix()[:, 2]
+    lean = n_B @ X_BF.rotation().matrix() - np.mean([n_B @ X.rotation().matrix() for X in data.X_BF], axis=0)
+    unsure = float(np.sqrt(max(lean @ fit.pen_covariance @ lean, 0.0)))
+    if -np.sign(p_TC[2]) * across > _BEHIND_M + _BEHIND_SIGMAS * unsure:
+        raise TabletDataError(
+            f"Camera and pen are on different sides of the page ({1e3 * abs(p_TC[2]):.0f} and {1e3 * abs(across):.0f} mm from it), so it is "
+            "mirrored in touches or image: check that x is before y in touches and landmarks, and u before v in the image."
+        )
+    pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
+    depth = float(np.linalg.norm(p_TC - np.r_[data.landmark_m.mean(axis=0), 0.0]))
+    if pixel / data.focal_px * depth > _REFUSED_M:
+        raise TabletDataError(f"{_why_pixels(pixel)} Nothing is written.")
 
 
 def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...]) -> tuple[str, ...]:
@@ -30,10 +63,7 @@ def wrist_diagnostics(data: WristTouches, fit: WristFit, names: tuple[str, ...])
         found.append(_why_touches(data, touch, names))
     pixel = float(np.sqrt((fit.pixel_residuals**2).sum(axis=-1).mean()))
     if pixel > _BAD_PIXEL:
-        found.append(
-            f"The image shows the landmarks {pixel:.1f} px from the positions of the fit: check the camera's intrinsics, its distortion, "
-            "and that image and page belong together."
-        )
+        found.append(_why_pixels(pixel))
     return tuple(found)
 
 
@@ -90,6 +120,13 @@ def _why_touches(data: WristTouches, left_m: float, names: tuple[str, ...]) -> s
         if left < _BETTER * left_m:
             return f"{plain}, to {1e3 * left:.2f} mm with {what}. Check the file."
     return f"{plain}: check that poses and touches belong to the same landmarks, and that the tablet did not move."
+
+
+def _why_pixels(pixel: float) -> str:
+    return (
+        f"The image shows the landmarks {pixel:.1f} px from the positions of the fit: check the camera's intrinsics, its distortion, "
+        "and that image and page belong together."
+    )
 
 
 def _misfit(data: WristTouches) -> float:

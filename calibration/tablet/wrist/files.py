@@ -18,6 +18,7 @@ from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
 from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist.fit import WristTouches
 from weldcal.calibration.tablet.wrist.page_grid import find_page
+from weldcal.calibration.tablet.wrist.page_match import check_page_match
 from weldcal.models.arrays import Array
 
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
@@ -60,8 +61,8 @@ def load_visit(
 
     ``poses``: landmark,x,y,z,qw,qx,qy,qz of X_BF in metres at each touch, and one row whose landmark is `camera` for where
     the image was taken. Of a landmark touched twice the last touch and the last pose count. Landmarks without a pose are left
-    out and named in the warnings. ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the file and what to change,
-    LandmarksNotFound for the image.
+    out and named in the warnings. ``tip_radius_m`` of a round pen tip. Raises TabletDataError with the file and what to change
+    (touches that are not at their landmarks too), LandmarksNotFound for the image.
     """
     rows = {landmark(r, touches): r for r in read_table(touches, TOUCH_COLUMNS)}
     if not rows:
@@ -82,6 +83,8 @@ def load_visit(
     shown = {k: np.array([v["landmark_x_px"], v["landmark_y_px"]]) for k, v in values.items()}
     touched = scale * np.array([[values[k]["touch_x_px"], values[k]["touch_y_px"]] for k in used])
     landmarks = scale * np.array([shown[k] for k in used])
+    names = tuple(str(k) for k in used)
+    odd = check_page_match(touched / scale, landmarks / scale, names, 1e3 * scale, touches.name)
     intrinsics = load_intrinsics(camera)
     picture, found = None, np.zeros((0, 2))
     if seen is not None:
@@ -101,8 +104,8 @@ def load_visit(
         focal_px=float(intrinsics.focal_px.mean()),
         tip_radius_m=tip_radius_m,
     )
-    told = _warnings(rows, used, poses, intrinsics, picture, camera)
-    return WristVisit(data, told, tuple(str(k) for k in used), picture, found)
+    told = (*odd, *_warnings(rows, used, poses, intrinsics, picture, camera))
+    return WristVisit(data, told, names, picture, found)
 
 
 def _poses(path: Path) -> tuple[RigidTransform, dict[int, RigidTransform]]:

@@ -26,6 +26,7 @@ class JobPlan:
     verification_scans: int
     verification_limit_m: float
     required_error_m: float
+    minimum_scans: int = 0
     dwell_s: float = 0.3
     scan_timeout_s: float = 8.0
     move_timeout_s: float = 20.0
@@ -153,6 +154,12 @@ def unreached_reason(status: CalibrationStatus, plan: JobPlan) -> str:
     if status.estimate is None:
         why = status.refused[-1][1] if status.refused else status.message
         return f"No calibration after {status.calibration_scans} scans: {why}"
+    if status.predicted_error_m <= plan.required_error_m:  # so that the scans are too few
+        return (
+            f"Only {len(status.observations)} of {status.calibration_scans} scans could be used, and the calibration needs "
+            f"{plan.minimum_scans} (it expects {status.predicted_error_m * 1e3:.3f} mm at the work point, within the required "
+            f"{required:.3f} mm); allow more scans, or a pose from which the scanner sees the feature."
+        )
     return (
         f"The calibration did not reach the required {required:.3f} mm: after {status.calibration_scans} scans it expects "
         f"{status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans, a wider workspace or a better scanner."

@@ -106,6 +106,7 @@ def job_plan(scenario: Scenario) -> JobPlan:
         verification_scans=c.verification_scans,
         verification_limit_m=c.verification_limit_mm * 1e-3,
         required_error_m=c.required_error_mm * 1e-3,
+        minimum_scans=c.minimum_scans,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
         maximum_time_s=job.maximum_time_s * slower,
     )

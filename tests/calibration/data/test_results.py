@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +86,16 @@ def test_every_export_says_the_same_pose(result: CalibrationResult, tmp_path: Pa
     assert np.allclose([float(ros[k]) for k in ("qw", "qx", "qy", "qz")], q.wxyz(), atol=1e-8)
     assert np.allclose(json.loads(export_json(result))["X_BC"], X_BC.GetAsMatrix4())
     assert all(path.is_file() for path in export_all(result, tmp_path / "exports"))
+
+
+def test_the_urdf_is_one_xml_document_with_its_note_inside(result: CalibrationResult, tmp_path: Path) -> None:
+    corrected = replace(result, scanner_correction={"scale": 1.002, "gradient_per_m": [0.01, -0.01]})
+    for k, one in enumerate((result, corrected)):
+        export_all(one, tmp_path / str(k))
+        root = ET.parse(tmp_path / str(k) / "scanner.urdf.xacro").getroot()
+        assert root.tag == "robot"
+        assert [e.tag for e in root] == ["link", "joint"]
+        assert ("multiply every point" in (tmp_path / str(k) / "scanner.urdf.xacro").read_text()) == (one is corrected)
 
 
 @pytest.mark.parametrize(

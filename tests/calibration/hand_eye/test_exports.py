@@ -49,7 +49,8 @@ def test_yaml_and_json_hold_the_whole_pose(written: tuple[HandEyeReport, Path]) 
 
 def test_urdf_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
     report, folder = written
-    root = ET.fromstring(f"<robot name='a'>{(folder / 'X_FC.urdf.xacro').read_text()}</robot>")
+    root = ET.parse(folder / "X_FC.urdf.xacro").getroot()
+    assert root.tag == "robot"
     joint = root.find("joint")
     assert joint is not None
     assert [joint.find(k).get("link") for k in ("parent", "child")] == ["flange", "camera_optical_frame"]  # type: ignore[union-attr]
@@ -57,6 +58,12 @@ def test_urdf_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
     assert origin is not None
     xyz, rpy = ([float(v) for v in str(origin.get(k)).split()] for k in ("xyz", "rpy"))
     same(RigidTransform(RollPitchYaw(*rpy), xyz), report.result.X)
+
+
+def test_the_terminal_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:
+    report, folder = written
+    for symbol in ("X_FC", "X_BM"):
+        assert f"UR pose      {(folder / f'{symbol}.ur_pose.script').read_text().strip()}" in report.text()
 
 
 def test_ros_2_says_the_same_pose(written: tuple[HandEyeReport, Path]) -> None:

@@ -330,6 +330,7 @@ def test_on_real_profiles_what_is_left_out_is_foretold_and_no_more_model_is_take
     parts = np.split(z["xz"] * MM, np.cumsum(z["n"])[:-1])
     data = SphereData(poses(z["T_base_flange"]), [p[::8] for p in parts], 40 * MM)
     assert leave_one_out_m(data, "rigid").mean() <= 0.152 * MM
-    model, errors = choose_model(data)
-    assert model == "rigid"
-    assert errors["rigid"] < errors["affine"]
+    choice = choose_model(data)
+    assert choice.model == "rigid"
+    assert choice.left_out_m["rigid"] < choice.left_out_m["affine"]
+    assert "affine is not clearly better than rigid" in choice.reason

@@ -6,17 +6,15 @@ import csv
 import json
 import re
 import shutil
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform, RollPitchYaw
-from typer.testing import CliRunner
+from pydrake.math import RigidTransform
 
-from tests.calibration.tablet.image import grid, picture, project
+from tests.calibration.tablet.visit import MM_PER_PX, P_FP, X_FC, csv_options, rows_of, run, write, write_visit
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.planar.files import load_planar
 from weldcal.calibration.tablet.result import load_tablet_result
@@ -24,28 +22,7 @@ from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import WristVisit, load_visit
 from weldcal.calibration.tablet.wrist.fit import fit_wrist
 from weldcal.models.errors import InputError
-from weldcal.tools.cli.app import app
 from weldcal.tools.studies.tablet.paper import published_touches
-
-X_FC = RigidTransform(RollPitchYaw(0.03, -0.05, 1.5), [0.06, 0.02, 0.05])
-P_FP = np.array([-0.002, -0.021, 0.163])
-X_BT = RigidTransform(RollPitchYaw(np.pi + 0.01, -0.02, 0.4), [0.5, -0.1, 0.02])
-K = np.array([[617.7, 0.0, 316.5], [0.0, 617.7, 242.3], [0.0, 0.0, 1.0]])
-PAGE = grid(3, 3, 0.06, 0.038)
-MM_PER_PX = 0.125
-
-
-def run(*arguments: object) -> tuple[int, dict[str, Any], str]:
-    finished = CliRunner().invoke(app, ["tablet", "calibrate", *map(str, arguments), "--json"])
-    return finished.exit_code, json.loads(finished.stdout.splitlines()[-1]) if finished.stdout else {}, finished.output
-
-
-def write(path: Path, rows: Sequence[Mapping[str, object]]) -> Path:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
 
 
 @pytest.fixture
@@ -62,45 +39,7 @@ def npz(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def visit(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A simulated visit as files: the page's CSV, flange poses, intrinsics and a picture that is blurred and noisy."""
-    folder = tmp_path_factory.mktemp("visit")
-    rng = np.random.default_rng(5)
-    shown = PAGE / (1e-3 * MM_PER_PX) + [150.5, 120.5]
-    touched = np.round(shown + rng.normal(0.0, 4.0, shown.shape), 1)
-    rows, poses = [], []
-    for k, p in enumerate(touched):
-        R = RollPitchYaw(
-            np.pi + 0.2 * rng.uniform(-1, 1), 0.2 * rng.uniform(-1, 1), np.radians(-90 + 22.5 * k)
-        ).ToRotationMatrix()
-        tip = X_BT.multiply(np.r_[1e-3 * MM_PER_PX * (p - shown[0]), 0.0]) + rng.normal(0.0, 0.05e-3, 3)
-        poses.append(_pose_row(str(k), RigidTransform(R, tip - R.multiply(P_FP))))
-        rows.append(
-            {"landmark": k, "time_utc": "2026-01-01T00:00:00.000Z", "landmark_x_px": shown[k, 0], "landmark_y_px": shown[k, 1],
-             "touch_x_px": p[0], "touch_y_px": p[1], "mm_per_px": MM_PER_PX, "size_checked": 1}
-        )  # fmt: skip
-    middle = X_BT.multiply(np.r_[PAGE[4], 0.0])
-    R_BF = RollPitchYaw(np.pi + 0.1, -0.08, -1.0).ToRotationMatrix()
-    X_BF = RigidTransform(
-        R_BF, middle - (R_BF @ X_FC.rotation()).multiply([0.0, 0.0, 0.3]) - R_BF.multiply(X_FC.translation())
-    )
-    poses.append(_pose_row("camera", X_BF))
-    X_CT = (X_BF @ X_FC).inverse() @ X_BT
-    cv2.imwrite(str(folder / "picture.png"), picture(X_CT, PAGE, K))
-    write(folder / "touches.csv", rows)
-    write(folder / "poses.csv", poses)
-    uv = project(X_CT, PAGE, K)
-    write(folder / "seen.csv", [{"landmark": k, "u": u, "v": v} for k, (u, v) in enumerate(uv)])
-    (folder / "camera.yaml").write_text("fx: 617.7\nfy: 617.7\ncx: 316.5\ncy: 242.3\n")
-    return folder
-
-
-def _pose_row(name: str, X: RigidTransform) -> dict[str, object]:
-    q, p = X.rotation().ToQuaternion().wxyz(), X.translation()
-    return {"landmark": name, **dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), (*p, *q), strict=True))}
-
-
-def csv_options(visit: Path) -> list[object]:
-    return [visit / "touches.csv", "--poses", visit / "poses.csv", "--camera", visit / "camera.yaml"]
+    return write_visit(tmp_path_factory.mktemp("visit"))
 
 
 def test_an_npz_is_calibrated_and_its_size_questioned(npz: Path, tmp_path: Path) -> None:
@@ -217,10 +156,6 @@ def test_a_result_that_is_none_is_told(tmp_path: Path) -> None:
         load_tablet_result(tmp_path)
 
 
-def _rows(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(path.read_text().splitlines()))
-
-
 def _comma(folder: Path) -> None:
     """As a spreadsheet of a country with a decimal comma writes it, with a byte order mark."""
     for name in ("touches.csv", "poses.csv"):
@@ -235,11 +170,11 @@ def _header(folder: Path) -> None:
 
 def _backwards(folder: Path) -> None:
     for name in ("touches.csv", "poses.csv"):
-        write(folder / name, [dict(reversed(list(r.items()))) for r in reversed(_rows(folder / name))])
+        write(folder / name, [dict(reversed(list(r.items()))) for r in reversed(rows_of(folder / name))])
 
 
 def _turned_page(folder: Path) -> None:
-    rows = _rows(folder / "touches.csv")
+    rows = rows_of(folder / "touches.csv")
     for row in rows:
         for what in ("landmark", "touch"):
             x, y = float(row[f"{what}_x_px"]), float(row[f"{what}_y_px"])
@@ -264,9 +199,9 @@ OPENCV = (
         lambda f: (f / "camera.yaml").write_text(ROS),
         lambda f: (f / "camera.yaml").write_text(OPENCV),
         lambda f: write(
-            f / "touches.csv", _rows(f / "touches.csv")[:6]
+            f / "touches.csv", rows_of(f / "touches.csv")[:6]
         ),  # the third row is in the picture all the same
-        lambda f: write(f / "touches.csv", _rows(f / "touches.csv")[:8]),
+        lambda f: write(f / "touches.csv", rows_of(f / "touches.csv")[:8]),
     ],
 )
 def test_the_same_visit_in_another_dress_is_the_same(visit: Path, tmp_path: Path, change: Any) -> None:
@@ -294,7 +229,7 @@ def _distances(points: np.ndarray) -> np.ndarray:
 
 
 def _shifted(folder: Path, column: str, by: float) -> None:
-    rows = _rows(folder / "poses.csv")
+    rows = rows_of(folder / "poses.csv")
     write(folder / "poses.csv", [{**r, column: float(r[column]) + by * (r["landmark"] == "4")} for r in rows])
 
 
@@ -306,7 +241,7 @@ def _shifted(folder: Path, column: str, by: float) -> None:
         (lambda f: _edit(f / "touches.csv", str(MM_PER_PX), str(1.03 * MM_PER_PX)), "differ by -[23].. % in length"),
         (lambda f: _edit(f / "camera.yaml", "cx: 316.5", "cx: 200.0"), "principal point of 'camera.yaml'"),
         (
-            lambda f: write(f / "poses.csv", [r for r in _rows(f / "poses.csv") if r["landmark"] != "2"]),
+            lambda f: write(f / "poses.csv", [r for r in rows_of(f / "poses.csv") if r["landmark"] != "2"]),
             "without a pose in",
         ),
     ],
@@ -332,11 +267,11 @@ def test_what_looks_wrong_with_full_poses_is_told(visit: Path, tmp_path: Path, c
         (
             lambda f: write(
                 f / "poses.csv",
-                [{**r, "landmark": r["landmark"] if r["landmark"] == "camera" else int(r["landmark"]) + 1} for r in _rows(f / "poses.csv")],
+                [{**r, "landmark": r["landmark"] if r["landmark"] == "camera" else int(r["landmark"]) + 1} for r in rows_of(f / "poses.csv")],
             ),
             "counts its landmarks from 1",
         ),
-        (lambda f: write(f / "touches.csv", [{**r, "landmark": 2 * int(r["landmark"]) % 9} for r in _rows(f / "touches.csv")]), "make no grid"),
+        (lambda f: write(f / "touches.csv", [{**r, "landmark": 2 * int(r["landmark"]) % 9} for r in rows_of(f / "touches.csv")]), "make no grid"),
         (lambda f: (f / "touches.csv").write_text((f / "touches.csv").read_text().splitlines()[0]), "holds no touch"),
         (lambda f: (f / "camera.yaml").write_text("K: [600, 0, 320, 0, 600, 240, 0, 0, 1]\nD: [1, 2, 3]\n"), "OpenCV knows 4, 5"),
     ],

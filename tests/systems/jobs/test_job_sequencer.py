@@ -29,6 +29,7 @@ PLAN = JobPlan(
     verification_scans=2,
     verification_limit_m=0.5e-3,
     required_error_m=0.1e-3,
+    minimum_scans=6,
 )
 SEAM = SeamCurve.from_points(np.column_stack([np.linspace(0.0, 0.2, 20), np.zeros(20), np.zeros(20)]))
 PLANNED = PlannedSeam(
@@ -222,6 +223,12 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         0.1,
         {"calibration": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.234e-3)},
         r"did not reach the required 0\.100 mm: after 8 scans it expects 0\.234 mm",
+    ),
+    "required error reached from too few usable scans": (
+        "scan_pose",
+        0.1,
+        {"calibration": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.023e-3)},
+        r"^Only 0 of 8 scans could be used, and the calibration needs 6 .*0\.023 mm at the work point, within the required 0\.100 mm",
     ),
     "no calibration at all": (
         "scan_pose",

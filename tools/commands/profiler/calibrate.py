@@ -36,6 +36,7 @@ from weldcal.calibration.profiler.sphere.linear import (
     wrong_sides,
 )
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
+from weldcal.calibration.profiler.sphere.radius import SCALE_SIGMAS, check_radius
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.commands.profiler.files import ProfilerFile
@@ -209,16 +210,23 @@ def calibrate_sphere(
         raise InputError(f"The model is one of {', '.join(MODELS)}, not '{model}'.")
     s = SphereSigmas(sensor_m=sigmas.z_m, robot_m=sigmas.robot_m)
     found: dict[str, Any] = {"scans": len(data.poses), "touches": 0 if data.touches is None else len(data.touches)}
-    _refuse_inverse_poses(data, s)
+    scans = SphereData(data.poses, data.profiles, data.radius_m)
+    rigid = _rigid(scans, s)
+    check_radius(scans, s, rigid)
+    _refuse_inverse_poses(scans, rigid, s)
     chosen = cast(Model, model)
     if model == "auto":
         full = data.arm is not None and data.q is not None and (data.touches is None or data.touch_q is not None)
-        chosen, errors = choose_model(data if full else _without_arm(data), s)
-        found["left_out_rms_mm"] = {name: 1e3 * v for name, v in errors.items()}
+        choice = choose_model(data if full else _without_arm(data), s)
+        chosen = choice.model
+        found["left_out_rms_mm"] = {name: 1e3 * v for name, v in choice.left_out_m.items()}
+        found["model_reason"] = choice.reason
     e = _widened(sphere_joint(data, chosen, s))
     found |= {"model": chosen} | _figures(e)
     found["wrong_scans"] = list(e.wrong_poses)
-    found["radius_of_profiles_mm"] = 1e3 * (data.radius_m + e.radius_change_m)
+    # to first order, and so only where it is near the stated one
+    known = abs(e.radius_change_m) <= SCALE_SIGMAS * s.affine * data.radius_m
+    found["radius_of_profiles_mm"] = 1e3 * (data.radius_m + e.radius_change_m) if known else None
     found["warnings"] = _warnings(e, data, s)
     if plan:
         if np.median([fit_circle(p)[0][1] - np.median(p[:, 1]) for p in data.profiles]) < 0.0:
@@ -241,35 +249,36 @@ def _widened(e: Estimate) -> Estimate:
     return replace(e, covariance=believed_covariance(e))
 
 
-def _refuse_inverse_poses(data: SphereData, s: SphereSigmas) -> None:
+def _refuse_inverse_poses(scans: SphereData, rigid: SphereEstimate | None, s: SphereSigmas) -> None:
     """Refuses poses of the base in the flange instead of the flange in the base.
 
     Raises:
         InputError: the inverse poses fit the profiles far better.
     """
-    scans = SphereData(data.poses, data.profiles, data.radius_m)
-    chi2 = _rigid_chi2(scans, s)
+    chi2 = float("inf") if rigid is None else rigid.reduced_chi2
     if chi2 < POORLY:
         return
-    R, p = data.poses.rotation, data.poses.translation
+    R, p = scans.poses.rotation, scans.poses.translation
     inverse = FlangePoses(np.swapaxes(R, 1, 2), -np.einsum("nji,nj->ni", R, p))
-    if _rigid_chi2(replace(scans, poses=inverse), s) < 0.4 * chi2:
+    other = _rigid(replace(scans, poses=inverse), s)
+    if other is not None and other.reduced_chi2 < 0.4 * chi2:
         raise InputError(
             "The inverses of the poses fit the profiles. Give the flange in the base, not the base in the flange."
         )
 
 
-def _rigid_chi2(data: SphereData, s: SphereSigmas) -> float:
-    """Reduced chi-square of the rigid model; infinite where it refuses."""
+def _rigid(scans: SphereData, s: SphereSigmas) -> SphereEstimate | None:
+    """The rigid model's estimate; None where it refuses."""
     try:
-        return sphere_joint(data, "rigid", s).reduced_chi2
+        return sphere_joint(scans, "rigid", s)
     except WeldcalError:
-        return float("inf")
+        return None
 
 
 def _warnings(e: SphereEstimate, data: SphereData, s: SphereSigmas) -> list[str]:
     said = []
-    if abs(e.radius_change_m) > max(4.0 * e.radius_sigma_m, RADIUS_OFF_M):
+    known = abs(e.radius_change_m) <= SCALE_SIGMAS * s.affine * data.radius_m
+    if known and abs(e.radius_change_m) > max(4.0 * e.radius_sigma_m, RADIUS_OFF_M):
         said.append(
             f"The profiles show a sphere of {1e3 * (data.radius_m + e.radius_change_m):.2f} mm instead of "
             f"{1e3 * data.radius_m:.2f}. Check the radius and the profiler's scale."
@@ -297,6 +306,7 @@ def calibrate_compensate(
             "The compensation needs touches. Give 'touch_T' and 'tip' in the file, or --touches and --tip."
         )
     _check_number(data.poses, sign.shape, "signs")
+    check_radius(data, SphereSigmas(), None)
     if "translated" in file.arrays:
         translated = file.arrays["translated"] > 0.5
     else:

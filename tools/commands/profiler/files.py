@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.tables import read_rows
+from weldcal.calibration.data.tables import cut_off, read_rows
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.models.errors import InputError
@@ -33,11 +33,12 @@ LENGTHS = ("translation", "points", "profiles", "tip", "radius", "sigma")
 
 @dataclass(frozen=True, eq=False)
 class ProfilerFile:
-    """The contents of a file, in m and rad; `digest` is its SHA-256."""
+    """The contents of a file, in m and rad; `digest` is its SHA-256; `warnings` about it are sentences."""
 
     arrays: dict[str, Floats]
     profiles: tuple[Floats, ...] | None
     digest: str
+    warnings: tuple[str, ...] = ()
 
     def poses(self, of: str = "") -> FlangePoses | None:
         """Flange poses of the scans, or of="touch_"; None where there are none."""
@@ -86,13 +87,15 @@ def read_profiler_file(
     if unit is not None and unit not in UNITS:
         raise InputError(f"The unit is m or mm, not '{unit}'.")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    told: str | None = None
     if path.suffix.lower() == ".csv":
         arrays, profiles = _from_csv(path)
+        told = cut_off(path)
     elif path.suffix.lower() == ".npz":
         arrays, profiles = _from_npz(path, unit, dataset, trial)
     else:
         raise InputError(f"'{path.name}' is neither .npz nor .csv. Give one of these.")
-    file = ProfilerFile(arrays, profiles, digest)
+    file = ProfilerFile(arrays, profiles, digest, () if told is None else (told,))
     X = file.poses()
     if X is None:
         raise InputError("The file has no flange poses. Give 'T', or 'rotation' and 'translation'.")

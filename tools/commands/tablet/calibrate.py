@@ -13,7 +13,7 @@ from weldcal.calibration.tablet.published.chain import HTM_NAMES
 from weldcal.calibration.tablet.published.two_stage import AFFINE_NAMES, Sign
 from weldcal.calibration.tablet.result import TabletResult, save_tablet_result
 from weldcal.calibration.tablet.touches import TabletTouches
-from weldcal.calibration.tablet.wrist.diagnostics import wrist_diagnostics
+from weldcal.calibration.tablet.wrist.diagnostics import check_wrist, wrist_diagnostics
 from weldcal.calibration.tablet.wrist.files import file_hash, load_visit
 from weldcal.calibration.tablet.wrist.fit import WristFit, fit_wrist
 from weldcal.models.errors import InputError
@@ -164,6 +164,7 @@ def _wrist(inputs: TabletInputs) -> TabletCalibration:
         tip_radius_m=inputs.pen_radius_m,
     )
     fit = fit_wrist(visit.data, inputs.pen_length_m)
+    check_wrist(visit.data, fit, visit.names)
     files = (inputs.file, inputs.poses, inputs.camera, inputs.image, inputs.seen)
     in_page = fit.touch_residuals_m @ fit.X_BT.rotation().matrix()[:, :2]
     picture = None if visit.picture is None else marked_picture(visit.picture, visit.found_px)

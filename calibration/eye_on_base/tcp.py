@@ -1,0 +1,218 @@
+"""Finds a TCP that was set while the poses were recorded: a constant offset of the circle in the flange's frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.stats import f as f_distribution
+
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.models.arrays import Array
+
+FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
+_SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a TCP of a millimetre
+_UNKNOWN_M = 5e-3  # one sigma of an axis from which on it is not known
+_SURE_SIGMAS = 4.0
+_LEAST_FREE = 5  # spare numbers of the test
+_SCANNER_ORDERS = ((12, 2), (7, 1), (0, 0))
+"""From how many poses on the scanner's own error is left open to which power of x, y and z: a scale error looks like a TCP along z
+where every pose faces the scanner. Depth is among them: triangulation errs with its square, time of flight in waves over it."""
+_GATE = 6.5  # sigmas of a pose that takes no part, as in the calibration
+_USUAL_SPREAD_M = 1e-4
+_SINGULAR = 1e-6
+
+
+@dataclass(frozen=True)
+class TcpOffset:
+    """A TCP that the poses seem to carry.
+
+    ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z; ``sigma_m`` (3,), infinite where
+    these poses do not show it; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability`` that chance
+    alone does as much.
+    """
+
+    offset_m: Array
+    sigma_m: Array
+    with_m: float
+    without_m: float
+    probability: float
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Which of x, y, z the poses show (3,)."""
+        return np.asarray(self.sigma_m < _UNKNOWN_M)
+
+    @property
+    def length_m(self) -> float:
+        """Of the axes that are known."""
+        return float(np.linalg.norm(self.offset_m[self.known]))
+
+    def surely_beyond(self, length_m: float) -> bool:
+        """Whether it is longer than that by four sigmas."""
+        sigma = float(np.sqrt((self.sigma_m[self.known] ** 2).sum()))
+        return self.length_m - _SURE_SIGMAS * sigma > length_m
+
+    def sentence(self, X_FR: RigidTransform | None) -> str:
+        """What to do, where poses were read with the feature at ``X_FR``; None where there are pairs and no poses."""
+        tcp = ", ".join(f"{-1e3 * v:.1f}" if k else "?" for v, k in zip(self.offset_m, self.known, strict=True))
+        cure = "or correct the positions in pairs.csv"
+        if X_FR is not None:
+            at = X_FR.multiply(np.where(self.known, self.offset_m, 0.0))
+            cure = f"or write feature_in_flange: {{xyz: [{', '.join(f'{v:.5f}' for v in at)}]}} (m) in dataset.yaml"
+        hidden = [a for a, k in zip("xyz", self.known, strict=True) if not k]
+        open_axes = (
+            f" Its {' and '.join(hidden)} cannot be seen in these poses: take it from the controller." if hidden else ""
+        )
+        return (
+            f"The poses look as if a TCP of ({tcp}) mm were set at the robot: with it, centres fit to {1e3 * self.with_m:.2f} mm instead "
+            f"of {1e3 * self.without_m:.2f}. Set the TCP to zero and record again, {cure}.{open_axes}"
+        )
+
+
+def find_tcp(observations: Sequence[Observation], start: RigidTransform | None = None) -> TcpOffset | None:
+    """The TCP that observations (n >= 5) seem to carry; None where they show none, or cannot.
+
+    With the scanner's own errors left open, centres are fitted with and without a constant offset b in the frame of the
+    poses, R_BC p_C + p_BC = p_BR + R_BR b. The F-test of both holds FALSE_ALARM for normal errors; besides, the offset must be
+    longer than arms are off. ``start`` of the camera's pose where one is known.
+    """
+    n = len(observations)
+    order = next(k for least, k in _SCANNER_ORDERS if n >= least)
+    terms = (1, 4, 10)[order]
+    if n < 5 or 3 * n - 9 - terms < _LEAST_FREE:
+        return None
+    data = _Data.of(observations, order)
+    starts = [one for one in (start, _linear_start(data), _rigid_start(data)) if one is not None]
+    fitted = [_fit(data, one, offset=True) for one in starts]
+    best = min(fitted, key=lambda one: float(np.median(one.norms)))
+    scale = float(np.median(best.norms)) / 1.5382  # of the chi distribution with three free
+    keep = best.norms < _GATE * max(scale, 1e-6) * np.sqrt(3.0 * n / max(3 * n - 9 - terms, 1))
+    if 3 * int(keep.sum()) - 9 - terms < _LEAST_FREE or 2 * int(keep.sum()) <= n:
+        return None
+    data = data.pick(keep)
+    full, bare = _fit(data, best.X_BC, offset=True, robust=False), _fit(data, best.X_BC, offset=False, robust=False)
+    gained, free = full.rank - bare.rank, 3 * int(keep.sum()) - full.rank
+    if gained < 1 or free < _LEAST_FREE:
+        return None
+    variance = max(full.square / free, 1e-12)
+    value = (bare.square - full.square) / gained / variance
+    probability = float(f_distribution.sf(value, gained, free))
+    found = TcpOffset(
+        full.offset,
+        np.sqrt(variance) * full.offset_factor,
+        float(np.sqrt(full.square / keep.sum())),
+        float(np.sqrt(bare.square / keep.sum())),
+        probability,
+    )
+    return found if probability < FALSE_ALARM and found.length_m > _SHORTEST_M else None
+
+
+@dataclass(frozen=True)
+class _Data:
+    """Centres c (n, 3) in the camera, b (n, 3) in the base, rotations R (n, 3, 3) of the poses, terms (n, K), weights (n,)."""
+
+    c: Array
+    b: Array
+    R: Array
+    terms: Array
+    weight: Array
+
+    @staticmethod
+    def of(observations: Sequence[Observation], order: int) -> "_Data":
+        c = np.array([o.p_CR for o in observations])
+        # about their middle, in their spread: powers of metres would be nearly alike
+        at = (c - c.mean(axis=0)) / np.maximum(c.std(axis=0), 1e-3)
+        powers = [e for e in product(range(order + 1), repeat=3) if sum(e) <= order]
+        noise = [0.0 if o.center_covariance is None else np.trace(o.center_covariance) / 3.0 for o in observations]
+        return _Data(
+            c,
+            np.array([o.p_BR for o in observations]),
+            np.array([o.X_BR.rotation().matrix() for o in observations]),
+            np.stack([np.prod(at ** np.array(e), axis=1) for e in powers], axis=1),
+            1.0 / np.sqrt(1.0 + np.array(noise) / _USUAL_SPREAD_M**2),
+        )
+
+    def pick(self, keep: NDArray[np.bool_]) -> "_Data":
+        return _Data(*(getattr(self, f)[keep] for f in ("c", "b", "R", "terms", "weight")))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    X_BC: RigidTransform
+    offset: Array
+    offset_factor: Array  # (3,) one sigma per sigma of a coordinate; infinite where the poses do not show it
+    norms: Array  # (n,) weighted distances
+    rank: int
+
+    @property
+    def square(self) -> float:
+        return float(self.norms @ self.norms)
+
+
+def _fit(data: _Data, start: RigidTransform, *, offset: bool, robust: bool = True) -> _Fit:
+    """Gauss-Newton over pose, scanner terms and, where asked, the offset; reweighted (soft L1) where ``robust``."""
+    n, K = data.terms.shape
+    R, p = start.rotation().matrix(), np.asarray(start.translation())
+    scanner, b = np.zeros(K), np.zeros(3)
+    size = 6 + K + (3 if offset else 0)
+    J, norms, unit = np.zeros((n, 3, size)), np.zeros(n), np.ones(size)
+    for k in range(40):
+        q = (data.c * (1.0 + data.terms @ scanner)[:, None]) @ R.T
+        e = (q + p - data.b - data.R @ b) * data.weight[:, None]
+        J[:, :, :3], J[:, :, 3:6] = -skew(q), np.eye(3)
+        J[:, :, 6 : 6 + K] = (data.c @ R.T)[:, :, None] * data.terms[:, None]
+        if offset:
+            J[:, :, 6 + K :] = -data.R
+        rows = J * data.weight[:, None, None]
+        norms = np.linalg.norm(e, axis=1)
+        w = np.ones(n)
+        if robust:
+            scale = max(float(np.median(norms)) / 1.5382, 1e-9)
+            w = (1.0 + (norms / (2.0 * scale)) ** 2) ** -0.25
+        A = (rows * w[:, None, None]).reshape(-1, size)
+        unit = np.maximum(np.linalg.norm(A, axis=0), 1e-12)
+        step = -np.linalg.lstsq(A / unit, (e * w[:, None]).ravel(), rcond=_SINGULAR)[0] / unit
+        dR = exp_rotation(step[:3])
+        R, p, scanner = (
+            RotationMatrix.ProjectToRotationMatrix(dR @ R).matrix(),
+            p + step[3:6],
+            scanner + step[6 : 6 + K],
+        )
+        b = b + step[6 + K :] if offset else b
+        if k > 3 and float(np.linalg.norm(step[:6])) < 1e-10:
+            break
+    _, s, Vt = np.linalg.svd((J * data.weight[:, None, None]).reshape(-1, size) / unit, full_matrices=False)
+    shown = s > _SINGULAR * s[0]
+    factor = np.full(3, np.inf)
+    if offset:
+        hidden = (Vt[~shown, 6 + K :] ** 2).sum(axis=0) > _SINGULAR
+        spread = np.sqrt(((Vt[shown, 6 + K :] / s[shown, None]) ** 2).sum(axis=0)) / unit[6 + K :]
+        factor = np.where(hidden, np.inf, spread)
+    return _Fit(RigidTransform(RotationMatrix(R), p), b, factor, norms, int(shown.sum()))
+
+
+def _linear_start(data: _Data) -> RigidTransform | None:
+    """The camera's pose with the rotation's nine numbers free, so that an offset of any size is linear; None below six poses."""
+    n = len(data.c)
+    if n < 6:
+        return None
+    A = np.zeros((n, 3, 15))
+    for k in range(3):
+        A[:, k, 3 * k : 3 * k + 3] = data.c
+    A[:, :, 9:12], A[:, :, 12:] = np.eye(3), -data.R
+    x = np.linalg.lstsq(A.reshape(-1, 15), data.b.ravel(), rcond=1e-9)[0]
+    U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), x[9:12])
+
+
+def _rigid_start(data: _Data) -> RigidTransform | None:
+    try:
+        return fit_rigid(data.b, data.c)
+    except ValueError:
+        return None
