@@ -131,6 +131,10 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
         sentence = f"{problem.strerror or problem}{place}. Check that the path exists and is writable."
     except (typer.Exit, typer.Abort, typer.BadParameter):
         raise
+    except MemoryError:
+        sentence = (
+            "There is not enough memory for this. Give fewer or smaller files, or use a computer with more memory."
+        )
     except Exception as problem:
         if debug:
             traceback.print_exc()

@@ -1,7 +1,6 @@
 """Reads, checks and writes a calibration dataset folder: poses, clouds and pairs."""
 
 import csv
-import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,11 +15,17 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
+from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
+from weldcal.models.files import read_text, sha256
+from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 CONFIGURATIONS = ("eye_on_base",)
-_REACH_M = (0.001, 10.0)  # distances from the base that a robot flange can have
+# Median distances that a flange has from its base, and a scanned point from its camera. The bounds are a factor of 1000 apart, so
+# that metres called millimetres, or the reverse, always fall outside.
+_REACH_M = (0.01, 10.0)
+_SAMPLE = 10_000  # points whose distance is enough to tell metres from millimetres
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,18 @@ class Dataset:
 
     def cloud(self, id: str) -> Array:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
-        return read_cloud(self.clouds[id]) * UNITS[self.header.units.clouds]
+        unit = self.header.units.clouds
+        points = read_cloud(self.clouds[id])
+        points *= UNITS[unit]
+        seen = points[np.isfinite(points[..., 2])]
+        distance = float(np.median(np.linalg.norm(seen[:: 1 + len(seen) // _SAMPLE], axis=1)))
+        if not _REACH_M[0] <= distance <= _REACH_M[1]:
+            other = "mm" if unit == "m" else "m"
+            raise CloudError(
+                f"The points of {self.clouds[id].name} lie {distance:.3g} m from the camera, as {unit}: they look like {other}; correct "
+                "units in dataset.yaml."
+            )
+        return points
 
 
 def load_dataset(folder: Path) -> Dataset:
@@ -82,13 +98,15 @@ def load_dataset(folder: Path) -> Dataset:
             f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."
         )
     header = _header(folder / "dataset.yaml")
-    hashes = {"dataset.yaml": _sha256(folder / "dataset.yaml")}
+    hashes = {"dataset.yaml": _digest(folder / "dataset.yaml")}
     scale = UNITS[header.units.poses]
     if (folder / "poses.csv").is_file():
-        hashes["poses.csv"] = _sha256(folder / "poses.csv")
+        hashes["poses.csv"] = _digest(folder / "poses.csv")
         poses = _poses(folder / "poses.csv", scale)
         clouds, refused = _match(folder / "clouds", poses)
-        content = {id: _sha256(cloud) for id, cloud in clouds.items()}
+        content, unreadable = _contents(clouds)
+        clouds = {id: cloud for id, cloud in clouds.items() if id in content}
+        refused += unreadable
         again = _repeated({id: (content[id], *poses[id].GetAsMatrix34().ravel()) for id in clouds})
         clouds = {id: cloud for id, cloud in clouds.items() if id not in dict(again)}
         if not clouds:
@@ -99,7 +117,7 @@ def load_dataset(folder: Path) -> Dataset:
         hashes.update({f"clouds/{path.name}": content[id] for id, path in clouds.items()})
         return Dataset(folder, header, poses, clouds, (), refused + again, hashes)
     if (folder / "pairs.csv").is_file():
-        hashes["pairs.csv"] = _sha256(folder / "pairs.csv")
+        hashes["pairs.csv"] = _digest(folder / "pairs.csv")
         pairs = _pairs(folder / "pairs.csv", scale, UNITS[header.units.clouds])
         again = _repeated({p.id: (*p.X_BR.GetAsMatrix34().ravel(), *p.p_CR) for p in pairs})
         pairs = tuple(p for p in pairs if p.id not in dict(again))
@@ -144,13 +162,17 @@ def _wxyz(X: RigidTransform) -> list[float]:
 
 
 def _header(path: Path) -> DatasetHeader:
-    if not path.is_file():
+    if not path.exists():
         raise DatasetError(
             f"'{path.parent.name}' has no dataset.yaml; add one with schema, robot, flange, scanner, configuration "
             "and units."
         )
     try:
-        header: DatasetHeader = yaml_load_typed(schema=DatasetHeader, filename=str(path), defaults=DatasetHeader())
+        text = read_text(path, LARGEST_DOCUMENT)
+        parse_document(path.name, text)  # within bounds, no key twice
+        header: DatasetHeader = yaml_load_typed(schema=DatasetHeader, data=text, defaults=DatasetHeader())
+    except InputError as e:
+        raise DatasetError(str(e)) from e
     except Exception as e:
         # pydrake raises whatever its YAML reader meets; the first line names the key
         raise DatasetError(f"'{path.name}' cannot be read as a dataset description: {str(e).splitlines()[0]}") from e
@@ -164,7 +186,30 @@ def _header(path: Path) -> DatasetHeader:
             f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles "
             f"{', '.join(CONFIGURATIONS)}."
         )
+    _check_poses(header, path)
     return header
+
+
+def _check_poses(header: DatasetHeader, path: Path) -> None:
+    """The lists of the header's poses: their lengths, finite numbers, metres, unit quaternions."""
+    guess = header.scanner_guess
+    for key, found in (("feature_in_flange", header.feature_in_flange), ("scanner_guess", guess)):
+        if found is None:
+            continue
+        for name, values, n in ((f"{key}.xyz", found.xyz, 3), (f"{key}.wxyz", found.wxyz, 4)):
+            if len(values) != n:
+                raise DatasetError(f"'{path.name}': {name} must hold {n} numbers, not {len(values)}.")
+            if not np.isfinite(values).all():
+                raise DatasetError(f"'{path.name}': {name} holds a number that is not finite.")
+        if float(np.abs(found.xyz).max()) > _REACH_M[1]:
+            raise DatasetError(
+                f"'{path.name}': {key}.xyz must be in metres; {_REACH_M[1]:g} m or more is no place of a scanner."
+            )
+        _quaternion(found.wxyz, key)
+    if guess is not None and not 0.0 < guess.radius_m <= _REACH_M[1]:
+        raise DatasetError(
+            f"'{path.name}': scanner_guess.radius_m must be a positive number of metres up to {_REACH_M[1]:g}, not {guess.radius_m:g}."
+        )
 
 
 def _rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
@@ -183,7 +228,7 @@ def _rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
     seen: set[str] = set()
     for row in rows:
         if not row["id"] or Path(row["id"]).name != row["id"]:
-            raise DatasetError(f"'{path.name}' has a row whose id '{row['id']}' is empty or not a plain name.")
+            raise DatasetError(f"'{path.name}' has a row whose id '{row['id'][:40]}' is empty or not a plain name.")
         if row["id"] in seen:
             raise DatasetError(f"'{path.name}' gives the id '{row['id']}' twice; keep one row for each scan.")
         seen.add(row["id"])
@@ -197,12 +242,14 @@ def _numbers(row: dict[str, str], columns: tuple[str, ...], path: Path) -> list[
             value = float(row[c])
         except ValueError:
             raise DatasetError(
-                f"'{path.name}' has '{row[c]}' in column {c} of '{row['id']}'; a number is needed."
+                f"'{path.name}' has '{row[c][:40]}' in column {c} of '{row['id']}'; a number is needed."
             ) from None
         if not np.isfinite(value):
             raise DatasetError(
                 f"'{path.name}' has {row[c]} in column {c} of '{row['id']}'; remove the row or give a finite number."
             )
+        if abs(value) > LARGEST_NUMBER:
+            raise DatasetError(f"'{path.name}' has {row[c]} in column {c} of '{row['id']}', beyond {LARGEST_NUMBER:g}.")
         out.append(value)
     return out
 
@@ -216,12 +263,12 @@ def _quaternion(wxyz: list[float], where: str) -> RotationMatrix:
     return RotationMatrix(Quaternion(np.asarray(wxyz) / norm))
 
 
-def _check_reach(points: Array, path: Path, unit: str) -> None:
+def _check_reach(points: Array, path: Path, unit: str, of: str = "robot's base") -> None:
     reach = float(np.median(np.linalg.norm(points, axis=1)))
     if reach > _REACH_M[1] or reach < _REACH_M[0]:
         other = "mm" if unit == "m" else "m"
         raise DatasetError(
-            f"The positions in '{path.name}' lie {reach:.4g} m from the robot's base, which no arm reaches: they look "
+            f"The positions in '{path.name}' lie {reach:.4g} m from the {of}, which is out of reach: they look "
             f"like {other}; correct units in dataset.yaml."
         )
 
@@ -259,6 +306,7 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
             f"The robot positions in '{path.name}' spread {a / b:.3g} times as far as the camera's: one of them is in "
             "millimetres; correct units in dataset.yaml."
         )
+    _check_reach(spread_C, path, "m" if scale_camera == 1.0 else "mm", "camera")
     return tuple(pairs)
 
 
@@ -296,5 +344,19 @@ def _repeated(scans: Mapping[str, tuple[object, ...]]) -> tuple[tuple[str, str],
     return tuple(again)
 
 
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _contents(clouds: Mapping[str, Path]) -> tuple[dict[str, str], tuple[tuple[str, str], ...]]:
+    """SHA-256 of each cloud, and those that are not regular files, with the reason."""
+    found, refused = {}, []
+    for id, cloud in clouds.items():
+        try:
+            found[id] = sha256(cloud)
+        except InputError as e:
+            refused.append((id, str(e)))
+    return found, tuple(refused)
+
+
+def _digest(path: Path) -> str:
+    try:
+        return sha256(path)
+    except InputError as e:
+        raise DatasetError(str(e)) from e

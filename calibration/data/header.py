@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Units:
-    """Length units of the files: ``m`` or ``mm``."""
+    """Length units of the files: ``m`` or ``mm``. Flange poses and clouds must then lie 10 mm to 10 m away (median)."""
 
     clouds: str = "m"
     poses: str = "m"

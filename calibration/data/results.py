@@ -3,19 +3,20 @@
 import json
 import os
 import tempfile
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
-from pydrake.common.yaml import yaml_dump, yaml_load
+from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.scanner_correction import correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
+from weldcal.models.documents import Section, read_document, shown
 from weldcal.models.errors import InputError
 
 RESULT_FILE = "calibration.yaml"
@@ -149,44 +150,85 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
 def load_result(path: Path) -> CalibrationResult:
     """Read a calibration.yaml (or the folder that holds it).
 
-    Raises InputError when it is missing, not a calibration, or its rotation is not orthonormal.
+    Raises InputError, with the file and the key, when it is missing, not a calibration, holds a value of the wrong kind, or its
+    rotation is not orthonormal.
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
-    try:
-        d = yaml_load(filename=str(path))  # what its YAML reader raises is no ValueError
-        M = np.array(d["X_BC"]["matrix"], dtype=float)
-        covariance = np.array(d["covariance"]["matrix"], dtype=float)
-        schema = d["schema"]
-    except Exception as e:  # unreadable in any way: the same sentence
-        raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.") from e
-    if schema != 1 or M.shape != (4, 4) or covariance.shape != (6, 6) or not np.isfinite(M).all():
+    document = read_document(path)
+    if not isinstance(document, dict) or not {"schema", "X_BC", "covariance"} <= set(document):
+        raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.")
+    d = Section.of(path.name, document)
+    if d.values["schema"] != 1:
         raise InputError(f"'{path.name}' is not a calibration result of schema 1; run 'weldcal calibrate' again.")
+    M = d.section("X_BC").array("matrix", 4, 4)
     if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0:
         raise InputError(f"The rotation in '{path.name}' is not orthonormal; the file was changed by hand.")
+    covariance = _covariance(d, "covariance", 6)
+    correction = correction_from_document(d.values.get("scanner_correction"), path.name)
+    joint = None
+    if d.has("joint_covariance"):
+        joint = _covariance(d, "joint_covariance", 6 + (0 if correction is None else len(correction.values)))
+    turn = d.array("axis_turn_deg", 2) if d.has("axis_turn_deg") else None
     return CalibrationResult(
         X_BC=RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3]),
         covariance=covariance,
-        held_out_mm={k: float("nan") if v is None else v for k, v in (d.get("held_out_mm") or {}).items()},
-        tilt_deg=dict(d.get("tilt_deg") or {}),
-        poses=tuple(PoseRecord(**r) for r in d.get("poses") or []),
-        icp=tuple(_icp_record(r) for r in d.get("icp") or []),
-        unobservable=tuple(d.get("unobservable") or ()),
-        warnings=tuple(d.get("warnings") or ()),
-        robot=str(d.get("robot", "")),
-        flange=str(d.get("flange", "")),
-        scanner=str(d.get("scanner", "")),
-        sigma_position_mm=float(d.get("sigma_position_mm", 0.0)),
-        sigma_normal_deg=float(d.get("sigma_normal_deg", 0.0)),
-        seed=int(d.get("seed", 0)),
-        data_hashes=dict(d.get("data_sha256") or {}),
-        scanner_correction=d.get("scanner_correction"),
-        joint_covariance=np.array(d["joint_covariance"]["matrix"], dtype=float) if d.get("joint_covariance") else None,
-        axis_turn_deg=_two(d.get("axis_turn_deg")),
-        software=str(d.get("software", "")),
+        held_out_mm={k: float("nan") if v is None else v for k, v in d.numbers("held_out_mm").items()},
+        tilt_deg=d.numbers("tilt_deg"),
+        poses=tuple(_pose_record(r) for r in d.sections("poses")),
+        icp=tuple(_icp_record(r) for r in d.sections("icp")),
+        unobservable=d.texts("unobservable"),
+        warnings=d.texts("warnings"),
+        robot=d.text("robot"),
+        flange=d.text("flange"),
+        scanner=d.text("scanner"),
+        sigma_position_mm=d.number("sigma_position_mm", 0.0, low=0.0),
+        sigma_normal_deg=d.number("sigma_normal_deg", 0.0, low=0.0),
+        seed=d.whole("seed"),
+        data_hashes={str(name): d.section("data_sha256").text(name) for name in d.section("data_sha256").values},
+        scanner_correction=d.values.get("scanner_correction"),
+        joint_covariance=joint,
+        axis_turn_deg=None if turn is None else (float(turn[0]), float(turn[1])),
+        software=d.text("software"),
     )
+
+
+def _covariance(d: Section, key: str, size: int) -> Array:
+    """The matrix (size, size) of a covariance. Raises InputError where it is not symmetric or has a negative variance."""
+    C = d.section(key).array("matrix", size, size)
+    scale = np.sqrt(np.abs(np.diag(C)))
+    scale[scale == 0.0] = 1.0
+    unit = C / np.outer(scale, scale)  # radians and metres: each direction in its own size
+    if not np.allclose(unit, unit.T, atol=1e-6) or float(np.linalg.eigvalsh(0.5 * (unit + unit.T)).min()) < -1e-6:
+        raise InputError(
+            f"'{d.file}': {key}.matrix is no covariance (not symmetric, or not positive); the file was changed by hand."
+        )
+    return C
+
+
+def _pose_record(r: Section) -> PoseRecord:
+    _only(r, PoseRecord)
+    numbers = ("residual_mm", "held_out_mm", "tilt_deg", "held_out_tilt_deg")
+    return PoseRecord(r.text("id"), r.yes("used"), r.text("reason"), *(r.optional(key) for key in numbers))
+
+
+def _icp_record(r: Section) -> IcpRecord:
+    _only(r, IcpRecord)
+    rotation, translation = (tuple(float(v) for v in r.array(key, 3)) for key in ("rotation_deg", "translation_mm"))
+    return IcpRecord(
+        r.text("id"), r.text("method"), rotation, translation, r.number("translation_norm_mm", low=0.0), r.texts("unseen"),
+        r.optional("true_error_mm"),
+    )  # fmt: skip
+
+
+def _only(r: Section, kind: type) -> None:
+    """Refuses keys that a record does not have."""
+    known = {f.name for f in fields(kind)}
+    surplus = next((k for k in r.values if k not in known), None)
+    if surplus is not None:
+        raise InputError(f"'{r.file}': {r.place} has the unknown key {shown(surplus)}.")
 
 
 def export_urdf(
@@ -270,15 +312,6 @@ def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
 def _wxyz(X: RigidTransform) -> tuple[float, float, float, float]:
     q: Quaternion = X.rotation().ToQuaternion()
     return float(q.w()), float(q.x()), float(q.y()), float(q.z())
-
-
-def _two(values: list[float] | None) -> tuple[float, float] | None:
-    return None if values is None else (float(values[0]), float(values[1]))
-
-
-def _icp_record(fields: dict[str, Any]) -> IcpRecord:
-    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-    return IcpRecord(**values)
 
 
 def _plain(record: dict[str, Any]) -> dict[str, Any]:

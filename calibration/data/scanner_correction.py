@@ -129,17 +129,20 @@ class ScannerCorrection:
         )
 
 
-def correction_from_document(document: dict[str, Any] | None) -> ScannerCorrection | None:
-    """Read a correction from its document; None for None. Raises InputError where it is malformed."""
+def correction_from_document(document: dict[str, Any] | None, file: str = "") -> ScannerCorrection | None:
+    """Read a correction from its document, of the file of that name; None for None. Raises InputError where it is malformed."""
     if document is None:
         return None
+    where = f"'{file}': " if file else ""
     try:
         gx, gy = (float(v) for v in document["gradient_per_m"])
         bend = tuple(float(v) for key in ("bend_per_m2", "bend_per_m3") for v in document.get(key) or ())
         field = document.get("field_m")
         x0, x1, y0, y1 = (0.0,) * 4 if field is None else (float(v) for v in field)
         return ScannerCorrection(float(document["scale"]), (gx, gy), bend, None if field is None else (x0, x1, y0, y1))
-    except (KeyError, TypeError, ValueError) as e:
+    except InputError as e:
+        raise InputError(f"{where}{e}") from e
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as e:
         raise InputError(
-            "The scanner correction in the result cannot be read; it holds scale and gradient_per_m [gx, gy]."
+            f"{where}The scanner correction in the result cannot be read; it holds scale and gradient_per_m [gx, gy]."
         ) from e

@@ -2,9 +2,12 @@
 
 import csv
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
+from weldcal.models.limits import MOST_CELLS, MOST_COLUMNS
 
 Row = dict[str, str]
 
@@ -16,24 +19,31 @@ def read_rows(path: Path) -> tuple[list[str], list[Row]]:
 
     The separator is the one that the header has most of: comma, semicolon, tab, else blanks. Lines that begin with #, empty
     lines and rows without a value are skipped. Decimal commas become points where the comma separates nothing. Raises
-    InputError: no such file, no text.
+    InputError: no regular file, no UTF-8 text, larger than the bounds in models/limits.py, a column named twice, a row with more
+    values than columns, a quote that does not end; with the line's number.
     """
-    table, separator = _cells(path)
-    if not table:
-        return [], []
-    names, rows = [name.lower() for name in table[0]], []
-    for values in table[1:]:
-        if separator != ",":
-            values = [v.replace(",", ".") if _DECIMAL_COMMA.fullmatch(v) else v for v in values]
+    names: list[str] = []
+    rows: list[Row] = []
+    for k, (line, values) in enumerate(_cells(path)):
+        if k == 0:
+            names = _names(path, values)
+            continue
+        if any(values[len(names) :]):
+            raise InputError(
+                f"'{path.name}', line {line}: {len(values)} cells, and the header names {len(names)} columns; decimal commas need "
+                "semicolons or tabs between the columns."
+            )
         if any(values):
             rows.append(dict.fromkeys(names, "") | dict(zip(names, values, strict=False)))
+        if len(rows) * len(names) > MOST_CELLS:
+            raise InputError(f"'{path.name}' has more than {MOST_CELLS} cells, the most that are read.")
     return names, rows
 
 
 def cut_off(path: Path) -> str | None:
     """A sentence where a CSV file seems to end within its last row, None else: that row has fewer cells than the header, or no
     line break follows it and its last number is shorter than all others of its column. Raises what read_rows raises."""
-    table, _ = _cells(path)
+    table = [values for _, values in _cells(path)]
     rows = [row for row in table[1:] if any(row)]
     if not rows:
         return None
@@ -50,22 +60,40 @@ def cut_off(path: Path) -> str | None:
     return None
 
 
-def _cells(path: Path) -> tuple[list[list[str]], str]:
-    """All rows as stripped cells, the header first, and the separator."""
-    if not path.is_file():
-        raise InputError(f"There is no file '{path}'.")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as e:
-        raise InputError(f"'{path.name}' is not a CSV text file.") from e
-    if "\0" in text:
-        raise InputError(f"'{path.name}' is not a CSV text file.")
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+def _cells(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Line numbers and stripped cells of all rows, the header first, with decimal points. Raises InputError as read_rows."""
+    lines = [
+        (number, line)
+        for number, line in enumerate(re.split(r"\r\n|\n|\r", read_text(path)), start=1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if not lines:
-        return [], ","
-    separator = max(",;\t", key=lines[0].count)
-    if separator not in lines[0] and len(lines[0].split()) > 1:
-        separator, lines = " ", [" ".join(line.split()) for line in lines]
-    return [
-        [cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator, skipinitialspace=True)
-    ], separator
+        return
+    begin = lines[0][1]
+    separator = max(",;\t", key=begin.count)
+    if separator not in begin and len(begin.split()) > 1:
+        separator, lines = " ", [(number, " ".join(line.split())) for number, line in lines]
+    reader = csv.reader((line for _, line in lines), delimiter=separator, skipinitialspace=True, strict=True)
+    line = lines[0][0]
+    try:
+        for cells in reader:
+            line = lines[reader.line_num - 1][0]
+            values = [cell.strip() for cell in cells]
+            if separator != ",":
+                values = [v.replace(",", ".") if _DECIMAL_COMMA.fullmatch(v) else v for v in values]
+            yield line, values
+    except csv.Error as e:
+        number = lines[min(reader.line_num, len(lines) - 1)][0]
+        what = "has a cell of more than 131072 characters" if "field larger" in str(e) else f"cannot be read ({e})"
+        raise InputError(f"'{path.name}', line {max(line, number)}, {what}.") from e
+
+
+def _names(path: Path, cells: list[str]) -> list[str]:
+    """The columns' names; refuses two of one name."""
+    names = [name.lower() for name in cells]
+    if len(names) > MOST_COLUMNS:
+        raise InputError(f"'{path.name}' has {len(names)} columns, more than {MOST_COLUMNS}, the most that are read.")
+    again = next((name for name in names if name and names.count(name) > 1), None)
+    if again is not None:
+        raise InputError(f"'{path.name}' has two columns '{again[:40]}'; keep one.")
+    return names

@@ -1,14 +1,10 @@
 """Reads pose pairs from npz, CSV and JSON files and from the samples of easy_handeye2 and MoveIt."""
 
-import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.common.yaml import yaml_load
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.tables import read_rows
@@ -16,8 +12,12 @@ from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.mountings import chain, get_mounting
 from weldcal.calibration.hand_eye.solve import as_poses
+from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
+from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
+from weldcal.models.files import file_size
+from weldcal.models.limits import LARGEST_NUMBER
 
 _NAMES = {
     "robot": ("A", "robot", "X_BF", "X_base_gripper"), "camera": ("B", "camera", "X_CM", "X_camera_target"),
@@ -27,6 +27,7 @@ _WHO = ("robot", "camera", "robot2", "link")
 _JOINTS = tuple(f"q{i}" for i in range(1, 10))
 LENGTHS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 _LONGEST_TURN = 7.0  # rad: a whole turn and a little
+_NEAR_M = 0.02  # nor are both this near: a file in metres that is said to be in millimetres
 _FAR_M = 20.0  # no arm and no camera on one reach this far: the numbers are not metres
 
 
@@ -80,10 +81,24 @@ def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = 
     path = Path(path)
     if path.is_dir():
         path = path / "pairs.npz"
-    if not path.is_file():
-        raise DatasetError(f"There is no file '{path}'.")
     if length is not None and length not in LENGTHS:
         raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
+    try:
+        return _read(path, mounting, length)
+    except DatasetError:
+        raise
+    except InputError as e:
+        raise DatasetError(_named(path, str(e))) from e
+    except MemoryError:
+        raise DatasetError(f"'{path.name}' needs more memory than there is: give fewer pairs.") from None
+
+
+def _named(path: Path, sentence: str) -> str:
+    return sentence if path.name in sentence else f"'{path.name}': {sentence}"
+
+
+def _read(path: Path, mounting: str | None, length: str | None) -> PosePairs:
+    file_size(path)
     ending = path.suffix.lower()
     if ending == ".npz":
         raw = _npz(path)
@@ -97,7 +112,7 @@ def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = 
 
 
 def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str | None) -> PosePairs:
-    said = raw.get("mode") or None
+    said = _said(path, raw, "mode")
     if said in ("eye_to_hand", "eye_on_hand"):  # other tools' words
         said = {"eye_to_hand": "eye_on_base", "eye_on_hand": "eye_in_hand"}[said]
     if said and mounting and said != mounting:
@@ -110,7 +125,7 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
             f"'{path.name}' does not say where the camera is; add --mounting eye_in_hand or eye_on_base."
         )
     get_mounting(mode)
-    unit = raw.get("unit") or None
+    unit = _said(path, raw, "unit")
     if unit and length and unit != length:
         raise DatasetError(
             f"'{path.name}' states lengths in {unit}, and the command states {length}; correct one of them."
@@ -123,14 +138,19 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
         if raw.get(key) is None:
             poses[key] = None
             continue
-        X = as_poses(raw[key], name)
+        X = as_poses(_array(path, name, raw[key]), name)
+        if len(X) and float(np.abs(X[:, :3, 3]).max()) > LARGEST_NUMBER:
+            raise DatasetError(f"A position of the {name} of '{path.name}' is beyond {LARGEST_NUMBER:g}.")
         X[:, :3, 3] *= scale
         poses[key] = X
     robot, camera = poses["robot"], poses["camera"]
     if robot is None or camera is None:
         raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
-    if len(robot) != len(camera):
-        raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(camera)} camera poses.")
+    for other, name in ((camera, "camera"), (poses["robot2"], "second robot"), (poses["link"], "arm link")):
+        if other is not None and len(other) != len(robot):
+            raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(other)} {name} poses.")
+    if len(robot) == 0:
+        raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
     far = {n: float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) for X, n in ((robot, "robot"), (camera, "camera"))}
     for name, distance in far.items():
         if distance > _FAR_M:
@@ -139,6 +159,11 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
             if other > 1e-2 * distance:
                 action = "if they are millimetres, add --unit mm"
             raise DatasetError(f"The {name} positions of '{path.name}' are {distance:.0f} m away, as metres; {action}.")
+    if scale != 1.0 and max(far.values()) < _NEAR_M:
+        raise DatasetError(
+            f"The positions of '{path.name}' are {1e3 * max(far.values()):.2g} mm away, as {unit or length}: they look like metres; "
+            "correct the unit."
+        )
     if raw.get("inverted") and mode == "eye_on_base":  # easy_handeye2 then stores the base in the hand
         robot = inverse(robot)
     X_true = raw.get("X_true")
@@ -154,22 +179,29 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
     )
 
 
+def _said(path: Path, raw: dict[str, Any], key: str) -> str | None:
+    value = raw.get(key) or None
+    if value is not None and not isinstance(value, str):
+        raise DatasetError(f"'{path.name}' must name its {key} by a word.")
+    return value
+
+
 def _array(path: Path, name: str, value: Any) -> Array:
     try:
         out = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as e:
-        raise DatasetError(f"'{name}' of '{path.name}' is not an array of numbers.") from e
+    except (TypeError, ValueError, OverflowError) as e:
+        raise DatasetError(
+            f"'{name}' of '{path.name}' is not an array of numbers, each row as long as the others."
+        ) from e
     if name != "img" and not np.isfinite(out).all():
         raise DatasetError(f"'{name}' of '{path.name}' holds numbers that are not finite.")
+    if float(np.nanmax(np.abs(out), initial=0.0)) > LARGEST_NUMBER:
+        raise DatasetError(f"'{name}' of '{path.name}' holds numbers beyond {LARGEST_NUMBER:g}.")
     return out
 
 
 def _npz(path: Path) -> dict[str, Any]:
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            raw = {k: z[k] for k in z.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as e:
-        raise DatasetError(f"'{path.name}' is not an npz file of plain arrays.") from e
+    raw = read_npz(path)
     out: dict[str, Any] = {k: raw[k] for k in ("X_true", "img", "obj", "K", "dist", "q") if k in raw}
     for key, known in _NAMES.items():
         out[key] = next((raw[name] for name in known if name in raw), None)
@@ -250,7 +282,7 @@ def _columns(path: Path, names: list[str], table: Array, who: str) -> Array:
 
 def _from_quaternions(path: Path, q: Array) -> Array:
     length = np.linalg.norm(q, axis=1)
-    if (np.abs(length - 1.0) > 1e-2).any():
+    if not (np.abs(length - 1.0) <= 1e-2).all():
         raise DatasetError(
             f"A quaternion of '{path.name}' has length {float(length[np.argmax(np.abs(length - 1))]):.3f}, not 1."
         )
@@ -258,16 +290,12 @@ def _from_quaternions(path: Path, q: Array) -> Array:
 
 
 def _document(path: Path) -> dict[str, Any]:
-    text = path.read_text(encoding="utf-8", errors="replace")
-    document: Any
-    try:
-        document = json.loads(text) if path.suffix.lower() == ".json" else yaml_load(data=text)
-    except Exception as e:  # unreadable in any way: the same sentence (pydrake's reader raises no ValueError)
-        raise DatasetError(f"'{path.name}' cannot be read as {'JSON' if path.suffix == '.json' else 'YAML'}.") from e
+    document = read_document(path)
     out: dict[str, Any] = {}
     samples: Any = document
     if isinstance(document, dict):
-        parameters = document.get("parameters") or {}
+        parameters = document.get("parameters")
+        parameters = parameters if isinstance(parameters, dict) else {}
         out["mode"] = document.get("configuration") or document.get("mode") or parameters.get("calibration_type") or ""
         out["unit"] = document.get("unit") or ""
         out["X_true"] = document.get("X_true")
@@ -297,8 +325,14 @@ def _document(path: Path) -> dict[str, Any]:
         if isinstance(first, dict) and name in first:
             out[key] = np.array([_one(path, s, name, i) for i, s in enumerate(samples)])
     if isinstance(first, dict) and "q" in first:
-        out["q"] = [s.get("q") for s in samples]
+        out["q"] = [_joints(path, s, i) for i, s in enumerate(samples)]
     return out
+
+
+def _joints(path: Path, sample: Any, index: int) -> Any:
+    if not isinstance(sample, dict) or "q" not in sample:
+        raise DatasetError(f"Sample {index} of '{path.name}' has no joint angles 'q', and the first has.")
+    return sample["q"]
 
 
 def _one(path: Path, sample: Any, name: str, index: int) -> Array:
@@ -316,10 +350,13 @@ def _one(path: Path, sample: Any, name: str, index: int) -> Array:
                 q = [q[k] for k in "wxyz"]
             elif "quaternion_wxyz" not in value and "wxyz" not in value:
                 raise InputError("the order of its quaternion is not said (name it quaternion_wxyz)")
-            return pose(_from_quaternions(path, np.array([q], dtype=float))[0], np.array(p, dtype=float))
+            at = np.array(p, dtype=float)
+            if at.shape != (3,):
+                raise InputError("its position is not three numbers")
+            return pose(_from_quaternions(path, np.array([q], dtype=float))[0], at)
         return np.array(value, dtype=float).reshape(4, 4)
     except DatasetError:
         raise
-    except (KeyError, TypeError, ValueError, InputError) as e:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError, InputError) as e:
         why = f": {e}" if isinstance(e, InputError) else ""
         raise DatasetError(f"Sample {index} of '{path.name}' has no pose '{name}' that can be read{why}.") from e

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump, yaml_load
+from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.results import matrix4, software_version, write_atomically
@@ -17,6 +17,7 @@ from weldcal.calibration.profiler.motion import FlangePoses, Floats
 from weldcal.calibration.profiler.result import ProfilerEstimate
 from weldcal.calibration.profiler.sphere.joint import SphereEstimate
 from weldcal.calibration.profiler.sphere.model import corrected
+from weldcal.models.documents import Section, read_document
 from weldcal.models.errors import InputError
 
 RECORD_FILE = "profiler.yaml"
@@ -126,34 +127,33 @@ def load_record(path: Path) -> ProfilerRecord:
         InputError: it is not there, or no profiler's calibration.
     """
     path = path / RECORD_FILE if path.is_dir() else path
-    if not path.is_file():
+    if not path.exists():
         raise InputError(
             f"There is no calibration at '{path}': give a folder written by 'weldcal profiler edge' or 'sphere'."
         )
-    try:
-        d = yaml_load(filename=str(path))
-        M = np.array(d["X_FS"]["matrix"], float)
-        covariance = None if d["covariance"] is None else np.array(d["covariance"]["matrix"], float)
-        affine, origin = np.array(d["sensor"]["x_scale_z_scale_shear"], float), np.array(d["sensor"]["origin"], float)
-        tip = None if d["tip_F"] is None else np.array(d["tip_F"], float)
-        arm, offsets, sag = None, np.zeros(len(OFFSET_JOINTS)), np.zeros(len(SAG_JOINTS))
-        if d["arm"] is not None:
-            arm = DhArm.checked(d["arm"]["dh"])
-            offsets, sag = np.array(d["arm"]["offsets"], float), np.array(d["arm"]["sag"], float)
-        good = (
-            d["schema"] == 1
-            and M.shape == (4, 4)
-            and np.isfinite(M).all()
-            and affine.shape == (3,)
-            and origin.shape == (2,)
-        )
-        method, figures, digest = str(d["method"]), dict(d["figures"] or {}), str(d["data_sha256"])
-    except Exception as e:  # unreadable in any way: the same sentence
-        raise InputError(
-            f"'{path.name}' is no profiler's calibration: run 'weldcal profiler edge' or 'sphere' again."
-        ) from e
-    if not good or not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
+    document = read_document(path)
+    if not isinstance(document, dict) or document.get("schema") != 1 or "X_FS" not in document:
+        raise InputError(f"'{path.name}' is no profiler's calibration: run 'weldcal profiler edge' or 'sphere' again.")
+    d = Section.of(path.name, document)
+    M = d.section("X_FS").array("matrix", 4, 4)
+    if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
         raise InputError(f"'{path.name}' was changed by hand: run 'weldcal profiler edge' or 'sphere' again.")
+    sensor, table = d.section("sensor"), d.section("arm")
+    arm, offsets, sag = None, np.zeros(len(OFFSET_JOINTS)), np.zeros(len(SAG_JOINTS))
+    if d.has("arm"):
+        arm = DhArm.checked(table.array("dh", -1, 4))
+        offsets, sag = table.array("offsets", len(offsets)), table.array("sag", len(sag))
     return ProfilerRecord(
-        method, M[:3, :3], M[:3, 3], covariance, affine, origin, tip, arm, offsets, sag, figures, digest
+        d.text("method"),
+        M[:3, :3],
+        M[:3, 3],
+        d.section("covariance").array("matrix", 6, 6) if d.has("covariance") else None,
+        sensor.array("x_scale_z_scale_shear", 3),
+        sensor.array("origin", 2),
+        d.array("tip_F", 3) if d.has("tip_F") else None,
+        arm,
+        offsets,
+        sag,
+        dict(d.section("figures").values),
+        d.text("data_sha256"),
     )

@@ -6,10 +6,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from pydrake.common.yaml import yaml_load
 
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.models.arrays import Array
+from weldcal.models.documents import parse_document
+from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
+from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
 
 _COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
 _MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficients", "D", "d", "distortion")
@@ -32,13 +35,17 @@ class Intrinsics:
 def load_intrinsics(path: Path) -> Intrinsics:
     """Intrinsics from a YAML file: fx, fy, cx, cy and optionally distortion (OpenCV's order), or camera_matrix (K) and
     distortion_coefficients (D) as lists or with their `data`. Raises TabletDataError."""
-    if not path.is_file():
-        raise TabletDataError(f"There is no file '{path}'.")
     try:
-        d = _document(path)
+        text = read_text(path, LARGEST_DOCUMENT)
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
+    try:
+        d = _document(path, text)
         numbers = [float(d[key]) for key in ("fx", "fy", "cx", "cy")] if "fx" in d else _from_matrix(d)
         found: Any = next((d[key] for key in _DISTORTION if d.get(key) is not None), [])
         distortion = np.ravel(np.array(_data(found), dtype=float))
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
     except Exception as error:  # unreadable in any way: the same sentence
         raise TabletDataError(
             f"'{path.name}' must hold fx, fy, cx and cy in pixels, or camera_matrix (and distortion, where known)."
@@ -46,17 +53,16 @@ def load_intrinsics(path: Path) -> Intrinsics:
     if distortion.size not in (0, *_COUNTS):
         counts = ", ".join(map(str, _COUNTS))
         raise TabletDataError(f"'{path.name}': distortion holds {distortion.size} numbers; OpenCV knows {counts}.")
-    if not np.isfinite([*numbers, *distortion]).all() or min(numbers[:2]) <= 0.0:
+    if not (np.abs([*numbers, *distortion]) <= LARGEST_NUMBER).all() or min(numbers[:2]) <= 0.0:
         raise TabletDataError(
             f"'{path.name}' holds a focal length that is not positive, or a value that is not a number."
         )
     return Intrinsics(np.array(numbers[:2]), np.array(numbers[2:]), distortion if distortion.size else np.zeros(5))
 
 
-def _document(path: Path) -> dict[str, Any]:
-    text = path.read_text(encoding="utf-8-sig")
+def _document(path: Path, text: str) -> dict[str, Any]:
     if not text.startswith("%YAML:"):
-        return dict(yaml_load(data=text))
+        return dict(parse_document(path.name, text))
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)  # OpenCV's own dialect
     nodes = {key: storage.getNode(key) for key in (*_MATRIX, *_DISTORTION)}
     return {key: node.mat().ravel().tolist() for key, node in nodes.items() if not node.empty()}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.common.yaml import yaml_dump, yaml_load
+from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.results import (
@@ -17,6 +17,7 @@ from weldcal.calibration.data.results import (
     software_version,
     write_atomically,
 )
+from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 
 RESULT_FILE = "tablet.yaml"
@@ -94,10 +95,10 @@ def save_tablet_result(result: TabletResult, folder: Path) -> tuple[Path, ...]:
 def load_tablet_result(path: Path) -> TabletResult:
     """Read a tablet.yaml, or the folder that holds it; raises InputError where it is none."""
     path = path / RESULT_FILE if path.is_dir() else path
-    if not path.is_file():
+    if not path.exists():
         raise InputError(f"There is no tablet calibration at '{path}'; give a folder of 'weldcal tablet calibrate'.")
+    d = read_document(path)
     try:
-        d = yaml_load(filename=str(path))
         if d["schema"] != 1 or d["configuration"] != "eye_in_hand_tablet":
             raise ValueError(d["schema"])
         M = None if d["X_FC"] is None else np.array(d["X_FC"]["matrix"], dtype=float)

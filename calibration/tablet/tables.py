@@ -7,6 +7,7 @@ from pathlib import Path
 from weldcal.calibration.data.tables import Row, read_rows
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.models.errors import InputError
+from weldcal.models.limits import LARGEST_NUMBER
 
 
 def read_table(path: Path, columns: Sequence[str]) -> list[Row]:
@@ -31,7 +32,9 @@ def number(row: Row, column: str, path: Path) -> float:
     except ValueError:
         value = float("nan")
     if not math.isfinite(value):
-        raise TabletDataError(f"'{path.name}': '{row[column]}' in the column {column} is not a number.")
+        raise TabletDataError(f"'{path.name}': '{row[column][:40]}' in the column {column} is not a number.")
+    if abs(value) > LARGEST_NUMBER:
+        raise TabletDataError(f"'{path.name}': {row[column][:40]} in the column {column} is beyond {LARGEST_NUMBER:g}.")
     return value
 
 
@@ -39,5 +42,5 @@ def landmark(row: Row, path: Path) -> int:
     """The landmark's number, from 0; raises TabletDataError."""
     value = number(row, "landmark", path)
     if value < 0.0 or value != int(value):
-        raise TabletDataError(f"'{path.name}': landmarks are whole numbers from 0, not '{row['landmark']}'.")
+        raise TabletDataError(f"'{path.name}': landmarks are whole numbers from 0, not '{row['landmark'][:40]}'.")
     return int(value)

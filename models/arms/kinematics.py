@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arrays import Array
+from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
@@ -267,14 +267,9 @@ def _read_kinematics(path: Path) -> tuple[Array, str]:
 
 def _read(path: Path, section: str) -> Mapping[str, Any]:
     """The mapping under the top-level key `section` of a YAML file."""
-    try:
-        data = yaml_load_file(str(path))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror}); name an existing YAML file.") from error
-    except Exception as error:  # the YAML reader has no common base of its own that pydrake exports
-        raise InputError(
-            f"{path.name} is not a YAML file; write it as Universal Robots' ROS 2 description does."
-        ) from error
+    if not path.exists():
+        raise InputError(f"{path} cannot be read (it does not exist); name an existing YAML file.")
+    data = read_document(path)
     if not isinstance(data, Mapping) or not isinstance(data.get(section), Mapping):
         raise InputError(
             f"{path.name} has no section {section!r}; write it as Universal Robots' ROS 2 description does."

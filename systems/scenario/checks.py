@@ -24,7 +24,9 @@ def check_scenario(scenario: Scenario) -> None:
         )
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
-    job_of(scenario)  # raises for the parts of two jobs
+    found = job_of(scenario)  # raises for the parts of two jobs
+    if not found.key and not scenario.job.calibrate and not scenario.job.weld:
+        raise InputError("This scenario has nothing to do: set job.calibrate or job.weld to true.")
     check_numbers(scenario)
     for job in jobs():
         job.check(scenario)

@@ -9,7 +9,10 @@ from typing import Any
 
 from pydrake.common.yaml import yaml_load_typed
 
+from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
+from weldcal.models.limits import LARGEST_DOCUMENT
 from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
@@ -46,15 +49,16 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
         InputError: unknown name, unknown key, wrong type; the message says which.
     """
     path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
-    if not path.is_file():
+    if not path.exists():
         raise InputError(
             f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file."
         )
     schema = scenario_class()
     scenario = schema()
-    for label, text in ((str(path.name), path.read_text(encoding="utf-8")), ("the overrides", overrides)):
+    for label, text in ((str(path.name), read_text(path, LARGEST_DOCUMENT)), ("the overrides", overrides)):
         if not text.strip():
             continue
+        parse_document(label, text)  # within bounds, no key twice
         try:
             scenario = yaml_load_typed(schema=schema, data=text, defaults=scenario)
         except Exception as error:  # Drake's loader raises several types, and not every message names the key

@@ -1,4 +1,4 @@
-"""Checks the numbers of a scenario: finite, with the required sign and list length."""
+"""Checks the numbers of a scenario: finite, within stated bounds, with the required sign and list length."""
 
 import dataclasses as dc
 import math
@@ -30,6 +30,28 @@ NOT_NEGATIVE = {
 LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "start_m": 3, "home_deg": 6, "payload_cog_m": 3}
 
 
+LARGEST = {
+    "width": 4096, "height": 4096, "samples": 8192, "recording_fps": 60, "cloud_points": 1_000_000, "maximum_scans": 200,
+    "minimum_scans": 200, "verification_scans": 200, "scans": 500, "held_out": 500, "touches": 500, "passes": 50, "columns": 20,
+    "rows": 20, "length_mm": 3000, "seam_length_mm": 3000, "maximum_time_s": 86_400, "rate_hz": 1000, "focal_px": 100_000,
+    "hole_from_mm": 3000, "theta_max_deg": 89, "speed_mm_s": 500, "control_period_s": 1, "exposure_s": 60, "latency_s": 10,
+}  # fmt: skip
+"""Largest value of a key, in any part of a scenario."""
+LARGEST_OF_UNIT = {
+    "_mm": 100_000, "_m": 100, "_deg": 36_000, "_rad": 1000, "_s": 1_000_000, "_px": 100_000, "_mm_s": 10_000, "_kg": 10_000,
+    "_per_m": 1e9, "_Hz": 10_000, "_hz": 10_000,
+}  # fmt: skip
+"""Largest size of any other key that names its unit; the longest unit counts."""
+LARGEST_AT_ALL = 1e9
+"""Largest size of any number."""
+
+
+def largest(name: str) -> float:
+    """The largest size that the value of a key of this name may have."""
+    units = sorted((u for u in LARGEST_OF_UNIT if name.endswith(u)), key=len)
+    return LARGEST.get(name, LARGEST_OF_UNIT[units[-1]] if units else LARGEST_AT_ALL)
+
+
 def check_numbers(config: Any, place: str = "") -> None:
     """Check all numbers in a tree of configuration dataclasses.
 
@@ -51,6 +73,8 @@ def check_numbers(config: Any, place: str = "") -> None:
 def _check(key: str, name: str, number: float) -> None:
     if not math.isfinite(number):
         raise InputError(f"{key} must be finite, not {number}.")
+    if abs(number) > largest(name):
+        raise InputError(f"{key} is {number:g}; from {-largest(name):g} to {largest(name):g} is possible.")
     if name in POSITIVE and number <= 0.0:
         raise InputError(f"{key} must be a positive number, not {number:g}.")
     if name in NOT_NEGATIVE and number < 0.0:

@@ -143,4 +143,21 @@ def robot(
     ).summary()
 
 
-COMMANDS = (tablet, seam_planning, hand_eye, mountings, profiler, cell, seeds, robot_faults, robot)
+@command("benchmark fuzz-files")
+def fuzz_files(
+    call: Call,
+    cases: Annotated[int, option("--cases", "N", "Damaged files for each reader.", min=1)] = 1000,
+    readers: Annotated[
+        list[str] | None, option("--readers", "NAME", "Only this reader; repeat for more.", show_default="all")
+    ] = None,
+) -> Outcome:
+    """Damage files of every format by its own grammar: each reader must accept or refuse them by a sentence, in 10 s and 1 GB."""
+    from weldcal.tools.studies.files.fuzz import chosen, fuzz_files
+
+    wanted = chosen(readers or ())
+    result = fuzz_files(wanted, cases, call.seed, call.folder("benchmark", "fuzz-files"), call.progress)
+    rows = {name: ", ".join(f"{n} {said}" for said, n in count.most_common()) for name, count in result.counts.items()}
+    return Outcome(result.summary(), values={}, rows=rows)
+
+
+COMMANDS = (tablet, seam_planning, hand_eye, mountings, profiler, cell, seeds, fuzz_files, robot_faults, robot)

@@ -131,6 +131,20 @@ class Command:
     short_help: str | None
 
 
+LARGEST_OPTION = 1e6
+"""Largest size of a number with a fraction on the command line: a kilometre in mm, eleven days in s."""
+
+
+def _check_numbers(given: Mapping[str, Any]) -> None:
+    """Refuses a number that is not finite or too large, as wrong usage. Raises typer.BadParameter."""
+    for name, value in given.items():
+        if isinstance(value, float) and not abs(value) <= LARGEST_OPTION:
+            raise typer.BadParameter(
+                f"{value:g} is not a number from {-LARGEST_OPTION:.0f} to {LARGEST_OPTION:.0f}.",
+                param_hint=f"'--{name.replace('_', '-')}'",
+            )
+
+
 Body = Callable[..., Outcome | Mapping[str, object] | None]
 
 
@@ -152,6 +166,7 @@ def command(
 
     def decorate(body: Body) -> Command:
         def run(**given: Any) -> None:
+            _check_numbers(given)
             shared = {name: given.pop(name) for name in names}
             json, debug = shared.get("json", False), shared["debug"]
             with console.boundary(json_wanted=json, debug=debug), ExitStack() as stack:

@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.models.documents import as_number, parse_document, shown
 from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
+from weldcal.models.limits import LARGEST_TEXT
 from weldcal.welding.numerics import Array
 from weldcal.welding.record.process import WeldProcess
 
@@ -165,8 +168,11 @@ def load_weld_log(path: Path | str) -> WeldRecord:
         raise WeldLogError(
             f"{csv_path} is not the table that {header_path.name} describes: it was cut off or changed; use the original."
         )
-    rows = list(csv.reader(io.StringIO(text)))
-    if len(rows) != header["rows"] + 1:
+    try:
+        rows = list(csv.reader(io.StringIO(text)))
+    except csv.Error as problem:
+        raise WeldLogError(f"{csv_path} cannot be read as CSV ({problem}); use the original.") from None
+    if not rows or len(rows) != header["rows"] + 1:
         raise WeldLogError(f"{csv_path} has {len(rows) - 1} rows, and {header_path.name} says {header['rows']}.")
     names = rows[0]
     missing = [name for name in NAMES if name not in names]
@@ -181,24 +187,31 @@ def load_weld_log(path: Path | str) -> WeldRecord:
                 raise WeldLogError(f"{csv_path}: line {k + 2} has no number in the column '{name}'.") from None
     phase = np.array([row[names.index("phase")] for row in rows[1:]], dtype=np.str_)
     keys = ("name", "current_A", "voltage_V", "efficiency", "wire_feed_m_min")
-    process = WeldProcess(**{key: header["process"].get(key) for key in keys})
+    process = WeldProcess(**{key: _nominal(header_path, key, header["process"].get(key)) for key in keys})
     return WeldRecord(columns, phase, process, header["settings"])
 
 
+def _nominal(path: Path, key: str, value: Any) -> Any:
+    """A value of the process: a word for its name, else a number; None where there is none."""
+    if value is not None and (not isinstance(value, str) if key == "name" else not math.isfinite(as_number(value))):
+        raise WeldLogError(f"{path} has no usable 'process': its {key} is {shown(value)}.")
+    return value if value is None or key == "name" else as_number(value)
+
+
 def _text(path: Path) -> str:
+    if not path.exists():
+        raise WeldLogError(f"There is no {path}: a weld log is {CSV_NAME} and {HEADER_NAME} side by side.")
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise WeldLogError(f"There is no {path}: a weld log is {CSV_NAME} and {HEADER_NAME} side by side.") from None
-    except (OSError, UnicodeDecodeError) as problem:
-        raise WeldLogError(f"{path} cannot be read as text ({type(problem).__name__}); use the original.") from None
+        return read_text(path, LARGEST_TEXT).replace("\r\n", "\n")
+    except InputError as problem:
+        raise WeldLogError(str(problem)) from None
 
 
 def _header(text: str, path: Path) -> dict[str, Any]:
     try:
-        header = json.loads(text)
-    except json.JSONDecodeError as problem:
-        raise WeldLogError(f"{path} is not complete JSON (line {problem.lineno}); use the original.") from None
+        header = parse_document(path.name, text, "JSON")
+    except InputError as problem:
+        raise WeldLogError(f"{path} is not complete JSON: {problem} Use the original.") from None
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
         raise WeldLogError(f"{path} is not the header of a weld log: its schema is not '{SCHEMA}'.")
     if header.get("version") != VERSION:

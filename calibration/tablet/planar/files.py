@@ -8,8 +8,10 @@ import numpy as np
 from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches
+from weldcal.models.array_files import read_npz
 from weldcal.models.arrays import Array
-from weldcal.models.errors import WeldcalError
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.limits import LARGEST_NUMBER
 
 # keys of the file and their dimensions for one visit; one more in front where visits differ in it
 DIMENSIONS = {
@@ -93,13 +95,15 @@ def hand_step_m(visits: tuple[PlanarVisit, ...]) -> float:
 
 def _read(path: Path) -> dict[str, Array]:
     wanted = {**DIMENSIONS, **QUERY_DIMENSIONS}
-    if not path.is_file():
-        raise TabletDataError(f"There is no file '{path}'.")
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            d = {key: np.asarray(archive[key], dtype=float) for key in wanted if key in archive.files}
-    except Exception as error:  # NumPy, zipfile and zlib have errors of their own
+        d = {key: np.asarray(value, dtype=float) for key, value in read_npz(path, tuple(wanted)).items()}
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
+    except ValueError as error:
         raise TabletDataError(f"'{path.name}' is not an npz file of numbers.") from error
+    for key, value in d.items():
+        if float(np.max(np.abs(value[np.isfinite(value)]), initial=0.0)) > LARGEST_NUMBER:
+            raise TabletDataError(f"'{path.name}': {key} holds a number beyond {LARGEST_NUMBER:g}.")
     missing = [key for key in DIMENSIONS if key not in d and key != "depth"]
     d.setdefault("depth", np.full(d["uv"].shape[:-1], np.nan) if "uv" in d else np.zeros(0))
     if missing:

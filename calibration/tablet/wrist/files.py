@@ -1,11 +1,9 @@
 """Reads a tablet visit: the page's CSV, robot poses and an image."""
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.eigen_geometry import Quaternion
@@ -20,6 +18,9 @@ from weldcal.calibration.tablet.wrist.fit import WristTouches
 from weldcal.calibration.tablet.wrist.page_grid import find_page
 from weldcal.calibration.tablet.wrist.page_match import check_page_match
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.files import sha256
+from weldcal.models.images import read_grey_image
 
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
 POSE_COLUMNS = ("landmark", "x", "y", "z", "qw", "qx", "qy", "qz")
@@ -43,8 +44,11 @@ class WristVisit:
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    """SHA-256 of a file. Raises TabletDataError where it is no regular file."""
+    try:
+        return sha256(path)
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
 
 
 def load_visit(
@@ -133,11 +137,10 @@ def _seen(path: Path, used: list[int]) -> Array:
 
 
 def _picture(path: Path) -> NDArray[np.uint8]:
-    if not path.is_file():
-        raise TabletDataError(f"There is no file '{path}'.")
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise TabletDataError(f"'{path.name}' is not a readable image.")
+    try:
+        picture = read_grey_image(path)
+    except InputError as error:
+        raise TabletDataError(str(error)) from error
     return np.asarray(picture, dtype=np.uint8)
 
 
@@ -171,9 +174,11 @@ def _flange_pose(row: Row, path: Path) -> RigidTransform:
     x, y, z, *q = (number(row, c, path) for c in POSE_COLUMNS[1:])
     norm = float(np.linalg.norm(q))
     if abs(norm - 1.0) > 1e-2:
-        raise TabletDataError(f"'{path.name}': the quaternion of '{row['landmark']}' has the length {norm:.3g}, not 1.")
+        raise TabletDataError(
+            f"'{path.name}': the quaternion of '{row['landmark'][:40]}' has the length {norm:.3g}, not 1."
+        )
     if max(abs(x), abs(y), abs(z)) > _FARTHEST_M:
         raise TabletDataError(
-            f"'{path.name}' must be in metres; '{row['landmark']}' is {max(abs(x), abs(y), abs(z)):.0f} away."
+            f"'{path.name}' must be in metres; '{row['landmark'][:40]}' is {max(abs(x), abs(y), abs(z)):.0f} away."
         )
     return RigidTransform(RotationMatrix(Quaternion(np.array(q) / norm)), [x, y, z])

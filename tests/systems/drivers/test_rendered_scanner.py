@@ -235,7 +235,7 @@ def test_black_is_dark_and_steel_is_not() -> None:
 
 def test_a_dark_surface_is_measured_less_often_than_a_bright_one() -> None:
     """The tool's dark plate against the steel ring that stands on it, as the scanner of the demo sees them."""
-    scenario = perfect(load_scenario("s_groove", "job: {calibrate: false, weld: false}"))
+    scenario = perfect(load_scenario("s_groove", "job: {weld: false}"))
     station = make_station(scenario, seed=0)
     context = station.diagram.CreateDefaultContext()
     sensor = station.diagram.GetSubsystemByName("scanner_depth")

@@ -48,6 +48,7 @@ CANDIDATES = 300
 POORLY = 1.5  # reduced chi-square from which another convention of the poses is tried
 FAR_FROM_EDGE_MM = 1.0
 RADIUS_OFF_M = 0.1e-3
+_LONGEST_TORCH_M = 10.0
 ALL_ARC_M = 0.5e-3  # a profile off one circle by less holds the sphere only
 Estimate = TypeVar("Estimate", EdgeEstimate, SphereEstimate)
 MODELS = ("auto", "rigid", "affine", "affine+joints")
@@ -183,7 +184,10 @@ def parse_tip(text: str) -> Floats | None:
         x, y, z = (1e-3 * float(v) for v in text.split(","))
     except ValueError as e:
         raise InputError(f"The tip is three numbers in mm with commas between, as --tip 0,0,150, not '{text}'.") from e
-    return np.array([x, y, z])
+    tip = np.array([x, y, z])
+    if not (np.abs(tip) <= _LONGEST_TORCH_M).all():
+        raise InputError(f"The tip lies within {1e3 * _LONGEST_TORCH_M:.0f} mm of the flange; '{text}' does not.")
+    return tip
 
 
 def _check_number(poses: FlangePoses, shape: tuple[int, ...], what: str, each: tuple[int, ...] = ()) -> None:

@@ -1,7 +1,5 @@
 """Reads measurements of a profiler from NPZ or CSV into SI units and one set of names (layouts: docs/profiler.md)."""
 
-import hashlib
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +10,10 @@ from scipy.spatial.transform import Rotation
 from weldcal.calibration.data.tables import cut_off, read_rows
 from weldcal.calibration.profiler.arm_errors import DhArm
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
+from weldcal.models.array_files import AnyArray, read_npz
 from weldcal.models.errors import InputError
+from weldcal.models.files import sha256
+from weldcal.models.limits import LARGEST_NUMBER
 
 UNITS = {"m": 1.0, "mm": 1e-3}
 NEAR_M = 0.02  # nor always this near
@@ -82,11 +83,9 @@ def read_profiler_file(
     Raises:
         InputError: missing or unreadable file, missing or implausible unit, no such set or trial.
     """
-    if not path.is_file():
-        raise InputError(f"There is no file '{path}'. Check its name.")
     if unit is not None and unit not in UNITS:
         raise InputError(f"The unit is m or mm, not '{unit}'.")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    digest = sha256(path)
     told: str | None = None
     if path.suffix.lower() == ".csv":
         arrays, profiles = _from_csv(path)
@@ -95,6 +94,7 @@ def read_profiler_file(
         arrays, profiles = _from_npz(path, unit, dataset, trial)
     else:
         raise InputError(f"'{path.name}' is neither .npz nor .csv. Give one of these.")
+    _check_numbers(path, arrays, profiles)
     file = ProfilerFile(arrays, profiles, digest, () if told is None else (told,))
     X = file.poses()
     if X is None:
@@ -110,14 +110,17 @@ def read_profiler_file(
     return file
 
 
+def _check_numbers(path: Path, arrays: dict[str, Floats], profiles: tuple[Floats, ...] | None) -> None:
+    """Refuses numbers that are infinite or so large that their squares are; NaN marks a missing point."""
+    for name, value in {**arrays, **{f"profile {k}": p for k, p in enumerate(profiles or ())}}.items():
+        if not float(np.nanmax(np.abs(value), initial=0.0)) <= LARGEST_NUMBER:
+            raise InputError(f"'{path.name}': {name} holds a number that is infinite or beyond {LARGEST_NUMBER:g}.")
+
+
 def _from_npz(
     path: Path, unit: str | None, dataset: str, trial: int | None
 ) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]:
-    try:
-        with np.load(path, allow_pickle=False) as z:
-            raw = {name: z[name] for name in z.files}
-    except (ValueError, OSError, zipfile.BadZipFile, EOFError) as e:
-        raise InputError(f"'{path.name}' cannot be read as NPZ. Write it with numpy.savez.") from e
+    raw: dict[str, AnyArray] = read_npz(path)
     said = str(raw.pop("unit")) if "unit" in raw else unit
     if said is None:
         raise InputError("The file does not state its unit of length. Add --unit mm or --unit m, or an entry 'unit'.")
@@ -164,7 +167,9 @@ def _from_npz(
     if "n" in arrays and "xz" in raw:
         if raw["xz"].ndim != 2 or raw["xz"].shape[1] != 2:
             raise InputError(f"'xz' holds profile points [x, z] (n, 2), not an array of shape {raw['xz'].shape}.")
-        n = arrays["n"].astype(int)
+        n = arrays["n"].astype(int) if np.isfinite(arrays["n"]).all() else np.zeros(0, int)
+        if n.ndim != 1 or (n < 0).any() or (n != arrays["n"]).any() or raw["xz"].dtype.kind not in "fiub":
+            raise InputError("The profiles' lengths 'n' must be whole numbers, one for each profile, and 'xz' numbers.")
         if n.sum() != len(raw["xz"]):
             raise InputError(f"The profiles' lengths 'n' add up to {n.sum()}, and 'xz' has {len(raw['xz'])} points.")
         profiles = tuple(np.split(np.asarray(raw["xz"], float) * scale, np.cumsum(n)[:-1]))

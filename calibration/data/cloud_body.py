@@ -1,0 +1,109 @@
+"""Takes x, y, z out of the body of a cloud's file, as bytes or as text, and bounds the number of points."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.limits import MOST_POINTS, expansion_limit
+
+_ROWS = 50_000  # of text, converted at a time
+_LONGEST_LINE = 1_000_000
+_LONGEST_NUMBER = 100  # characters
+
+
+class CloudError(InputError):
+    """A cloud cannot be used; ``reason`` is one sentence without its name."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+def check_points(path: Path, points: int, size: int) -> None:
+    """Refuses a cloud without points, or of more than a file of ``size`` bytes may hold. Raises CloudError."""
+    if points == 0:
+        raise CloudError(f"The cloud {path.name} is empty; scan again.")
+    if points > MOST_POINTS or 24 * points > expansion_limit(size):
+        raise CloudError(
+            f"The header of {path.name} promises {points} points, more than {min(MOST_POINTS, expansion_limit(size) // 24)}, the most "
+            "that are read of a file of its size."
+        )
+
+
+def column_values(path: Path, content: bytes, n: int, record: int, columns: list[tuple[int, str]]) -> Array:
+    """Columns (n, k), each (offset, type), of n records of so many bytes. Raises CloudError where bytes are missing."""
+    if len(content) < n * record:
+        raise CloudError(
+            f"The file {path.name} is truncated: {n} points are promised and {len(content) // record} are there."
+        )
+    out = np.empty((n, len(columns)))
+    raw = np.frombuffer(content, np.uint8, n * record).reshape(n, record)
+    for k, (at, kind) in enumerate(columns):
+        out[:, k] = np.ascontiguousarray(raw[:, at : at + np.dtype(kind).itemsize]).view(kind)[:, 0]
+    return out
+
+
+def text_columns(
+    path: Path, stream: BinaryIO, columns: list[int], numbers: int, skip: int, rows: int, lines: int
+) -> Array:
+    """Columns (rows, k) of the text that follows in the stream: ``rows`` lines of ``numbers`` numbers after ``skip`` lines.
+
+    Raises CloudError where there are more or fewer than ``lines`` lines, or a line is not as promised.
+    """
+    out = np.empty((min(rows, MOST_POINTS), len(columns)))
+    found = 0
+    block: list[list[bytes]] = []
+    for line in _lines(path, stream):
+        k, found = found - skip, found + 1
+        if found > lines:
+            continue
+        if 0 <= k < rows:
+            words = line.split()
+            if len(words) != numbers:
+                raise CloudError(
+                    f"The file {path.name} is damaged: point {k + 1} has {len(words)} numbers instead of the {numbers} of its header."
+                )
+            block.append([words[c] for c in columns])
+            if len(block) == _ROWS or k + 1 == rows:
+                out[k + 1 - len(block) : k + 1] = _converted(path, block)
+                block = []
+    if found < lines:
+        raise CloudError(
+            f"The file {path.name} is truncated: its header promises {rows} points and {max(min(found - skip, rows), 0)} are there."
+        )
+    if found > lines:
+        raise CloudError(
+            f"The header of {path.name} promises {rows} points, and {found - lines} lines more follow; export it again."
+        )
+    return out
+
+
+def _lines(path: Path, stream: BinaryIO) -> Iterator[bytes]:
+    """The lines that are not blank."""
+    while line := stream.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise CloudError(f"The file {path.name} is damaged: a line is longer than {_LONGEST_LINE} characters.")
+        if line.strip():
+            yield line
+
+
+def _converted(path: Path, block: list[list[bytes]]) -> Array:
+    bad = next((w for row in block for w in row if len(w) > _LONGEST_NUMBER), None)
+    if bad is None:
+        try:
+            return np.array(block, dtype="S").astype(float)
+        except ValueError:
+            bad = next((w for row in block for w in row if not _is_number(w)), b"")
+    raise CloudError(f"The file {path.name} is damaged: '{bad.decode('latin-1')[:40]}' is not a number.")
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,171 @@
+"""Reads the points of a PCD file after its header has been checked against the length of its body."""
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+
+from weldcal.calibration.data.cloud_body import CloudError, check_points, column_values, text_columns
+from weldcal.models.arrays import Array
+from weldcal.models.files import opened
+from weldcal.models.limits import expansion_limit
+
+_SIZES = {"I": (1, 2, 4, 8), "U": (1, 2, 4, 8), "F": (4, 8)}
+_KINDS = {"I": "i", "U": "u", "F": "f"}
+_LONGEST_HEADER = 65536
+_KEYS = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the header says: of x, y, z the column (in text) and (offset, type) in a record; bytes and numbers of a record."""
+
+    columns: tuple[int, ...]
+    fields: tuple[tuple[int, str], ...]
+    record: int
+    numbers: int
+    width: int
+    height: int
+    data: str
+    begin: int
+
+    @property
+    def points(self) -> int:
+        """How many points the header promises."""
+        return self.width * self.height
+
+
+def read_pcd(path: Path) -> Array:
+    """Points (N, 3), or (H, W, 3) where the header has more than one row, in the file's unit.
+
+    Raises:
+        CloudError: no PCD, a header that contradicts itself or the body's length, coordinates that are missing.
+        InputError: the file cannot be opened.
+    """
+    with opened(path) as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        h = _header(path, stream.read(min(size, _LONGEST_HEADER)))
+        check_points(path, h.points, size)
+        stream.seek(h.begin)
+        if h.data == "ascii":
+            points = text_columns(path, stream, list(h.columns), h.numbers, 0, h.points, h.points)
+        elif h.data == "binary":
+            _check_length(path, h, size - h.begin)
+            points = column_values(path, stream.read(h.points * h.record), h.points, h.record, list(h.fields))
+        else:
+            _check_compressed(path, h, stream, size)
+            points = _decompressed(path)
+    if len(points) != h.points:
+        raise CloudError(
+            f"The file {path.name} is damaged: its header promises {h.points} points and {len(points)} are there."
+        )
+    return points.reshape(h.height, h.width, 3) if h.height > 1 else points
+
+
+def _header(path: Path, begin: bytes) -> _Header:
+    if not begin.strip():
+        raise CloudError(f"The cloud {path.name} is empty; scan again.")
+    found: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in found:
+        end = begin.find(b"\n", at)
+        if end < 0:
+            raise CloudError(f"The file {path.name} is not a PCD file: its header has no DATA line.")
+        words, at = begin[at:end].decode("latin-1").split(), end + 1
+        if not words or words[0].startswith("#"):
+            continue
+        if words[0] not in _KEYS:
+            raise CloudError(
+                f"The file {path.name} is not a PCD file: '{' '.join(words)[:60]}' is no line of its header."
+            )
+        if words[0] in found:
+            raise CloudError(f"The file {path.name} is damaged: its header has two {words[0]} lines.")
+        found[words[0]] = words[1:]
+    names, kinds = found.get("FIELDS", []), found.get("TYPE", [])
+    sizes = _whole(path, "SIZE", found.get("SIZE", []))
+    counts = _whole(path, "COUNT", found.get("COUNT", ["1"] * len(names)))
+    if not names or not len(names) == len(sizes) == len(kinds) == len(counts):
+        raise CloudError(
+            f"The file {path.name} is damaged: FIELDS, SIZE, TYPE and COUNT of its header are not as many."
+        )
+    if any(s not in _SIZES.get(t, ()) for s, t in zip(sizes, kinds, strict=True)):
+        raise CloudError(f"The file {path.name} is damaged: SIZE and TYPE of its header do not fit each other.")
+    data = " ".join(found["DATA"])
+    if data not in ("ascii", "binary", "binary_compressed"):
+        raise CloudError(f"The file {path.name} has DATA {data[:40]}; ascii, binary or binary_compressed is read.")
+    width, height = _extent(path, found)
+    columns, fields = [], []
+    for c in "xyz":
+        if names.count(c) != 1 or counts[names.index(c)] != 1:
+            raise CloudError(f"The header of {path.name} must name {c} once, with COUNT 1; export x, y and z.")
+        k = names.index(c)
+        columns.append(sum(counts[:k]))
+        fields.append(
+            (sum(s * n for s, n in zip(sizes[:k], counts[:k], strict=True)), f"<{_KINDS[kinds[k]]}{sizes[k]}")
+        )
+    record = sum(s * n for s, n in zip(sizes, counts, strict=True))
+    return _Header(tuple(columns), tuple(fields), record, sum(counts), width, height, data, at)
+
+
+def _extent(path: Path, found: dict[str, list[str]]) -> tuple[int, int]:
+    """Width and height; one row of all POINTS where they are not given."""
+    if "POINTS" not in found and not {"WIDTH", "HEIGHT"} <= set(found):
+        raise CloudError(f"The file {path.name} is not a PCD file: its header has no POINTS line.")
+    numbers = {key: _whole(path, key, found[key], 1)[0] for key in ("POINTS", "WIDTH", "HEIGHT") if key in found}
+    points = numbers.get("POINTS", numbers.get("WIDTH", 0) * numbers.get("HEIGHT", 0))
+    width, height = numbers.get("WIDTH", points), numbers.get("HEIGHT", 1)
+    if width * height != points:
+        raise CloudError(
+            f"The header of {path.name} contradicts itself: WIDTH {width} times HEIGHT {height} is not POINTS {points}."
+        )
+    return width, height
+
+
+def _whole(path: Path, key: str, words: list[str], n: int | None = None) -> list[int]:
+    if (n is not None and len(words) != n) or not all(w.isascii() and w.isdecimal() and len(w) < 16 for w in words):
+        raise CloudError(
+            f"The file {path.name} is damaged: {key} {' '.join(words)[:40]} in its header is no whole number."
+        )
+    return [int(w) for w in words]
+
+
+def _check_length(path: Path, h: _Header, there: int) -> None:
+    if there < h.points * h.record:
+        raise CloudError(
+            f"The file {path.name} is truncated: its header promises {h.points} points and {there // h.record} are there."
+        )
+    if there > h.points * h.record + 1:  # a last newline is no contradiction
+        raise CloudError(
+            f"The header of {path.name} promises {h.points} points, and {there - h.points * h.record} bytes more follow; export it "
+            "again."
+        )
+
+
+def _check_compressed(path: Path, h: _Header, stream: BinaryIO, size: int) -> None:
+    """The two lengths before the compressed body must fit the header and the file."""
+    lengths = stream.read(8)
+    if len(lengths) < 8:
+        raise CloudError(f"The file {path.name} is truncated: its body is missing.")
+    packed, unpacked = struct.unpack("<II", lengths)
+    there = size - stream.tell()
+    if packed > there:
+        raise CloudError(f"The file {path.name} is truncated: {packed} bytes are promised and {there} are there.")
+    if unpacked != h.points * h.record:
+        raise CloudError(
+            f"The file {path.name} is damaged: its header promises {h.points * h.record} bytes of points and its body {unpacked}."
+        )
+    if unpacked > expansion_limit(size):
+        raise CloudError(
+            f"The file {path.name} would expand to {1e-6 * unpacked:.0f} MB, too much for a file of its size."
+        )
+
+
+def _decompressed(path: Path) -> Array:
+    import open3d as o3d  # slow to import, and only a compressed body needs it
+
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+        cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
+    return np.asarray(cloud.points, dtype=float)

@@ -1,0 +1,143 @@
+"""Reads npz and npy files of plain numbers and words; their headers are checked before anything is expanded."""
+
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections import Counter
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.errors import InputError
+from weldcal.models.files import opened
+from weldcal.models.limits import MOST_ARRAYS, expansion_limit
+
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_KINDS = "biufSU"
+_LONGEST_HEADER = 10_000
+# what zipfile, zlib and NumPy raise for damaged files
+_DAMAGED = (
+    zipfile.BadZipFile, zlib.error, EOFError, ValueError, KeyError, TypeError, NotImplementedError, RuntimeError, struct.error,
+    SyntaxError, tokenize.TokenError, OverflowError,
+)  # fmt: skip
+
+AnyArray = NDArray[Any]
+
+
+def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, AnyArray]:
+    """Arrays of an npz by name, as stored: all, or those of ``names`` that it holds.
+
+    Every array that is read is checked first: plain numbers or words, as many bytes as its header says, and all of them
+    together within expansion_limit at 8 bytes a number.
+
+    Raises:
+        InputError: no regular file, no npz, damaged, an array twice, Python objects, or too large once expanded.
+    """
+    try:
+        with opened(path) as stream, zipfile.ZipFile(stream) as archive:
+            members = _members(path, archive)
+            wanted = {k: m for k, m in members.items() if names is None or k in names}
+            numbers = 0
+            for name, member in wanted.items():
+                with archive.open(member) as inside:
+                    numbers += _header(path, f"'{name}' in {path.name}", inside, member.file_size)[2]
+            _check_expansion(path, numbers, stream)
+            found = {}
+            for name, member in wanted.items():
+                with archive.open(member) as inside:
+                    found[name] = _array(inside, f"'{name}' in {path.name}", member.file_size)
+            return found
+    except InputError:
+        raise
+    except _DAMAGED as e:
+        raise InputError(
+            f"The file {path.name} cannot be read as NPZ: it is not an npz file, or damaged ({type(e).__name__})."
+        ) from e
+
+
+def read_npy(path: Path) -> AnyArray:
+    """The array of an npy file, as stored. Raises InputError as read_npz."""
+    try:
+        with opened(path) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            _check_expansion(path, _header(path, path.name, stream, size)[2], stream)
+            stream.seek(0)
+            return _array(stream, path.name, size)
+    except InputError:
+        raise
+    except _DAMAGED as e:
+        raise InputError(
+            f"The file {path.name} cannot be read as NPY: it is not an npy file, or damaged ({type(e).__name__})."
+        ) from e
+
+
+def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
+    """The arrays that the central directory lists, by name."""
+    listed = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+    if len(archive.infolist()) > MOST_ARRAYS:
+        raise InputError(f"The file {path.name} holds more than {MOST_ARRAYS} arrays.")
+    name, times = max(Counter(m.filename for m in listed).items(), key=lambda item: item[1], default=("", 1))
+    if times > 1:
+        raise InputError(f"The file {path.name} holds '{name.removesuffix('.npy')}' twice; keep one.")
+    for member in listed:
+        if member.compress_type not in _METHODS or member.flag_bits & 1:
+            raise InputError(
+                f"The file {path.name} is encrypted or compressed in a way NumPy does not use; save it again."
+            )
+    return {m.filename.removesuffix(".npy"): m for m in listed}
+
+
+def _header(path: Path, what: str, stream: Any, size: int) -> tuple[tuple[int, ...], bool, int, np.dtype[Any]]:
+    """Shape, order, how many 8-byte numbers it expands to, and type of an array whose file has ``size`` bytes."""
+    version = np.lib.format.read_magic(stream)
+    if version == (1, 0):
+        header = np.lib.format.read_array_header_1_0(stream, max_header_size=_LONGEST_HEADER)
+    elif version == (2, 0):
+        header = np.lib.format.read_array_header_2_0(stream, max_header_size=_LONGEST_HEADER)
+    else:
+        raise InputError(f"{what} is not an array of plain numbers.")
+    shape, order, dtype = header
+    if dtype.kind not in _KINDS or dtype.hasobject or dtype.itemsize == 0:
+        raise InputError(f"{what} holds {dtype}, not plain numbers; nothing else is read.")
+    count = 1
+    for n in shape:
+        if isinstance(n, bool) or n < 0:
+            raise InputError(f"{what} has the impossible shape {shape}.")
+        count *= n
+    there = size - stream.tell()
+    if count * dtype.itemsize != there:
+        raise InputError(
+            f"{what} is damaged: its header promises {count * dtype.itemsize} bytes and {there} are there; save it again."
+        )
+    return shape, order, max(count, count * dtype.itemsize // 8), dtype
+
+
+def _array(stream: Any, what: str, size: int) -> AnyArray:
+    shape, order, _, dtype = _header(Path(what), what, stream, size)
+    count = 1
+    for n in shape:
+        count *= n
+    content = np.empty(count * dtype.itemsize, np.uint8)
+    rest = memoryview(content)
+    while rest and (n := stream.readinto(rest)):
+        rest = rest[n:]
+    if rest:
+        raise InputError(f"{what} is truncated; save it again.")
+    values = content.view(dtype)
+    return values.reshape(shape[::-1]).T if order else values.reshape(shape)
+
+
+def _check_expansion(path: Path, numbers: int, stream: BinaryIO) -> None:
+    here = stream.tell()
+    size = stream.seek(0, 2)
+    stream.seek(here)
+    if 8 * numbers > expansion_limit(size):
+        raise InputError(
+            f"The file {path.name} would expand to {8e-6 * numbers:.0f} MB, more than the {1e-6 * expansion_limit(size):.0f} MB that "
+            "are read of a file of its size."
+        )

@@ -1,0 +1,262 @@
+"""Reads YAML and JSON files of bounded size and depth, and takes typed values out of them by key."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.files import read_text
+from weldcal.models.limits import DEEPEST, LARGEST_DOCUMENT, LARGEST_NUMBER, MOST_NODES
+
+_SHORT = 100_000  # characters, which the reader in Python reads in a moment
+
+
+def read_document(path: Path) -> Any:
+    """The contents of a YAML file, or of a JSON file where its name ends so.
+
+    Raises:
+        InputError: no regular file, no UTF-8, not YAML or JSON, a key twice, or larger than the bounds in limits.
+    """
+    return parse_document(
+        path.name, read_text(path, LARGEST_DOCUMENT), "JSON" if path.suffix.lower() == ".json" else "YAML"
+    )
+
+
+def parse_document(name: str, text: str, kind: str = "YAML") -> Any:
+    """The contents of a text of YAML or JSON, ``name`` of which appears in messages. Raises InputError as read_document."""
+    if not text.strip():
+        raise InputError(f"'{name}' is empty.")
+    try:
+        if kind == "JSON":
+            document = json.loads(text, object_pairs_hook=_once)
+        else:
+            _check_events(name, text)
+            document = yaml.load(text, Loader=_Loader)
+    except InputError:
+        raise
+    except _Twice as e:
+        raise InputError(f"'{name}' gives the key '{e}' twice; keep one.") from None
+    except MemoryError:
+        raise InputError(f"'{name}' needs more memory than there is: give a smaller file.") from None
+    except Exception as e:  # PyYAML and its constructors raise several types; a mark says the line
+        raise InputError(f"'{name}' cannot be read as {kind}{_where(e, text)}.") from e
+    _check_size(name, document)
+    return document
+
+
+def _where(error: Exception, text: str) -> str:
+    """What a reader's error says of the place, in brackets; empty where it says nothing."""
+    if isinstance(error, json.JSONDecodeError):
+        return f" ({error.msg}, line {error.lineno})"
+    if isinstance(error, yaml.MarkedYAMLError) and len(text) < _SHORT:
+        try:  # the reader in Python names the line where a bracket opens, the one in C the file's end
+            for _ in yaml.parse(text, Loader=yaml.SafeLoader):
+                pass
+        except yaml.MarkedYAMLError as plain:
+            error = plain
+        except (ValueError, RecursionError):
+            pass
+    if not isinstance(error, yaml.MarkedYAMLError):
+        return ""
+    parts = ((error.context, error.context_mark), (error.problem, error.problem_mark))
+    said = [f"{text}{'' if mark is None else f' in line {mark.line + 1}'}" for text, mark in parts if text]
+    return f" ({', '.join(said)})"
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
+    """Plain values only; a mapping with a tag of its own keeps it as the key `_tag`, as Drake's reader does."""
+
+
+def _tagged(loader: Any, tag: str, node: Any) -> dict[Any, Any]:
+    return {**loader.construct_mapping(node, deep=True), "_tag": tag}
+
+
+_Loader.add_multi_constructor("", _tagged)
+
+
+class _Twice(Exception):
+    """A key that stands twice in a mapping."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise _Twice(next(k for k in found if sum(k == other for other, _ in pairs) > 1))
+    return found
+
+
+def _check_events(name: str, text: str) -> None:
+    """Depth, number and repeated keys of a YAML text, before its readers, which recurse, see it."""
+    levels: list[tuple[set[str], bool] | None] = []  # of each open mapping its keys, and whether the next node is a key
+    count = 0
+    for event in yaml.parse(text, Loader=_Loader):
+        if isinstance(event, yaml.NodeEvent):
+            count += 1
+            if levels and levels[-1] is not None:
+                keys, is_key = levels[-1]
+                if is_key and isinstance(event, yaml.ScalarEvent) and event.value != "<<":
+                    if event.value in keys:
+                        raise _Twice(event.value)
+                    keys.add(event.value)
+                levels[-1] = keys, not is_key
+        if isinstance(event, yaml.CollectionStartEvent):
+            levels.append((set(), True) if isinstance(event, yaml.MappingStartEvent) else None)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            levels.pop()
+        if count > MOST_NODES or len(levels) > DEEPEST:
+            raise _too_much(name)
+
+
+def _check_size(name: str, document: Any) -> None:
+    """An alias of an alias ... of YAML is a small text and an endless document."""
+    count, rows = 0, [iter([document])]
+    while rows:
+        value = next(rows[-1], rows)
+        if value is rows:
+            rows.pop()
+            continue
+        count += 1
+        if count > MOST_NODES or len(rows) > DEEPEST + 1:
+            raise _too_much(name)
+        if isinstance(value, Mapping):
+            rows.append(iter(value.values()))
+        elif isinstance(value, list | tuple):
+            rows.append(iter(value))
+
+
+def _too_much(name: str) -> InputError:
+    return InputError(
+        f"'{name}' holds more than {MOST_NODES} values, its aliases counted in full, or {DEEPEST} levels."
+    )
+
+
+@dataclass(frozen=True)
+class Section:
+    """A mapping of a document; its getters raise InputError naming ``file`` and key where a value is missing or wrong."""
+
+    file: str
+    values: Mapping[Any, Any]
+    place: str = field(default="")
+
+    @staticmethod
+    def of(file: str, value: Any, place: str = "") -> "Section":
+        """The mapping as a section. Raises InputError where it is none."""
+        if not isinstance(value, Mapping):
+            raise InputError(
+                f"'{file}': {place or 'the file'} must be a mapping of keys to values, not {shown(value)}."
+            )
+        return Section(file, value, place)
+
+    def has(self, key: str) -> bool:
+        """Whether the key stands there with a value."""
+        return self.values.get(key) is not None
+
+    def section(self, key: str) -> "Section":
+        """The mapping under a key; empty where there is none."""
+        return Section.of(self.file, self.values[key] if self.has(key) else {}, self._at(key))
+
+    def sections(self, key: str) -> tuple["Section", ...]:
+        """The mappings of the list under a key; none where there is none."""
+        return tuple(Section.of(self.file, v, f"{self._at(key)}[{k}]") for k, v in enumerate(self.items(key)))
+
+    def items(self, key: str) -> list[Any]:
+        """The list under a key; empty where there is none."""
+        value = self.values[key] if self.has(key) else []
+        if not isinstance(value, list):
+            raise self.wrong(key, "a list")
+        return value
+
+    def number(self, key: str, default: float | None = None, *, low: float = -LARGEST_NUMBER) -> float:
+        """The finite number under a key, from ``low`` to LARGEST_NUMBER."""
+        if not self.has(key) and default is not None:
+            return default
+        value = as_number(self.values.get(key))
+        if not low <= value <= LARGEST_NUMBER:
+            raise self.wrong(key, "a finite number" if low < 0.0 else f"a finite number, {low:g} or more")
+        return value
+
+    def optional(self, key: str) -> float | None:
+        """The finite number under a key; None where there is none."""
+        return self.number(key) if self.has(key) else None
+
+    def whole(self, key: str, default: int = 0) -> int:
+        """The whole number from 0 under a key."""
+        value = self.number(key, default, low=0.0)
+        if value != int(value):
+            raise self.wrong(key, "a whole number")
+        return int(value)
+
+    def text(self, key: str, default: str = "") -> str:
+        """The text under a key."""
+        if not self.has(key):
+            return default
+        if not isinstance(self.values[key], str | int | float) or isinstance(self.values[key], bool):
+            raise self.wrong(key, "a text")
+        return str(self.values[key])
+
+    def yes(self, key: str) -> bool:
+        """The true or false under a key."""
+        value = self.values.get(key)
+        if not isinstance(value, bool):
+            raise self.wrong(key, "true or false")
+        return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        """The texts of the list under a key."""
+        found = self.items(key)
+        if not all(isinstance(v, str) for v in found):
+            raise self.wrong(key, "a list of texts")
+        return tuple(found)
+
+    def numbers(self, key: str) -> dict[str, float | None]:
+        """The numbers under the keys of the mapping under a key; null stays None."""
+        inside = self.section(key)
+        return {str(name): inside.optional(name) for name in inside.values}
+
+    def array(self, key: str, *shape: int) -> Array:
+        """The finite numbers (shape) of the nested lists under a key; -1 in the shape: any length."""
+        try:
+            value = np.array(self.values.get(key), dtype=float)
+        except (TypeError, ValueError, OverflowError):
+            value = np.zeros(())
+        fits = value.ndim == len(shape) and all(s in (-1, n) for s, n in zip(shape, value.shape, strict=True))
+        if not fits or not (np.abs(value) <= LARGEST_NUMBER).all():
+            size = " by ".join("any number" if s < 0 else str(s) for s in shape)
+            raise self.wrong(key, f"{size} finite numbers")
+        return value
+
+    def wrong(self, key: str, wanted: str) -> InputError:
+        """The sentence for a value that is not what was wanted."""
+        return InputError(f"'{self.file}': {self._at(key)} must be {wanted}, not {shown(self.values.get(key))}.")
+
+    def _at(self, key: str) -> str:
+        return f"{self.place}.{key}" if self.place else str(key)
+
+
+def as_number(value: Any) -> float:
+    """A number, or a text that is one (YAML 1.1 leaves 1e-05 as text); NaN for anything else, true and false included."""
+    try:
+        return math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def shown(value: Any) -> str:
+    """A value as a message shows it: short, on one line."""
+    if value is None:
+        return "nothing"
+    text = (
+        " ".join(str(value).split())
+        if not isinstance(value, int)
+        else f"{value:.6g}"
+        if abs(value) < 1e300
+        else "a huge number"
+    )
+    return f"'{text[:40]}...'" if len(text) > 40 else f"'{text}'"

@@ -1,0 +1,120 @@
+"""Opens a file that a person hands in: a regular file of bounded size, text in UTF-8; anything else is refused by a sentence."""
+
+import hashlib
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from weldcal.models.errors import InputError
+from weldcal.models.limits import LARGEST_BYTES, LARGEST_TABLE
+
+_BLOCK = 1024**2
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+_KINDS = (
+    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)  # fmt: skip
+
+
+def file_size(path: Path, limit: int = LARGEST_BYTES) -> int:
+    """Bytes of a regular file (or of the one that a link leads to), without opening it.
+
+    Raises:
+        InputError: it does not exist, is a folder, pipe, device or socket, or is larger than ``limit``.
+    """
+    try:
+        status = os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"There is no file '{path}'.") from None
+    except (OSError, ValueError) as e:  # a loop of links, a name that is too long or holds a null character
+        raise InputError(f"'{path}' cannot be opened: {_reason(e)}.") from None
+    return _checked(path, status, limit)
+
+
+@contextmanager
+def opened(path: Path, limit: int = LARGEST_BYTES) -> Iterator[BinaryIO]:
+    """The file, open for reading bytes; never waits for a pipe's other end.
+
+    Raises:
+        InputError: as file_size; it cannot be opened or read, or memory runs out inside the block.
+    """
+    file_size(path, limit)
+    try:
+        # the file may have been replaced since: what was opened is what must be regular
+        handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    except OSError as e:
+        raise InputError(f"'{path}' cannot be opened: {_reason(e)}.") from None
+    with os.fdopen(handle, "rb") as stream:
+        _checked(path, os.fstat(handle), limit)
+        try:
+            yield stream
+        except MemoryError:
+            raise InputError(f"'{path.name}' needs more memory than there is: give a smaller file.") from None
+        except OSError as e:
+            raise InputError(f"'{path.name}' cannot be read: {_reason(e)}.") from None
+
+
+def read_bytes(path: Path, limit: int = LARGEST_BYTES) -> bytes:
+    """The contents of a regular file. Raises InputError as ``opened``."""
+    with opened(path, limit) as stream:
+        content = stream.read(limit + 1)
+    if len(content) > limit:  # a file of the kernel's, whose size is not stated
+        raise _too_large(path, limit)
+    return content
+
+
+def read_text(path: Path, limit: int = LARGEST_TABLE) -> str:
+    """The text of a UTF-8 file, with or without a byte-order mark.
+
+    Raises:
+        InputError: as ``opened``; it is UTF-16, in another encoding, or not text.
+    """
+    return decoded(path, read_bytes(path, limit))
+
+
+def decoded(path: Path, content: bytes) -> str:
+    """The text of bytes that were read from ``path``. Raises InputError as read_text."""
+    if content.startswith(_UTF16):
+        raise InputError(f"'{path.name}' cannot be read as text: it is UTF-16; save it as UTF-8.")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as e:
+        line = content.count(b"\n", 0, e.start) + 1
+        raise InputError(
+            f"'{path.name}' cannot be read as text: line {line} is not UTF-8 (it may be Latin-1); save it as UTF-8."
+        ) from None
+    except MemoryError:
+        raise InputError(f"'{path.name}' needs more memory than there is: give a smaller file.") from None
+    if "\0" in text:
+        raise InputError(f"'{path.name}' cannot be read as text: it holds null characters; save it as UTF-8.")
+    return text
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a regular file in hexadecimal, read block by block. Raises InputError as ``opened``."""
+    digest, left = hashlib.sha256(), LARGEST_BYTES
+    with opened(path) as stream:
+        while left > 0 and (block := stream.read(_BLOCK)):
+            digest.update(block)
+            left -= len(block)
+    return digest.hexdigest()
+
+
+def _checked(path: Path, status: os.stat_result, limit: int) -> int:
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((name for test, name in _KINDS if test(status.st_mode)), "not a file")
+        raise InputError(f"'{path}' is {kind}; give a file.")
+    if status.st_size > limit:
+        raise _too_large(path, limit)
+    return status.st_size
+
+
+def _too_large(path: Path, limit: int) -> InputError:
+    return InputError(f"'{path.name}' is larger than {limit / 1024**2:.0f} MiB, the most that is read of such a file.")
+
+
+def _reason(error: Exception) -> str:
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)

@@ -1,0 +1,180 @@
+"""Damaged files for every reader, in child processes: accepted or refused by a sentence, or something that must not be."""
+
+import json
+import os
+import selectors
+import shutil
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from weldcal.models.errors import InputError
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.files.cases import CRASH, GOOD, HANG, MEMORY, Verdict, damaged, lay_out
+from weldcal.tools.studies.files.readers import READERS, Reader
+
+WATCHDOG_S = 10.0
+_START_S = 120.0  # to import everything, on a slow computer
+_KEPT = 20  # offending files of each reader and verdict
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A case that was neither accepted nor refused; ``folder`` holds its files."""
+
+    reader: str
+    case: int
+    said: str
+    detail: str
+    folder: str
+
+
+@dataclass(frozen=True)
+class FuzzResult:
+    """Verdicts by reader, what must not be, the slowest case of each reader (s), and some refusals of each."""
+
+    counts: dict[str, Counter[str]]
+    findings: tuple[Finding, ...]
+    slowest_s: dict[str, float]
+    seed: int
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object."""
+        total = sum(self.counts.values(), Counter())
+        bad = {f.reader: f for f in reversed(self.findings)}
+        first = next(iter(self.findings), None)
+        return {
+            "state": "failed" if self.findings else "done",
+            "reason": None
+            if first is None
+            else f"{len(self.findings)} damaged files in {len(bad)} readers were neither accepted nor refused; the first, {first.reader} "
+            f"case {first.case}: {first.said}.",
+            "seed": self.seed,
+            "cases": total.total(),
+            **{name.replace(" ", "_"): n for name, n in sorted(total.items())},
+            "readers": {name: dict(count) for name, count in self.counts.items()},
+            "slowest_s": max(self.slowest_s.values(), default=0.0),
+            "findings": [vars(f) for f in self.findings],
+        }
+
+
+def chosen(names: Sequence[str]) -> tuple[Reader, ...]:
+    """The readers of these names; all where none is named. Raises InputError naming the known ones."""
+    known = {reader.name: reader for reader in READERS}
+    wrong = next((name for name in names if name not in known), None)
+    if wrong is not None:
+        raise InputError(f"There is no reader '{wrong}'. Choose some of {', '.join(known)}.")
+    return tuple(known[name] for name in names) or READERS
+
+
+def fuzz_files(
+    readers: Sequence[Reader], cases: int, seed: int, out: Path, progress: Progress = no_progress
+) -> FuzzResult:
+    """Run ``cases`` damaged files through each reader; case k of a reader depends on the seed, the reader and k only.
+
+    Files that were neither accepted nor refused are kept in ``out``; findings.json lists them.
+    """
+    counts = {reader.name: Counter[str]() for reader in readers}
+    slowest = dict.fromkeys(counts, 0.0)
+    findings: list[Finding] = []
+    with TemporaryDirectory() as place, _Child(Path(place)) as child:
+        for n, reader in enumerate(readers):
+            for case in range(cases):
+                begin = time.monotonic()
+                verdict = child.ask(reader, seed, case)
+                slowest[reader.name] = max(slowest[reader.name], time.monotonic() - begin)
+                counts[reader.name][verdict.said] += 1
+                if verdict.said not in GOOD:
+                    kept = counts[reader.name][verdict.said] <= _KEPT
+                    folder = _keep(reader, seed, case, out) if kept else ""
+                    findings.append(Finding(reader.name, case, verdict.said, verdict.detail, folder))
+                if case % 50 == 0:
+                    progress(reader.name, (n + case / cases) / len(readers))
+    result = FuzzResult(counts, tuple(findings), slowest, seed)
+    write_atomic(out / "findings.json", json.dumps(result.summary(), indent=1) + "\n")
+    return result
+
+
+def _keep(reader: Reader, seed: int, case: int, out: Path) -> str:
+    _, files, _, place = damaged(reader, seed, case)
+    folder = out / f"{reader.name}-{case}"
+    lay_out(folder, files, reader.target, place)
+    return str(folder)
+
+
+class _Child:
+    """A worker process, started anew after it hung, died or took too much memory."""
+
+    def __init__(self, place: Path) -> None:
+        self._place = place
+        self._process: subprocess.Popen[str] | None = None
+
+    def __enter__(self) -> "_Child":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._end()
+
+    def ask(self, reader: Reader, seed: int, case: int) -> Verdict:
+        """The verdict of a case."""
+        limit = WATCHDOG_S if self._process is not None else WATCHDOG_S + _START_S
+        process = self._process or self._start()
+        assert process.stdin is not None
+        try:
+            process.stdin.write(f"{reader.name} {seed} {case}\n")
+            process.stdin.flush()
+        except BrokenPipeError:
+            self._end()
+            return Verdict(CRASH, "the worker ended before the case")
+        answer = self._line(process, limit)
+        if answer is None:
+            hung = process.poll() is None
+            self._end()
+            return (
+                Verdict(HANG, f"no answer within {WATCHDOG_S:g} s")
+                if hung
+                else Verdict(CRASH, f"exit {process.returncode}")
+            )
+        said: dict[str, Any] = json.loads(answer)
+        if said["said"] == MEMORY:  # the next case begins with little
+            self._end()
+        return Verdict(said["said"], said["detail"])
+
+    def _start(self) -> subprocess.Popen[str]:
+        shutil.rmtree(self._place, ignore_errors=True)
+        self._place.mkdir()
+        command = [sys.executable, "-P", "-m", "weldcal.tools.studies.files.worker", str(self._place)]
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1"},
+        )
+        return self._process
+
+    def _line(self, process: subprocess.Popen[str], limit: float) -> str | None:
+        """The next line of the worker; None where none comes in time, or the worker ends."""
+        assert process.stdout is not None
+        with selectors.DefaultSelector() as selector:
+            selector.register(process.stdout, selectors.EVENT_READ)
+            if not selector.select(limit):
+                return None
+        line = process.stdout.readline()
+        if not line:
+            process.wait()
+        return line or None
+
+    def _end(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+            self._process = None
