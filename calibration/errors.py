@@ -1,5 +1,7 @@
 """Exceptions of the calibration package; each message names what to change."""
 
+from typing import Any
+
 from weldcal.models.errors import InputError, WeldcalError
 
 
@@ -41,6 +43,14 @@ class UndeterminedPoses(InputError):
 
 class InconsistentPoses(InputError):
     """No rigid transform explains enough of the poses."""
+
+
+class ScannerMoved(InconsistentPoses):
+    """The camera's pose changed during the recording; ``details`` are the change and both parts, as plain types."""
+
+    def __init__(self, message: str, details: dict[str, Any]) -> None:
+        super().__init__(message)
+        self.details = details
 
 
 class DatasetError(InputError):

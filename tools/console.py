@@ -122,10 +122,11 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     Raises:
         typer.Exit: with code 1, for a WeldcalError, an OSError or (named an internal error) anything else.
     """
+    details: dict[str, object] = {}
     try:
         yield
     except WeldcalError as problem:
-        sentence = str(problem)
+        sentence, details = str(problem), getattr(problem, "details", {})
     except OSError as problem:
         place = f": {problem.filename}" if problem.filename else ""
         sentence = f"{problem.strerror or problem}{place}. Check that the path exists and is writable."
@@ -143,7 +144,7 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     else:
         return
     if json_wanted:
-        emit_json({"state": "failed", "reason": sentence})
+        emit_json({"state": "failed", "reason": sentence, **details})
     typer.secho(f"weldcal: {sentence}", err=True, fg=typer.colors.RED)
     raise typer.Exit(1)
 

@@ -2,8 +2,9 @@
 
 import csv
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
@@ -50,6 +51,30 @@ class Dataset:
     pairs: tuple[Pair, ...]
     refused: tuple[tuple[str, str], ...]
     hashes: dict[str, str]
+
+    def between(self, ids: str) -> Self:
+        """The dataset without the scans before or after those named "FROM:TO" (ids; either may be left out), in its order.
+
+        Raises DatasetError where there is no colon, an id is not in the dataset, or FROM stands after TO.
+        """
+        first, colon, last = (part.strip() for part in ids.partition(":"))
+        known = [p.id for p in self.pairs] or list(self.clouds)
+        if not colon:
+            raise DatasetError(f"The poses '{ids}' are no range: write FROM:TO, FROM: or :TO with ids of the dataset.")
+        for id in filter(None, (first, last)):
+            if id not in known:
+                raise DatasetError(
+                    f"'{self.folder.name}' has no usable pose '{id}'; its poses go from {known[0]} to {known[-1]}."
+                )
+        begin, end = known.index(first) if first else 0, known.index(last) if last else len(known) - 1
+        if begin > end:
+            raise DatasetError(f"'{first}' comes after '{last}' in '{self.folder.name}'; write --poses {last}:{first}.")
+        kept = set(known[begin : end + 1])
+        return replace(
+            self,
+            clouds={id: path for id, path in self.clouds.items() if id in kept},
+            pairs=tuple(p for p in self.pairs if p.id in kept),
+        )
 
     @property
     def X_FR(self) -> RigidTransform:

@@ -112,20 +112,20 @@ def from_motion(
     R, p = start.rotation().matrix(), np.asarray(start.translation())
     pivot = b.mean(axis=0)
     change = np.zeros(size - 6)  # of the factors, then the circles' own
-    basis = shape.terms(c)
+    basis, slopes = shape.terms(c), shape.slopes(c[has])  # a correction is linear in its factors
     redundancy = 1.0
     information = np.eye(size)
     for k in range(40):
-        correction = correction_of(change[:terms], field)
-        q = correction.points(c) @ R.T + p
+        values = correction_of(change[:terms], field).values
+        q = (c * (basis @ values)[:, None]) @ R.T + p
         e_p = (q - b) / vague
         J_p = np.zeros((len(b), 3, size))
         J_p[:, :, :3], J_p[:, :, 3:6] = -skew(q - pivot), np.eye(3)
         J_p[:, :, 6 : 6 + terms] = (c @ R.T)[:, :, None] * basis[:, None]
         J_p /= vague[:, :, None]
-        e_n, J_n = _normal_rows(correction, c[has], m, z, R, size)
+        e_n, J_n = _normal_rows(basis[has] @ values, slopes, values, c[has], m, z, R, size)
         own = change[terms:] if len(ratio) else np.zeros(3)
-        e_r = ratio * (rows @ correction.values) - 1.0 - rows[:, :3] @ own
+        e_r = ratio * (rows @ values) - 1.0 - rows[:, :3] @ own
         J_r = np.zeros((len(ratio), size))
         J_r[:, 6 : 6 + terms] = ratio[:, None] * rows
         J_r[:, 6 + terms :] = -rows[:, : size - 6 - terms]
@@ -185,18 +185,22 @@ def _expected(terms: int, depth: float, usual: bool) -> Array:
 
 
 def _normal_rows(
-    correction: ScannerCorrection, c: Array, m: Array, z: Array, R: Array, size: int
+    factor: Array, slopes: Array, values: Array, c: Array, m: Array, z: Array, R: Array, size: int
 ) -> tuple[Array, Array]:
     """Tilts (n, 3) of seen against stated normals, and their derivative (n, 3, size) by rotation and correction.
+
+    The correction has these ``values`` (K,), ``factor`` (n,) and ``slopes`` (n, K, 2) of its terms at the centres c (n, 3).
 
     A normal turns by the inverse transpose of the correction's derivative; the linear part of that, at the identity, is what a
     small change of a factor does.
     """
-    seen = correction.normals(c, m) @ R.T
+    jacobian = factor[:, None, None] * np.eye(3)
+    jacobian[:, :, :2] += c[:, :, None] * np.einsum("nki,k->ni", slopes, values)[:, None]
+    turned_back = np.linalg.solve(np.swapaxes(jacobian, -1, -2), m[..., None])[..., 0]
+    seen = turned_back / np.linalg.norm(turned_back, axis=-1, keepdims=True) @ R.T
     across = np.eye(3) - z[:, :, None] * z[:, None]
     J = np.zeros((len(z), 3, size))
     J[:, :, :3] = -skew(seen)
-    slopes = correction.slopes(c)
     lean = (c * m).sum(axis=1)
     turned = np.zeros((len(z), slopes.shape[1], 3))
     turned[:, :, :2] = -lean[:, None, None] * slopes

@@ -1,14 +1,13 @@
 """Decides whether to correct the scanner, by comparing robot motion, hole circles and held-out errors."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.scanner_fit import (
     CIRCLE_OWN,
@@ -31,6 +30,7 @@ _EVIDENT = 0.999  # probability that the correction is not zero by chance
 _EVIDENT_FEW = 0.95  # the same below eight poses, where the correction is held back besides
 _CHANCE_FEW = 1.6  # held-out errors of four poses differ by as much by chance: root of F (12, 12) at 5 %
 _CONTRADICT = 0.99  # probability beyond which two sources that differ so much do contradict each other
+_FOLDS = 20  # of a comparison, at most: up to so many poses each is held out alone
 _GAIN = 0.95  # of the held-out error that must be left at most: a correction that gains less is not worth its unknowns
 
 
@@ -38,7 +38,8 @@ _GAIN = 0.95  # of the held-out error that must be left at most: a correction th
 class SelfCalibration:
     """Decision on the scanner correction. ``found`` is None where the scanner is taken as it is; ``sentence`` says why, or what was found;
     ``worth_saying`` where a reader of the result should know it. ``held_out_m`` and ``held_out_tilt_rad`` (n,) are errors
-    of each pose under a correction and a calibration that never saw it; NaN where they were not needed."""
+    of each pose under a correction and a calibration that never saw it, by which the order was chosen; NaN where they were
+    not needed."""
 
     found: CorrectionEstimate | None
     motion: CorrectionEstimate | None
@@ -47,6 +48,11 @@ class SelfCalibration:
     held_out_tilt_rad: Array
     sentence: str
     worth_saying: bool
+
+    @property
+    def could_choose(self) -> bool:
+        """Whether robot motion and hole circles were both there, so that the data made a choice."""
+        return self.motion is not None and self.holes is not None
 
     @property
     def accepted(self) -> ScannerCorrection | None:
@@ -174,54 +180,25 @@ def _from_few(
     )
 
 
-def apply_self_calibration(
-    observations: list[Observation],
-    rigid: CalibrationEstimate,
-    patterns: Mapping[str, HolePattern],
-    *,
-    seed: int = 0,
-    wanted: bool = True,
-) -> tuple[SelfCalibration | None, list[Observation], CalibrationEstimate]:
-    """The verdict on the scanner (None where it is not ``wanted``), the observations as corrected by it, and their estimate.
-
-    ``rigid`` is the estimate without a correction. Held-out errors of the one returned come from corrections, too, that
-    never saw the pose; its covariance contains that of the correction.
-    """
-    if not wanted:
-        return None, observations, rigid
-    good = [o for o, keep in zip(observations, rigid.inliers, strict=True) if keep]
-    scanner = self_calibrate(good, patterns, rigid.held_out.position_m[rigid.inliers], seed=seed)
-    if scanner.found is None or scanner.accepted is None:
-        return scanner, observations, rigid
-    corrected = [corrected_observation(scanner.accepted, o) for o in observations]
-    found = scanner.found
-    assert found.X_BC is not None
-    estimate = replace(
-        with_scanner(rigid, found.correction, found.X_BC, found.joint, found.redundancy),
-        position_residuals_m=position_errors(found.X_BC, corrected),
-        tilt_residuals_rad=tilt_errors(found.X_BC, corrected),
-        sigma_position_m=found.sigma_position_m,
-        sigma_normal_rad=found.sigma_normal_rad,
-    )
-    position, tilt = estimate.held_out.position_m.copy(), estimate.held_out.tilt_rad.copy()
-    position[rigid.inliers], tilt[rigid.inliers] = scanner.held_out_m, scanner.held_out_tilt_rad
-    return scanner, corrected, replace(estimate, held_out=HeldOut(position, tilt))
-
-
 def held_out_errors(
     observations: Sequence[Observation], patterns: Mapping[str, HolePattern], seed: int, order: int
 ) -> tuple[Array, Array]:
-    """Errors (n,) m and tilts (n,) rad of each pose under correction and calibration made without it."""
+    """Errors (n,) m and tilts (n,) rad of each pose under correction and calibration of that order made without its fold.
+
+    They compare orders; reported are those of nested.nested_errors, in which the choice is repeated, too.
+    """
     errors, tilts = np.full((2, len(observations)), np.nan)
     start = from_motion(observations, patterns, seed=seed, order=order, usual=True).X_BC
-    for i, o in enumerate(observations):
-        rest = [other for other in observations if other is not o]
+    folds = min(len(observations), _FOLDS)
+    for f in range(folds):
+        test = [i for i in range(len(observations)) if i % folds == f]
+        rest = [o for i, o in enumerate(observations) if i % folds != f]
         try:
             X, correction = calibrate_corrected(rest, patterns, seed=seed, order=order, start=start)
         except InputError:
             continue
-        seen = [corrected_observation(correction, o)]
-        errors[i], tilts[i] = float(position_errors(X, seen)[0]), float(tilt_errors(X, seen)[0])
+        seen = [corrected_observation(correction, observations[i]) for i in test]
+        errors[test], tilts[test] = position_errors(X, seen), tilt_errors(X, seen)
     return errors, tilts
 
 

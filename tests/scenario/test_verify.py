@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result, save_result
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
 from weldcal.calibration.eye_on_base.solve import estimate_eye_on_base
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.observation import Observation

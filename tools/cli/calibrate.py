@@ -27,6 +27,10 @@ def calibrate(
         bool, switch("--centres", "Also write centres.csv: the flange centre found in each scan of a dataset.")
     ] = False,
     scanner_correction: CorrectionOption = True,
+    poses: Annotated[
+        str | None,
+        option("--poses", "FROM:TO", "Of a dataset: use only the scans from one id to another, such as p09: or :p08."),
+    ] = None,
     axis_turn: Annotated[
         float | None,
         option(
@@ -52,9 +56,13 @@ def calibrate(
             centres=centres,
             correct_scanner=scanner_correction,
             axis_turn_deg=axis_turn,
+            poses=poses,
         )
         algorithm1 = report.algorithm1
         rows = {} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence}
+        interval = report.held_out_interval_mm
+        if interval is not None:
+            rows["mean error of as many new scans"] = f"{interval[0]:.3f} to {interval[1]:.3f} mm (95 %)"
         return Outcome(report.summary(), rows=rows | pose_rows(report.result.X_BC))
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")

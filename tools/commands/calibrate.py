@@ -9,13 +9,13 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
-from weldcal.calibration.errors import InconsistentPoses, TooFewPoses
+from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
+from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
 from weldcal.calibration.eye_on_base.observations import see_flanges
-from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration, calibrate_corrected
-from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.tcp import find_tcp
+from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -23,6 +23,7 @@ from weldcal.calibration.planning.observability import turn_deg
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
+from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.report.calibration import calibration_report
@@ -43,12 +44,14 @@ def calibrate_dataset(
     centres: bool = False,
     correct_scanner: bool = True,
     axis_turn_deg: float | None = None,
+    poses: str | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
     ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, uncorrected).
     ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole pattern about the
-    flange axis; with it, one to three scans that show the holes are enough. A cloud that cannot be used is refused and
+    flange axis; with it, one to three scans that show the holes are enough. ``poses`` ("FROM:TO", ids, either may be left
+    out) takes the scans from one id to another, in the order of the dataset. A cloud that cannot be used is refused and
     reported, as long as enough remain. Nothing is written unless the calibration succeeded.
 
     Raises:
@@ -59,6 +62,8 @@ def calibrate_dataset(
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
     data = load_dataset(Path(folder))
+    if poses is not None:
+        data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
@@ -72,7 +77,7 @@ def calibrate_dataset(
         estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
     else:
         config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
-        estimate, tcp = _estimate(observations, config, X_FR, 0.5 * standard.outer_m)
+        estimate, tcp = estimate_consistent(observations, config, X_FR, 0.5 * standard.outer_m)
     tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
@@ -85,18 +90,15 @@ def calibrate_dataset(
     ]
     inliers = [o for o, keep in zip(observations, estimate.inliers, strict=True) if keep]
     accepted = None if scanner is None else scanner.accepted
+    chose = scanner is not None and (scanner.could_choose or scanner.accepted is not None)
     tell("cross-validating", 0.75)
     folds = (
         k_fold(
             inliers,
             folds=min(5, len(inliers)),
-            repeats=5,
+            repeats=2 if chose else 5,
             seed=seed,
-            solve=None
-            if accepted is None
-            else lambda poses: calibrate_corrected(
-                poses, seen.patterns, seed=seed, order=accepted.order, start=estimate.X_BC
-            ),
+            solve=(lambda poses: calibrate_by_choice(poses, seen.patterns, seed=seed)) if chose else None,
         )
         if len(inliers) >= 6
         else np.full((1, 1), np.nan)
@@ -165,27 +167,6 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
-
-
-def _estimate(
-    observations: list[Observation], config: SolveConfig, X_FR: RigidTransform | None, flange_m: float
-) -> tuple[CalibrationEstimate, tuple[str, ...]]:
-    """The estimate, and a sentence where the poses look as if a TCP were set.
-
-    Raises:
-        InconsistentPoses: the TCP is surely longer than the flange's radius ``flange_m``, or explains why no calibration is found.
-    """
-    try:
-        estimate = estimate_eye_on_base(observations, config)
-    except InconsistentPoses as refusal:
-        tcp = find_tcp(observations)
-        if tcp is None:
-            raise
-        raise InconsistentPoses(tcp.sentence(X_FR)) from refusal
-    tcp = find_tcp(observations, estimate.X_BC)
-    if tcp is not None and tcp.surely_beyond(flange_m):
-        raise InconsistentPoses(tcp.sentence(X_FR))
-    return estimate, () if tcp is None else (tcp.sentence(X_FR),)
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:

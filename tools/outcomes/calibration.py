@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.nested import mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence
@@ -79,8 +80,14 @@ class CalibrationReport:
     advice: tuple[str, ...] = ()
     patterns: dict[str, HolePattern] = field(default_factory=dict)
 
+    @property
+    def held_out_interval_mm(self) -> tuple[float, float] | None:
+        """Interval (mm) that holds the mean error of as many new scans with 95 % probability; None for fewer than four errors."""
+        return mean_interval(1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
+
     def summary(self) -> dict[str, Any]:
         """The JSON object of `calibrate`."""
+        interval = self.held_out_interval_mm
         r = self.result
         a = self.algorithm1
         return {
@@ -91,6 +98,7 @@ class CalibrationReport:
             "covariance": r.covariance.tolist(),
             "scanner_correction": r.scanner_correction,
             "held_out_mm": {k: r.held_out_mm[k] for k in ("median", "mean", "p95")},
+            "held_out_interval_mm": None if interval is None else list(interval),
             "tilt_deg": r.tilt_deg,
             "outliers": list(self.outliers),
             "warnings": list(r.warnings),

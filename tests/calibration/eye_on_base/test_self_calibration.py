@@ -11,11 +11,11 @@ from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.estimate import with_scanner
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.self_calibration import (
     SelfCalibration,
-    apply_self_calibration,
     from_holes,
     from_motion,
     self_calibrate,
@@ -230,7 +230,7 @@ def _warped_cell(device: int, n: int, seed: int) -> tuple[list[Observation], dic
 def test_held_out_errors_are_those_of_new_scans_where_no_correction_of_ours_is_exact() -> None:
     """The scanner errs by another model than the one that is fitted."""
     told = []
-    for device in range(10):
+    for device in range(8):
         observations, patterns = _warped_cell(device, 10, 0)
         rigid = estimate_eye_on_base(observations)
         scanner, _, estimate = apply_self_calibration(observations, rigid, patterns)
@@ -245,7 +245,7 @@ def test_held_out_errors_are_those_of_new_scans_where_no_correction_of_ours_is_e
         assert np.mean(after**2) <= 1.1 * np.mean(before**2), f"device {device} is made worse: {scanner.sentence}"
         told.append(float(np.sqrt(np.mean(estimate.held_out.position_m**2) / np.mean(after**2))))
     assert len(told) >= 4, "the case is about corrections"
-    # What chooses the order is told as well, which makes it 14 % too small at most on real scans; the rest is chance: ten
+    # The choice is repeated without each pose, so nothing makes them too small but chance: ten
     # poses know an rms to some 20 %, five devices to 10 %. Errors of poses that were fitted would be 0.62 of the true ones.
     assert 0.72 <= np.mean(told) <= 1.25
 

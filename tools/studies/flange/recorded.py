@@ -11,10 +11,11 @@ from scipy.stats import chi
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibrate_from_few
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
 from weldcal.calibration.eye_on_base.scanner_fit import from_holes, from_motion
-from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration, held_out_errors
+from weldcal.calibration.eye_on_base.self_calibration import held_out_errors
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
@@ -178,6 +179,6 @@ def _calibrated(
         alone = len(used) == 1
         return calibrate_from_few(used, patterns, turn if alone else None, seed=seed).X_BC, ScannerCorrection()
     rigid = estimate_eye_on_base(used, SolveConfig(seed=seed, allow_coplanar=True))
-    scanner, _, estimate = apply_self_calibration(used, rigid, patterns, seed=seed)
+    scanner, _, estimate = apply_self_calibration(used, rigid, patterns, seed=seed, nested=False)
     accepted = None if scanner is None else scanner.accepted
     return estimate.X_BC, ScannerCorrection() if accepted is None else accepted

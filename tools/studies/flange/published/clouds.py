@@ -10,8 +10,8 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.observations import FlangeObservations, corrected_observation, see_flanges
-from weldcal.calibration.eye_on_base.self_calibration import apply_self_calibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.fit import fit_flange

@@ -1,0 +1,183 @@
+"""Finds a change of the camera's pose during the recording: the scanner, or the robot's base, was moved."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.stats import f as f_distribution
+
+from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
+from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+
+FALSE_ALARM = 1e-4  # of recordings without a change in which one is named, by the F-test alone
+LEAST_PART = 4  # poses before and after
+_LEAST = 9  # poses in all: with fewer, 12 unknowns of two poses and 3 of the scanner leave nothing to test with
+_LARGER_THAN = (
+    3.0  # sigmas per axis of one pose: a smaller shift is arm and scanner, which repeat no better over a field
+)
+_SCANNER_ORDERS = ((14, 2), (_LEAST, 1))  # from how many poses on the scanner's own error is left open to which order
+_USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 0.02, 0.02, 0.02])  # what the factors of a scanner are off (1, 1/m, 1/m^2)
+_CANDIDATES = 60  # places looked at first
+_SAME_M, _SAME_RAD = 5e-3, 1e-2  # starts so near to each other lead to the same fit
+_HUBER = 2.0
+_FLOOR_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class ChangePoint:
+    """A change between two poses: ids of the last before and of the first after it; the two camera poses; the rms shift (m)
+    of the flange centres that it makes, the spread per axis (m) with and without it, and the probability by chance."""
+
+    index: int
+    before: str
+    after: str
+    X_BC_before: RigidTransform
+    X_BC_after: RigidTransform
+    shift_m: float
+    with_m: float
+    without_m: float
+    probability: float
+
+    @property
+    def rotation_rad(self) -> float:
+        """Angle between the two camera poses."""
+        turn = RotationMatrix(self.X_BC_before.rotation().inverse() @ self.X_BC_after.rotation())
+        return float(abs(turn.ToAngleAxis().angle()))
+
+
+def find_change(observations: Sequence[Observation]) -> ChangePoint | None:
+    """The change of the camera's pose in observations (n) in the order of their recording; None where they show none.
+
+    One camera pose is compared with two, for every place of a change that leaves four poses on either side. Both models
+    leave the scanner's own error open, held to its usual size, which a recording from near to far would else take for a
+    change. Centres only; Huber weights. A change is named if the F-test, corrected for the number of places, gives it a
+    probability by chance below FALSE_ALARM, and if it shifts the centres by more than three sigmas of a single pose.
+    Deterministic. Fewer than nine poses show none.
+    """
+    n = len(observations)
+    if n < _LEAST:
+        return None
+    b = np.array([o.p_BR for o in observations])
+    c = np.array([o.p_CR for o in observations])
+    order = next(order for least, order in _SCANNER_ORDERS if n >= least)
+    starts = _starts(observations)
+    best: tuple[float, int, _Split] | None = None
+    for X in starts:
+        places = list(range(LEAST_PART, n - LEAST_PART + 1))
+        step = max(1, len(places) // _CANDIDATES)
+        fits = {k: _fit(b, c, X, k, order) for k in places[::step]}
+        near = min(fits, key=lambda k: fits[k].loss)
+        fits |= {k: _fit(b, c, X, k, order) for k in places if abs(k - near) < step}
+        k = min(fits, key=lambda k: fits[k].loss)
+        if best is None or fits[k].loss < best[0]:
+            best = (fits[k].loss, k, fits[k])
+    if best is None:
+        return None
+    _, k, split = best
+    single = min((_fit(b, c, X, None, order, split.sigma) for X in starts), key=lambda s: s.loss)
+    at_split = _fit(b, c, split.X_before, k, order, split.sigma)
+    free = 3 * n - 12 - TERMS[order]
+    ratio = max(single.loss - at_split.loss, 0.0) / 6.0 / max(at_split.loss / free, 1e-12)
+    probability = min(1.0, float(f_distribution.sf(ratio, 6, free)) * (n - 2 * LEAST_PART + 1))
+    moved = (at_split.X_after @ at_split.X_before.inverse()).multiply(b.T).T - b
+    shift = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+    if probability > FALSE_ALARM or shift < _LARGER_THAN * at_split.sigma:
+        return None
+    return ChangePoint(
+        k, observations[k - 1].id, observations[k].id, at_split.X_before, at_split.X_after,
+        shift, at_split.sigma, single.own_sigma, probability,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    """A fit: twice its Huber loss in units of sigma^2, the sigma (m) it was taken with, and its own."""
+
+    X_before: RigidTransform
+    X_after: RigidTransform
+    loss: float
+    sigma: float
+    own_sigma: float
+
+
+def _starts(observations: Sequence[Observation]) -> list[RigidTransform]:
+    """Camera poses to begin with: from all poses, from the first and from the last of them; those that can be estimated and
+    that lead elsewhere than an earlier one."""
+    n = len(observations)
+    config = SolveConfig(leave_one_out=False, hypotheses=150, allow_coplanar=True)
+    middle = np.mean([o.p_CR for o in observations], axis=0)
+    out: list[RigidTransform] = []
+    for part in (slice(None), slice(n // 2), slice(n // 2, None), slice(LEAST_PART), slice(-LEAST_PART, None)):
+        try:
+            X = estimate_eye_on_base(tuple(observations[part]), config).X_BC
+        except InputError:
+            continue
+        if all(
+            np.linalg.norm(X @ middle - Y @ middle) > _SAME_M
+            or (X.rotation().inverse() @ Y.rotation()).ToAngleAxis().angle() > _SAME_RAD
+            for Y in out
+        ):
+            out.append(X)
+    return out
+
+
+def _fit(
+    b: Array, c: Array, start: RigidTransform, split: int | None, order: int, sigma: float | None = None
+) -> _Split:
+    """Camera poses before and from ``split`` on (None: one for all) and the scanner's factors, by reweighted Gauss-Newton.
+
+    ``sigma`` (m, an axis) is estimated from the residuals where it is not given.
+    """
+    n, terms = len(b), TERMS[order]
+    correction = ScannerCorrection(1.0, (0.0, 0.0), (0.0,) * (terms - 3))
+    basis = correction.terms(c)
+    later = np.zeros(n, dtype=bool) if split is None else np.arange(n) >= split
+    poses = 1 if split is None else 2
+    X = [(start.rotation().matrix(), np.asarray(start.translation()))] * poses
+    factors = np.zeros(terms)
+    given, own = sigma, 1e-3
+    free = max(3 * n - 6 * poses - terms, 3)
+    e = np.zeros((n, 3))
+    for _ in range(12):
+        q, J = np.zeros((n, 3)), np.zeros((n, 3, 6 * poses + terms))
+        pivot = b.mean(axis=0)
+        for s, (R, p) in enumerate(X):
+            rows = later == bool(s)
+            seen = c[rows] * (1.0 + basis[rows] @ factors)[:, None]
+            q[rows] = seen @ R.T + p
+            J[rows, :, 6 * s : 6 * s + 3], J[rows, :, 6 * s + 3 : 6 * s + 6] = -skew(q[rows] - pivot), np.eye(3)
+            J[rows, :, 6 * poses :] = (c[rows] @ R.T)[:, :, None] * basis[rows][:, None]
+        e = q - b
+        size = np.linalg.norm(e, axis=1)
+        own = max(
+            float(np.median(size)) / 1.538 * float(np.sqrt(3 * n / free)), _FLOOR_M
+        )  # median of chi, 3 dof: 1.538
+        scale = own if given is None else given
+        w = np.minimum(1.0, _HUBER * np.sqrt(3.0) * scale / np.maximum(size, 1e-12))
+        prior = np.zeros(J.shape[2])
+        prior[6 * poses :] = (scale / _USUAL[:terms]) ** 2
+        N = np.einsum("nki,n,nkj->ij", J, w, J) + np.diag(prior)
+        g = np.einsum("nki,n,nk->i", J, w, e) + prior * np.concatenate([np.zeros(6 * poses), factors])
+        step = -np.linalg.lstsq(N, g, rcond=1e-13)[0]
+        factors = factors + step[6 * poses :]
+        X = [
+            (
+                exp_rotation(step[6 * s : 6 * s + 3]) @ R,
+                exp_rotation(step[6 * s : 6 * s + 3]) @ (p - pivot) + pivot + step[6 * s + 3 : 6 * s + 6],
+            )
+            for s, (R, p) in enumerate(X)
+        ]
+        if float(np.linalg.norm(step)) < 1e-9:
+            break
+    scale = own if given is None else given
+    size, limit = np.linalg.norm(e, axis=1) / scale, _HUBER * np.sqrt(3.0)
+    loss = float(
+        np.where(size < limit, size**2, 2.0 * limit * size - limit**2).sum() + ((factors / _USUAL[:terms]) ** 2).sum()
+    )
+    rigid = [RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p) for R, p in X]
+    return _Split(rigid[0], rigid[-1], loss if given is not None else float(np.log(scale) * 3 * n + loss), scale, own)
