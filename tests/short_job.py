@@ -7,7 +7,7 @@ from functools import cache
 
 import pytest
 
-from tests.perfect_world import perfect
+from weldcal.tools.studies.perfect_world import perfect
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario

@@ -10,7 +10,7 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
-from tests.perfect_world import perfect
+from weldcal.tools.studies.perfect_world import perfect
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.cell import Cell, build_cell

@@ -22,7 +22,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F
 
-from tests.perfect_world import perfect
+from weldcal.tools.studies.perfect_world import perfect
 from tests.systems.cells import Q_HOME, the_arm
 from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool

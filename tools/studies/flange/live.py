@@ -22,6 +22,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.outcomes.weld import calibration_error
 from weldcal.tools.report.pictures import svg
+from weldcal.tools.studies.perfect_world import perfect
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +155,8 @@ class LiveRow:
 
 
 def live_scenario(repeatability_mm: float, scans: int) -> Scenario:
-    """The calibration scenario with an arm that repeats no better, and exactly so many scans."""
-    scenario = load_scenario(SCENARIO)
+    """The calibration scenario with an arm that repeats no better, a scanner without distortion, and exactly so many scans."""
+    scenario = perfect(load_scenario(SCENARIO))
     assert isinstance(scenario.robot, SimulatedUr)
     scenario.robot.repeatability_mm = repeatability_mm
     scenario.calibration.minimum_scans = scenario.calibration.maximum_scans = scans

@@ -1,4 +1,4 @@
-"""Takes the scanner's and the arm's own errors out of a scenario, for tests of what has nothing to do with them."""
+"""Takes the scanner's and the arm's own errors out of a scenario, for studies and tests that are not about them."""
 
 from __future__ import annotations
 
