@@ -25,6 +25,11 @@ class PauseWatch:
     def __init__(self) -> None:
         self.pauses: list[tuple[float, float]] = []
 
+    @property
+    def pid(self) -> int:
+        """The watching process."""
+        return self._process.pid
+
     def __enter__(self) -> PauseWatch:
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", _WATCH.format(pause=PAUSE_S)], stdout=subprocess.PIPE, text=True

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 from array import array
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,6 +33,18 @@ def streamed(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreamReport, Pa
         if not (report.stops and WATCH.pauses):
             break
     return report, folder
+
+
+def test_a_bystander_sees_a_pause_and_nothing_else() -> None:
+    with PauseWatch() as watch:
+        time.sleep(0.3)
+        os.kill(watch.pid, signal.SIGSTOP)
+        time.sleep(0.5)
+        os.kill(watch.pid, signal.SIGCONT)
+        time.sleep(0.1)
+    assert max(length for _, length in watch.pauses) == pytest.approx(0.5, abs=0.2)
+    assert "paused" in watch.sentence
+    assert PauseWatch().sentence == "the computer never paused"
 
 
 def test_the_stream_goes_through_without_a_fault(streamed: tuple[StreamReport, Path]) -> None:

@@ -320,7 +320,8 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
 FEEDTHROUGH: dict[type[LeafSystem], set[tuple[str, str]]] = {
     SingularityGuard: {(i, o) for i in ("V_BT", "position_measured") for o in ("velocity", "margin", "guarded")},
     CommandArbiter: {(i, "velocity_wanted") for i in ("job", "robot_status", "mover_velocity", "servo_velocity")},
-    WeldingVelocityServo: {("job", "torch_on")},  # the process goes off in the very tick in which the job says so
+    # process and motion end in the very tick in which the job says so
+    WeldingVelocityServo: {("job", "torch_on"), ("job", "V_BT")},
     # whoever stops the arm turns the process off in the same tick
     ProcessSwitch: {(i, "process_on") for i in ("torch_wanted", "job", "robot_status", "margin", "hold")},
     PicturePoses: {("body_poses", "frame_poses")},

@@ -97,9 +97,11 @@ def honesty(
     from weldcal.tools.report.render import write_atomic
     from weldcal.tools.studies.flange.coverage import coverage_picture, study_corrected, study_coverage
     from weldcal.tools.studies.flange.tables import coverage_table
+    from weldcal.tools.studies.flange.warped import study_warped
 
     studies = [study_coverage(n, runs, call.seed, call.progress) for n in (5, 6, 8, 12, 20)]
     studies += [study_corrected(n, runs, call.seed, call.progress) for n in (6, 8, 12, 20)]
+    studies.append(study_warped(12, max(10, runs // 5), call.progress))
     if call.out is not None:
         write_atomic(call.out / "coverage.svg", coverage_picture(studies))
     return _figures(call, coverage_table(studies))

@@ -57,7 +57,7 @@ class WeldingVelocityServo(LeafSystem):
         - telemetry
         - torch_on
 
-    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
+    `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B, zero unless the job's mode is `weld`; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
     (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch.
     """
 

@@ -7,13 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
-from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.estimate import with_scanner
-from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.self_calibration import (
     SelfCalibration,
     from_holes,
@@ -21,11 +19,10 @@ from weldcal.calibration.eye_on_base.self_calibration import (
     self_calibrate,
 )
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
-from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import rotation_vector
-from weldcal.models.depth_noise import device_warp
+from weldcal.tools.studies.flange.warped import calibrate_warped, new_errors
 
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 WRONG = ScannerCorrection(1.003, (0.015, -0.01))
@@ -193,55 +190,22 @@ def test_the_covariance_holds_what_the_correction_leaves_open() -> None:
     assert np.mean(points) / 3.0 > 0.5
 
 
-FIELD, REFERENCE_M, WARP_M = 0.5, 0.4, 1.6e-3
-"""Half the width that the scanner sees over its distance; where the warp is stated; 0.4 % of that, twice what a real one showed."""
-
-
-def _warped(p_C: np.ndarray, device: int) -> np.ndarray:
-    """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x and y."""
-    image = device_warp((401, 401), WARP_M, device)
-    column, row = ((1.0 + p_C[k] / p_C[2] / FIELD) * 200.0 for k in (0, 1))
-    off = float(map_coordinates(image, [[row], [column]], order=3, mode="nearest")[0])
-    return np.asarray(p_C * (1.0 + off * (p_C[2] / REFERENCE_M) ** 2 / p_C[2]))
-
-
-def _warped_cell(device: int, n: int, seed: int) -> tuple[list[Observation], dict[str, HolePattern]]:
-    """Observations and hole circles by such a scanner; both follow from where it puts the points of the flange."""
-    rng, observations, patterns, h = np.random.default_rng((device, seed)), [], {}, 0.02
-    for k in range(n):
-        true = np.array([0.0, 0.0, 0.4]) + rng.uniform([-0.12, -0.1, -0.06], [0.12, 0.1, 0.06])
-        R_CR = RollPitchYaw(
-            np.pi + rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2), rng.uniform(-3, 3)
-        ).ToRotationMatrix()
-        ahead, behind = (
-            [_warped(true + s * h * R_CR.matrix()[:, axis], device) for axis in (0, 1)] for s in (1.0, -1.0)
-        )
-        across = [(a - b) / (2.0 * h) for a, b in zip(ahead, behind, strict=True)]
-        normal = np.cross(*across)
-        normal = normal / np.linalg.norm(normal) + NOISE_RAD * rng.standard_normal(3)
-        p_C = _warped(true, device) + NOISE_M * rng.standard_normal(3)
-        name = f"p{k:02d}"
-        observations.append(Observation(name, X_BC @ RigidTransform(R_CR, true), p_C, normal / np.linalg.norm(normal)))
-        ratio = 0.5 * float(sum(np.linalg.norm(v) for v in across)) + NOISE_RATIO * rng.standard_normal()
-        patterns[name] = HolePattern(np.zeros((4, 3)), np.zeros(4), p_C, RigidTransform(R_CR, p_C), ratio, 0.0)
-    return observations, patterns
-
-
 def test_held_out_errors_are_those_of_new_scans_where_no_correction_of_ours_is_exact() -> None:
-    """The scanner errs by another model than the one that is fitted."""
+    """The scanner errs by another model than the one that is fitted, by 0.4 %: twice what a real one showed."""
     told = []
+<<<<<<< HEAD
     for device in range(8):
         observations, patterns = _warped_cell(device, 10, 0)
         rigid = estimate_eye_on_base(observations)
         scanner, _, estimate = apply_self_calibration(observations, rigid, patterns)
         assert scanner is not None
+=======
+    for device in range(10):
+        rigid, estimate, scanner = calibrate_warped(device, 10, 1.6e-3)
+>>>>>>> fb70913dc953c1e7b1e08fab860204545f4557e3
         if scanner.accepted is None:
             continue
-        new, _ = _warped_cell(device, 60, 1)
-        before, after = (
-            position_errors(rigid.X_BC, new),
-            position_errors(estimate.X_BC, [corrected_observation(scanner.accepted, o) for o in new]),
-        )
+        before, after = (new_errors(device, *pair, 1.6e-3) for pair in ((rigid, None), (estimate, scanner)))
         assert np.mean(after**2) <= 1.1 * np.mean(before**2), f"device {device} is made worse: {scanner.sentence}"
         told.append(float(np.sqrt(np.mean(estimate.held_out.position_m**2) / np.mean(after**2))))
     assert len(told) >= 4, "the case is about corrections"

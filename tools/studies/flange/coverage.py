@@ -35,7 +35,7 @@ class Coverage:
     """Of ``runs`` calibrations from ``poses`` observations each: how often the truth lies within the stated 95 % region of
     X_BC (six dimensions) and of a point at the work point (three); held-out over true error at the flange, both means
     over the runs, with the noise of the held-out scan in both (NaN where that was not looked at). ``corrected``: with a
-    scanner that is off in scale and gradient, and its correction."""
+    scanner that is off in scale and gradient, and its correction; ``warped``: with one that errs by another model."""
 
     poses: int
     runs: int
@@ -43,6 +43,7 @@ class Coverage:
     point: float
     held_out_over_true: float
     corrected: bool = False
+    warped: bool = False
 
     def chance(self) -> tuple[float, float]:
         """Shares between which 99 % of such studies fall where the regions are exact."""
@@ -174,7 +175,7 @@ def coverage_picture(studies: list[Coverage]) -> bytes:
     for ax, corrected, title in zip(
         axes, (False, True), ("an exact scanner", "a scanner off by 0.2 %, corrected"), strict=True
     ):
-        chosen = [s for s in studies if s.corrected == corrected]
+        chosen = [s for s in studies if s.corrected == corrected and not s.warped]
         n = [s.poses for s in chosen]
         ax.axhspan(100 * low, 100 * high, color="#1d5f8a", alpha=0.10, linewidth=0)
         ax.axhline(95.0, color="#444", linewidth=1, linestyle="--")

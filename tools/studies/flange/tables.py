@@ -108,12 +108,18 @@ def parts_table(rows: Sequence[PartRow]) -> Table:
 def coverage_table(studies: Sequence[Coverage]) -> Table:
     """How often the stated 95 % regions contain the truth, a row per number of scans."""
     lines = {
-        f"{s.poses} scans{', scanner corrected' if s.corrected else ''}": f"X_BC in its 95 % region {100 * s.pose:.1f} %, the work "
+        f"{s.poses} scans{_scanner(s)}": f"X_BC in its 95 % region {100 * s.pose:.1f} %, the work "
         f"point in its {100 * s.point:.1f} %"
-        + ("" if s.corrected else f"; held-out over true error {s.held_out_over_true:.2f}")
+        + ("" if np.isnan(s.held_out_over_true) else f"; held-out over true error {s.held_out_over_true:.2f}")
         for s in studies
     }
     return _rows("studies", studies), lines
+
+
+def _scanner(study: Coverage) -> str:
+    if study.warped:
+        return ", scanner of another model"
+    return ", scanner corrected" if study.corrected else ""
 
 
 def _rms(values: Array) -> float:
