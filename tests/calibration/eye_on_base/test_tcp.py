@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 
-from tests.calibration.eye_on_base.test_solve import displaced, make_observations
+from tests.calibration.eye_on_base.test_solve import X_BC, displaced, make_observations
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.tcp import FALSE_ALARM, find_tcp
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.tools.commands.calibrate import calibrate_dataset
 
 
@@ -57,11 +58,28 @@ def test_without_a_tcp_none_is_named() -> None:
     assert len(named) <= 3
 
 
+def facing(n: int, seed: int) -> list[Observation]:
+    """Poses that face the scanner to within 9 degrees, as planned ones do: an error along its rays is one along their z."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for o in make_observations(n, seed):
+        ray = o.p_CR / np.linalg.norm(o.p_CR)
+        z = -ray
+        x = np.cross([0.0, 1.0, 0.0], z)
+        R = np.column_stack([x / np.linalg.norm(x), np.cross(z, x / np.linalg.norm(x)), z])
+        R = R @ exp_rotation(rng.uniform(-0.15, 0.15, 3))
+        out.append(replace(o, X_BR=RigidTransform(X_BC.rotation() @ RotationMatrix(R), o.p_BR), n_C=R[:, 2]))
+    return out
+
+
 def test_a_scanners_own_error_is_not_called_a_tcp() -> None:
+    """A range that is 6 mm too long, as of time of flight, and scale with gradient: both lie along the poses' z."""
     scanner = ScannerCorrection(0.997, (0.02, -0.015))
     for seed in range(30):
-        seen = [replace(o, p_CR=scanner.points(o.p_CR)) for o in make_observations(12, seed, turn=0.3)]
-        assert find_tcp(seen) is None
+        seen = facing(20, seed)
+        far = [replace(o, p_CR=o.p_CR * (1.0 + 6e-3 / float(np.linalg.norm(o.p_CR)))) for o in seen]
+        assert find_tcp(far) is None
+        assert find_tcp([replace(o, p_CR=scanner.points(o.p_CR)) for o in seen]) is None
 
 
 def test_poses_of_one_orientation_show_none() -> None:
