@@ -15,10 +15,10 @@ from weldcal.calibration.data.tables import Row
 from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
+from weldcal.calibration.tablet.page_match import check_page_match
 from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist.fit import WristTouches
 from weldcal.calibration.tablet.wrist.page_grid import find_page
-from weldcal.calibration.tablet.wrist.page_match import check_page_match
 from weldcal.models.arrays import Array
 
 TOUCH_COLUMNS = ("landmark", "landmark_x_px", "landmark_y_px", "touch_x_px", "touch_y_px", "mm_per_px")
