@@ -10,6 +10,8 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.calibration.eye_on_base.test_solve import X_BC, displaced, make_observations
+from tests.places import SHARED_DATA
+from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import InconsistentPoses
 from weldcal.calibration.eye_on_base.tcp import FALSE_ALARM, find_tcp
@@ -101,6 +103,20 @@ def test_what_an_arm_is_off_is_not_called_a_tcp() -> None:
             replace(o, X_BR=RigidTransform(o.X_BR.rotation(), o.p_BR + e)) for o, e in zip(poses, error, strict=True)
         ]  # fmt: skip
         assert find_tcp(off) is None
+
+
+@pytest.mark.skipif(not (SHARED_DATA / "flange").is_dir(), reason="The real flange scans are not beside this checkout.")
+@pytest.mark.parametrize("name", ["ur10e_phoxi_m", "ur10e_azure_kinect"])
+def test_on_real_pairs_no_tcp_is_named_and_one_that_was_set_is(name: str) -> None:
+    pairs = load_dataset(SHARED_DATA / "flange" / name).pairs
+    seen = [Observation(p.id, p.X_BR, p.p_CR) for p in pairs]
+    assert find_tcp(seen) is None
+    found = find_tcp(with_tcp(seen, [0.0, 0.05, 0.18]))
+    if name == "ur10e_phoxi_m":
+        assert found is not None
+        assert found.known.all()
+        np.testing.assert_allclose(found.offset_m, [0.0, -0.05, -0.18], atol=3e-3)
+        assert found.surely_beyond(0.0315)
 
 
 def test_poses_of_one_orientation_show_none() -> None:
