@@ -16,6 +16,9 @@ from weldcal.models.arrays import Array
 
 FALSE_ALARM = 1e-3  # of calibrations without a TCP in which one is named, by the F-test alone
 _SHORTEST_M = 2e-3  # twice what arms are off: a joint's zero error looks like a TCP of a millimetre
+_ARM_M = 5e-4
+"""What arms err systematically per coordinate (1 mm a point). However such errors are spread over the poses, they move the offset by
+no more than the norm of its row of the pseudo-inverse times theirs: a weak geometry makes much of little."""
 _UNKNOWN_M = 5e-3  # one sigma of an axis from which on it is not known
 _SURE_SIGMAS = 4.0
 _LEAST_FREE = 5  # spare numbers of the test
@@ -32,12 +35,14 @@ class TcpOffset:
     """A TCP that the poses seem to carry.
 
     ``offset_m`` (3,) of the flange's circle in the frame that the poses name, along x, y, z; ``sigma_m`` (3,), infinite where
-    these poses do not show it; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability`` that chance
+    these poses do not show it; ``pretended_m`` (3,) what systematic errors of the arm, or of the size of the residuals, may pretend at
+    most; ``with_m`` and ``without_m`` rms of the centres with and without it; ``probability`` that chance
     alone does as much.
     """
 
     offset_m: Array
     sigma_m: Array
+    pretended_m: Array
     with_m: float
     without_m: float
     probability: float
@@ -53,9 +58,15 @@ class TcpOffset:
         return float(np.linalg.norm(self.offset_m[self.known]))
 
     def surely_beyond(self, length_m: float) -> bool:
-        """Whether it is longer than that by four sigmas."""
-        sigma = float(np.sqrt((self.sigma_m[self.known] ** 2).sum()))
-        return self.length_m - _SURE_SIGMAS * sigma > length_m
+        """Whether it is longer than that by four sigmas, and by what systematic errors may pretend."""
+        doubt = np.maximum(_SURE_SIGMAS * self.sigma_m, self.pretended_m)[self.known]
+        return self.length_m - float(np.linalg.norm(doubt)) > length_m
+
+    @property
+    def evident(self) -> bool:
+        """Whether it is no chance, and longer than what arms are off may pretend."""
+        beyond = np.abs(self.offset_m) > np.maximum(self.pretended_m, _SHORTEST_M)
+        return self.probability < FALSE_ALARM and bool((beyond & self.known).any())
 
     def sentence(self, X_FR: RigidTransform | None) -> str:
         """What to do, where poses were read with the feature at ``X_FR``; None where there are pairs and no poses."""
@@ -79,7 +90,7 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
 
     With the scanner's own errors left open, centres are fitted with and without a constant offset b in the frame of the
     poses, R_BC p_C + p_BC = p_BR + R_BR b. The F-test of both holds FALSE_ALARM for normal errors; besides, the offset must be
-    longer than arms are off. ``start`` of the camera's pose where one is known.
+    longer than systematic errors may pretend. ``start`` of the camera's pose where one is known.
     """
     n = len(observations)
     order = next(k for least, k in _SCANNER_ORDERS if n >= least)
@@ -105,11 +116,12 @@ def find_tcp(observations: Sequence[Observation], start: RigidTransform | None =
     found = TcpOffset(
         full.offset,
         np.sqrt(variance) * full.offset_factor,
+        max(_ARM_M, float(np.sqrt(variance))) * full.offset_factor * np.sqrt(3.0 * keep.sum()),
         float(np.sqrt(full.square / keep.sum())),
         float(np.sqrt(bare.square / keep.sum())),
         probability,
     )
-    return found if probability < FALSE_ALARM and found.length_m > _SHORTEST_M else None
+    return found if found.evident else None
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,10 @@ def verify(
         correct_scanner=scanner_correction,
         limit_mm=limit_mm,
     )
-    verdict = report.verdict
+    verdict, summary = report.verdict, report.summary()
     return Outcome(
-        report.summary(),
-        rows={"because": verdict.reason, **pose_rows(report.result.X_BC)},
+        summary,
+        values={"verdict": verdict.verdict, "because": verdict.reason, **summary},
+        rows=pose_rows(report.result.X_BC),
         problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )

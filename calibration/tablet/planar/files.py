@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from weldcal.calibration.tablet.errors import EqualRotations, TabletDataError, TooFewLandmarks
+from weldcal.calibration.tablet.page_match import check_page_match
 from weldcal.calibration.tablet.plane_pose import tablet_pose
 from weldcal.calibration.tablet.touches import MIN_LANDMARKS, TabletTouches
 from weldcal.models.array_files import read_npz
@@ -153,6 +154,11 @@ def _visit(name: str, d: dict[str, Array], path: Path) -> PlanarVisit:
     if d["c"].shape != (2,) or d["hand_capture"].shape != (3,):
         raise TabletDataError(f"{where}: c must hold 2 numbers and hand_capture 3.")
     pitch_m = 1e-3 * float(d["mm_per_px"].reshape(()))
+    rows = tuple(int(i) for i in np.nonzero(good)[0])
+    landmark, delta = d["tablet_px"][good], d["delta_px"][good]
+    check_page_match(
+        landmark - delta, landmark, tuple(map(str, rows)), 1e3 * pitch_m, f"{path.name}{name and f' visit {name}'}"
+    )
     depth_m, seen = 1e-3 * d["depth"][good], d["depth"][good] > 0.0
     if not seen.all():
         rays = (d["uv"][good] - d["c"]) / focal
@@ -171,7 +177,6 @@ def _visit(name: str, d: dict[str, Array], path: Path) -> PlanarVisit:
         centre_px=d["c"],
         hand_capture_m=1e-3 * d["hand_capture"],
     )
-    rows = tuple(int(i) for i in np.nonzero(good)[0])
     return PlanarVisit(name, touches, _queries(d, where), rows, tuple(int(i) for i in np.nonzero(~good)[0]))
 
 

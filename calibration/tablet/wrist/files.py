@@ -13,10 +13,10 @@ from weldcal.calibration.data.tables import Row
 from weldcal.calibration.tablet.detection import Look
 from weldcal.calibration.tablet.errors import TabletDataError
 from weldcal.calibration.tablet.intrinsics import Intrinsics, load_intrinsics
+from weldcal.calibration.tablet.page_match import check_page_match
 from weldcal.calibration.tablet.tables import landmark, number, read_table
 from weldcal.calibration.tablet.wrist.fit import WristTouches
 from weldcal.calibration.tablet.wrist.page_grid import find_page
-from weldcal.calibration.tablet.wrist.page_match import check_page_match
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import sha256

@@ -11,10 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.calibration.profiler.test_cli import called, edge_csv, found
-from tests.calibration.profiler.test_sphere import SIGMAS, clean
+from tests.calibration.profiler.test_sphere import DATA, MM, SIGMAS, clean, needs_data, poses
 from weldcal.calibration.profiler.errors import RadiusError
 from weldcal.calibration.profiler.sphere.joint import _clearly_less, choose_model
-from weldcal.calibration.profiler.sphere.model import SphereData
+from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.calibration.profiler.sphere.radius import check_radius, free_radius
 from weldcal.tools.cli.app import app
 from weldcal.tools.studies.profiler.worlds import CLEAN, RADIUS_M, SphereWorld, sphere_trial
@@ -67,6 +67,16 @@ def test_the_diameter_for_the_radius_ends_the_command_and_writes_nothing(tmp_pat
     assert code == 1, text
     assert "diameter" in text
     assert not (tmp_path / "out").exists()
+
+
+@needs_data
+def test_the_real_spheres_diameter_is_refused_and_its_radius_is_not() -> None:
+    z = np.load(DATA / "real_sphere15_a.npz")
+    parts = np.split(z["xz"] * MM, np.cumsum(z["n"])[:-1])
+    scans = SphereData(poses(z["T_base_flange"]), [p[::8] for p in parts], 40 * MM)
+    check_radius(scans, SphereSigmas(), None)
+    with pytest.raises(RadiusError, match=r"a sphere of 40\.\d\d mm radius.*that is its diameter"):
+        check_radius(scans_of(scans, 80 * MM), SphereSigmas(), None)
 
 
 def test_the_model_taken_is_explained(tmp_path: Path) -> None:

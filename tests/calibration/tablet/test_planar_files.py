@@ -128,7 +128,6 @@ def test_four_landmarks_are_enough_and_leave_nothing_out(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("changed", "warning"),
     [
-        (lambda d: {**d, "theta_deg": -d["theta_deg"]}, "theta_deg counted the other way"),
         (lambda d: {**d, "delta_px": -d["delta_px"]}, "delta_px reversed"),
         (lambda d: {**d, "tablet_px": d["tablet_px"] * [1, -1], "delta_px": d["delta_px"] * [1, -1]}, "up the page"),
         (lambda d: {**d, "hand": d["hand"] + np.outer(np.eye(9)[4], [12.0, 0.0])}, "Without landmark 4 the others fit"),
@@ -147,6 +146,15 @@ def test_what_looks_wrong_is_told(tmp_path: Path, changed: Callable[[Fields], Fi
 @pytest.mark.parametrize(
     ("changed", "reason"),
     [
+        (
+            lambda d: {**d, "theta_deg": -d["theta_deg"]},
+            "contradict each other: .* with theta_deg counted the other way",
+        ),
+        (
+            lambda d: {**d, "delta_px": d["tablet_px"] - (d["tablet_px"] - d["delta_px"])[:, ::-1]},
+            "touch_x and touch_y are swapped",
+        ),
+        (lambda d: {**d, "delta_px": d["delta_px"] + [120.0, 60.0]}, "shifted by .* another origin"),
         (lambda d: only(d, [0, 2, 4]), "3 landmarks with finite numbers; at least 4"),
         (lambda d: {**d, "hand": d["hand"][[1, 0, *range(2, 9)]]}, "contradict each other: .* in one order"),
         (lambda d: only(d, [0, 2, 4, 0, 2, 4]), r"3 landmarks are too few \(a landmark counts once\)"),

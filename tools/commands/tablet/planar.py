@@ -80,9 +80,8 @@ def fit_visit(visit: PlanarVisit, sign: Sign, step_m: float, *, thorough: bool =
         rows = ", ".join(map(str, visit.excluded))
         warnings.append(f"Not used, because a number is not finite: landmark {rows}.")
     odd = _other_signs(touches, sign, planar.sigma_m) + _odd_landmarks(visit, planar, config)
-    if not odd:
-        _refuse_contradictions(fits, touches)
-        odd = _mirrored(touches)
+    _refuse_contradictions(fits, touches, odd)
+    odd = odd or _mirrored(touches)
     if planar.sigma_m > _BAD_M and not odd:
         odd = [f"The touches fit to {1e3 * planar.sigma_m:.1f} mm only; {_ONE_ORDER}."]
     warnings += odd
@@ -121,8 +120,10 @@ def _same_units(planar: PlanarFit) -> None:
         )
 
 
-def _refuse_contradictions(fits: Mapping[str, PlanarFit | LinearFit], touches: TabletTouches) -> None:
-    """Refuses touches that no model fits.
+def _refuse_contradictions(
+    fits: Mapping[str, PlanarFit | LinearFit], touches: TabletTouches, causes: Sequence[str]
+) -> None:
+    """Refuses touches that no model fits, with the first of the ``causes`` where there are any.
 
     Raises:
         InputError: the residuals are a large share of the landmarks' spread.
@@ -131,7 +132,7 @@ def _refuse_contradictions(fits: Mapping[str, PlanarFit | LinearFit], touches: T
     if left > _CONTRADICTION * spread:
         raise InputError(
             f"The touches contradict each other: they fit to {1e3 * left:.0f} mm only, with landmarks {1e3 * spread:.0f} mm from their "
-            f"centre. Please {_ONE_ORDER}, x before y."
+            f"centre. {causes[0] if causes else f'Please {_ONE_ORDER}, x before y.'}"
         )
 
 
