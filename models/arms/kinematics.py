@@ -284,7 +284,7 @@ def _number(section: Mapping[str, Any], *keys: str, path: Path | None = None) ->
         value = value.get(key) if isinstance(value, Mapping) else None
     try:
         number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         where = f"{path.name}: " if path else ""

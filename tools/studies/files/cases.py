@@ -23,7 +23,7 @@ GRAMMARS = text_mutations.GRAMMARS | binary_mutations.GRAMMARS
 _PLACES = ("a pipe", "a folder", "a device", "a loop of links", "nothing")
 _ODD_PLACE = 0.02  # share of the cases in which no regular file is there
 _UNITS = 0.05  # and in which a dataset's unit is exchanged
-_LONGEST = 400  # characters of a refusal
+_LONGEST = 1010  # characters of a refusal
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Verdict:
 
 
 def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, str]:
-    """The example, the damaged files, whether they contradict themselves, and what is there instead of a file ("" a file)."""
+    """The files before the last damage and after it, whether they contradict themselves, and what is there instead of a file ("" a file)."""
     rng = np.random.default_rng((seed, READERS.index(reader), case))
     files = reader.example(rng)
     if rng.random() < _ODD_PLACE:
@@ -46,8 +46,9 @@ def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, s
             *((b"clouds: m,", b"clouds: mm,") if rng.random() < 0.5 else (b"poses: m}", b"poses: mm}"))
         )
         return files, {**files, reader.target: swapped}, True, ""
-    wrong = False
+    wrong, before = False, content
     for _ in range(1 if rng.random() < 0.8 else 3):
+        before = content
         try:
             content, contradicts = GRAMMARS[reader.kind](content, rng)
         except Exception:  # what an earlier damage left is beyond the grammar
@@ -56,8 +57,8 @@ def damaged(reader: Reader, seed: int, case: int) -> tuple[Files, Files, bool, s
         if contradicts or not content:
             break
     if reader.name == "weld-table":  # its checksum stands in the header
-        wrong = content.replace(b"\r\n", b"\n") != files[reader.target]
-    return files, {**files, reader.target: content}, wrong, ""
+        before, wrong = files[reader.target], True
+    return {**files, reader.target: before}, {**files, reader.target: content}, wrong, ""
 
 
 def lay_out(folder: Path, files: Files, target: str, place: str = "") -> None:
