@@ -95,8 +95,9 @@ def fuzz_files(
                     findings.append(Finding(reader.name, case, verdict.said, verdict.detail, folder))
                 if case % 50 == 0:
                     progress(reader.name, (n + case / cases) / len(readers))
-    result = FuzzResult(counts, tuple(findings), slowest, seed)
-    write_atomic(out / "findings.json", json.dumps(result.summary(), indent=1) + "\n")
+            # after each reader, since thousands of cases take a while
+            result = FuzzResult(counts, tuple(findings), slowest, seed)
+            write_atomic(out / "findings.json", json.dumps(result.summary(), indent=1) + "\n")
     return result
 
 
