@@ -6,6 +6,7 @@ import dataclasses as dc
 import re
 import types
 import typing
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,7 +17,7 @@ from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.checks import check_scenario
-from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
+from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario, scenario_class, scenario_names
 from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 
@@ -316,6 +317,17 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
         ("calibration: {verification_scans: -1}", "calibration.verification_scans must not be negative"),
         ("welding: {seam_length_mm: -5}", "welding.seam_length_mm must be a positive number"),
         ("welding: {speed_mm_s: fast}", "at 'welding'"),
+        ("scanner: !RenderedScanner {width: 20000}", "scanner.width is 20000; from -4096 to 4096 is possible"),
+        ("scanner: !RenderedScanner {width: '1,5'}", "at 'scanner': invalid literal for int"),
+        ("scanner: !RenderedScanner {width: 1.5}", "at 'scanner': Expected a"),
+        ("visualization: {recording_fps: 1.0e+9}", "visualization.recording_fps is 1e+09"),
+        ("visualization: {cloud_points: null}", "at 'visualization': Expected a"),
+        ("workpiece: {length_mm: 1.0e+7}", "workpiece.length_mm is 1e+07"),
+        ("workpiece: {pose_guess: {xyz_m: [5.0, 0.0, 0.0]}}", "5 m from the robot"),
+        ("planning: {start_m: [a, b, c]}", "at 'planning': could not convert"),
+        (f"calibration: {{maximum_scans: {'9' * 400}}}", "calibration.maximum_scans is beyond 1e+09"),
+        ("job: {calibrate: false, weld: false}", "nothing to do: set job.calibrate or job.weld"),
+        ("arm: ur10e\narm: ur10e", "gives the key 'arm' twice"),
         ("home_deg: 5", "at 'home_deg'"),
     ],
 )
@@ -409,3 +421,20 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
 def test_a_law_or_workpiece_that_is_not_to_be_had_is_refused(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         load_scenario("s_groove", text)
+
+
+@pytest.mark.parametrize(("encoding", "said"), [("utf-16", "is UTF-16; save it as UTF-8"), ("latin-1", "is not UTF-8")])
+def test_a_scenario_in_another_encoding_is_refused(tmp_path: Path, encoding: str, said: str) -> None:
+    path = tmp_path / "cell.yaml"
+    path.write_bytes("description: Gerät\narm: ur10e\n".encode(encoding))
+    with pytest.raises(InputError, match=said):
+        load_scenario(str(path))
+
+
+@pytest.mark.parametrize("value", ["1,5", "null", "word", "-1e308"])
+def test_a_device_that_is_a_word_is_refused(tmp_path: Path, value: str) -> None:
+    """Drake's reader takes the word for the first of the device's drivers, all of whose keys are then that word."""
+    text = (SCENARIO_FOLDER / "profiler_edge.yaml").read_text()
+    (tmp_path / "cell.yaml").write_text(text.replace("finger_camera: !NoDevice {}", f"finger_camera: {value}"))
+    with pytest.raises(InputError, match="finger_camera"):
+        load_scenario(str(tmp_path / "cell.yaml"))

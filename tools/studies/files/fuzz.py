@@ -20,6 +20,7 @@ from weldcal.tools.studies.files.cases import CRASH, GOOD, HANG, MEMORY, Verdict
 from weldcal.tools.studies.files.readers import READERS, Reader
 
 WATCHDOG_S = 10.0
+WORKER = ("-m", "weldcal.tools.studies.files.worker")
 _START_S = 120.0  # to import everything, on a slow computer
 _KEPT = 20  # offending files of each reader and verdict
 
@@ -147,7 +148,7 @@ class _Child:
     def _start(self) -> subprocess.Popen[str]:
         shutil.rmtree(self._place, ignore_errors=True)
         self._place.mkdir()
-        command = [sys.executable, "-P", "-m", "weldcal.tools.studies.files.worker", str(self._place)]
+        command = [sys.executable, "-P", *WORKER, str(self._place)]
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
