@@ -154,7 +154,10 @@ def _walked(path: Path, order: str, e: _Element, content: bytes) -> int:
     """Bytes of all records of an element with lists."""
     if len(e.properties) == 1:  # faces of as many corners each, which need no walk
         _, kind, counter = e.properties[0]
+        if len(content) < int(counter[1]):
+            raise CloudError(f"The file {path.name} is truncated: its element {e.name} is not whole.")
         first = np.frombuffer(content, order + counter, 1)
+        _check_corners(path, e, int(first[0]))
         record = int(counter[1]) + int(kind[1]) * int(first[0])
         if first[0] > 0 and record * e.count <= len(content):
             counts = np.ndarray(e.count, order + counter, content, strides=(record,))
@@ -170,5 +173,12 @@ def _walked(path: Path, order: str, e: _Element, content: bytes) -> int:
             if at + counter_size > len(content):
                 raise CloudError(f"The file {path.name} is truncated: its element {e.name} is not whole.")
             number = struct.unpack_from((order or "<") + letter, content, at)[0]
-            at += counter_size + max(int(number), 0) * size
+            _check_corners(path, e, int(number))
+            at += counter_size + int(number) * size
     return at
+
+
+def _check_corners(path: Path, e: _Element, corners: int) -> None:
+    """A face of fewer than three corners is what remains of points that were counted wrongly."""
+    if corners < (3 if e.name == "face" else 0):
+        raise CloudError(f"The file {path.name} is damaged: a list of its element {e.name} has {corners} entries.")
