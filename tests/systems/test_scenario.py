@@ -6,7 +6,6 @@ import dataclasses as dc
 import re
 import types
 import typing
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +16,7 @@ from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.checks import check_scenario
-from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario, scenario_class, scenario_names
+from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
 from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 
@@ -421,20 +420,3 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
 def test_a_law_or_workpiece_that_is_not_to_be_had_is_refused(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         load_scenario("s_groove", text)
-
-
-@pytest.mark.parametrize(("encoding", "said"), [("utf-16", "is UTF-16; save it as UTF-8"), ("latin-1", "is not UTF-8")])
-def test_a_scenario_in_another_encoding_is_refused(tmp_path: Path, encoding: str, said: str) -> None:
-    path = tmp_path / "cell.yaml"
-    path.write_bytes("description: Gerät\narm: ur10e\n".encode(encoding))
-    with pytest.raises(InputError, match=said):
-        load_scenario(str(path))
-
-
-@pytest.mark.parametrize("value", ["1,5", "null", "word", "-1e308"])
-def test_a_device_that_is_a_word_is_refused(tmp_path: Path, value: str) -> None:
-    """Drake's reader takes the word for the first of the device's drivers, all of whose keys are then that word."""
-    text = (SCENARIO_FOLDER / "profiler_edge.yaml").read_text()
-    (tmp_path / "cell.yaml").write_text(text.replace("finger_camera: !NoDevice {}", f"finger_camera: {value}"))
-    with pytest.raises(InputError, match="finger_camera"):
-        load_scenario(str(tmp_path / "cell.yaml"))

@@ -153,6 +153,12 @@ def unreached_reason(status: CalibrationStatus, plan: JobPlan) -> str:
     if status.estimate is None:
         why = status.refused[-1][1] if status.refused else status.message
         return f"No calibration after {status.calibration_scans} scans: {why}"
+    if status.predicted_error_m <= plan.required_error_m:  # good enough, but by fewer scans than are asked for
+        why = f" The last was refused: {status.refused[-1][1]}" if status.refused else ""
+        return (
+            f"Only {len(status.observations)} of {status.calibration_scans} calibration scans could be used, fewer than "
+            f"calibration.minimum_scans.{why}"
+        )
     return (
         f"The calibration did not reach the required {required:.3f} mm: after {status.calibration_scans} scans it expects "
         f"{status.predicted_error_m * 1e3:.3f} mm at the work point; allow more scans, a wider workspace or a better scanner."

@@ -223,6 +223,19 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
         {"calibration": status(calibration_scans=8, estimate=ESTIMATE, predicted_error_m=0.234e-3)},
         r"did not reach the required 0\.100 mm: after 8 scans it expects 0\.234 mm",
     ),
+    "too few scans that count": (
+        "scan_pose",
+        0.1,
+        {
+            "calibration": status(
+                calibration_scans=8,
+                estimate=ESTIMATE,
+                predicted_error_m=0.023e-3,
+                refused=(("pose01", "it is too dark"),),
+            )
+        },
+        "Only 0 of 8 calibration scans could be used, fewer than calibration.minimum_scans. .*: it is too dark",
+    ),
     "no calibration at all": (
         "scan_pose",
         0.1,
