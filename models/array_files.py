@@ -44,7 +44,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, AnyA
             numbers = 0
             for name, member in wanted.items():
                 with archive.open(member) as inside:
-                    numbers += _header(path, f"'{name}' in {path.name}", inside, member.file_size)[2]
+                    numbers += _header(f"'{name}' in {path.name}", inside, member.file_size)[2]
             _check_expansion(path, numbers, stream)
             found = {}
             for name, member in wanted.items():
@@ -65,7 +65,7 @@ def read_npy(path: Path) -> AnyArray:
         with opened(path) as stream:
             size = stream.seek(0, 2)
             stream.seek(0)
-            _check_expansion(path, _header(path, path.name, stream, size)[2], stream)
+            _check_expansion(path, _header(path.name, stream, size)[2], stream)
             stream.seek(0)
             return _array(stream, path.name, size)
     except InputError:
@@ -92,7 +92,7 @@ def _members(path: Path, archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]
     return {m.filename.removesuffix(".npy"): m for m in listed}
 
 
-def _header(path: Path, what: str, stream: Any, size: int) -> tuple[tuple[int, ...], bool, int, np.dtype[Any]]:
+def _header(what: str, stream: Any, size: int) -> tuple[tuple[int, ...], bool, int, np.dtype[Any]]:
     """Shape, order, how many 8-byte numbers it expands to, and type of an array whose file has ``size`` bytes."""
     version = np.lib.format.read_magic(stream)
     if version == (1, 0):
@@ -118,7 +118,7 @@ def _header(path: Path, what: str, stream: Any, size: int) -> tuple[tuple[int, .
 
 
 def _array(stream: Any, what: str, size: int) -> AnyArray:
-    shape, order, _, dtype = _header(Path(what), what, stream, size)
+    shape, order, _, dtype = _header(what, stream, size)
     count = 1
     for n in shape:
         count *= n

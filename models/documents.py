@@ -15,7 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.models.limits import DEEPEST, LARGEST_DOCUMENT, LARGEST_NUMBER, MOST_NODES
 
-_SHORT = 100_000  # characters, which the reader in Python reads in a moment
+_SHORT = 3000  # characters, which the reader in Python reads in a moment
 
 
 def read_document(path: Path) -> Any:
@@ -116,19 +116,24 @@ def _check_events(name: str, text: str) -> None:
 
 def _check_size(name: str, document: Any) -> None:
     """An alias of an alias ... of YAML is a small text and an endless document."""
-    count, rows = 0, [iter([document])]
-    while rows:
-        value = next(rows[-1], rows)
-        if value is rows:
-            rows.pop()
-            continue
-        count += 1
-        if count > MOST_NODES or len(rows) > DEEPEST + 1:
+    _weight(name, document, 0, {})
+
+
+def _weight(name: str, value: Any, level: int, known: dict[int, tuple[int, int] | None]) -> tuple[int, int]:
+    """Values and levels of a document, aliases in full; each part is looked at once."""
+    if not isinstance(value, Mapping | list | tuple):
+        return 1, 1
+    if id(value) in known or level > DEEPEST:
+        if (found := known.get(id(value))) is None:  # a list within itself, or too deep
             raise _too_much(name)
-        if isinstance(value, Mapping):
-            rows.append(iter(value.values()))
-        elif isinstance(value, list | tuple):
-            rows.append(iter(value))
+        return found
+    known[id(value)] = None
+    inside = [_weight(name, v, level + 1, known) for v in (value.values() if isinstance(value, Mapping) else value)]
+    count, height = 1 + sum(n for n, _ in inside), 1 + max((h for _, h in inside), default=0)
+    if count > MOST_NODES or height > DEEPEST + 1:
+        raise _too_much(name)
+    known[id(value)] = count, height
+    return count, height
 
 
 def _too_much(name: str) -> InputError:

@@ -79,8 +79,10 @@ def decoded(path: Path, content: bytes) -> str:
     """The text of bytes that were read from ``path``. Raises InputError as read_text."""
     if content.startswith(_UTF16):
         raise InputError(f"'{path.name}' cannot be read as text: it is UTF-16; save it as UTF-8.")
+    if b"\0" in content:
+        raise InputError(f"'{path.name}' cannot be read as text: it holds null characters; save it as UTF-8.")
     try:
-        text = content.decode("utf-8-sig")
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as e:
         line = content.count(b"\n", 0, e.start) + 1
         raise InputError(
@@ -88,9 +90,6 @@ def decoded(path: Path, content: bytes) -> str:
         ) from None
     except MemoryError:
         raise InputError(f"'{path.name}' needs more memory than there is: give a smaller file.") from None
-    if "\0" in text:
-        raise InputError(f"'{path.name}' cannot be read as text: it holds null characters; save it as UTF-8.")
-    return text
 
 
 def sha256(path: Path) -> str:

@@ -7,12 +7,12 @@ from functools import cache
 
 import pytest
 
-from weldcal.tools.studies.perfect_world import perfect
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.studies.perfect_world import perfect
 
 SHORTER = "welding: {seam_length_mm: 30.0}\ncalibration: {minimum_scans: 4}"
 SHORT_JOB_SEED = 5

@@ -20,7 +20,7 @@ class CloudError(InputError):
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
-        self.reason = reason
+        self.reason = str(self)
 
 
 def check_points(path: Path, points: int, size: int) -> None:

@@ -317,7 +317,13 @@ def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ..
     pairs = []
     for row in _rows(path, ("id", *base, *camera)):
         v = _numbers(row, base + camera, path)
-        has = all(row.get(c) for c in turn)
+        given = [c for c in turn if row.get(c)]
+        if given and len(given) < len(turn):
+            missing = next(c for c in turn if c not in given)
+            raise DatasetError(
+                f"'{path.name}' lacks {missing} of '{row['id']}'; give all of {', '.join(turn)}, or none."
+            )
+        has = bool(given)
         R = _quaternion(_numbers(row, turn, path), row["id"]) if has else RotationMatrix()
         pairs.append(
             Pair(row["id"], RigidTransform(R, scale_base * np.array(v[:3])), scale_camera * np.array(v[3:]), has)

@@ -37,6 +37,8 @@ def read_text_cloud(path: Path) -> Array:
     if _number(header[0], separator) is None:
         if {"x", "y", "z"} <= set(header):
             columns = [header.index(c) for c in "xyz"]
+        if any(header.count(c) > 1 for c in "xyz"):
+            raise CloudError(f"The header of {path.name} names x, y or z twice; keep one.")
         below = next(rows, None)
         if below is None:
             raise CloudError(f"The cloud {path.name} is empty; scan again.")

@@ -16,6 +16,8 @@ HAND_EYE = {
     "DANIILIDIS": cv2.CALIB_HAND_EYE_DANIILIDIS,
 }
 ROBOT_WORLD = {"SHAH": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "LI": cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI}
+MOST_COMPARED = 200
+"""Poses that a command fits these methods to: their time and memory grow with the square of the number."""
 METHODS = (*HAND_EYE, *ROBOT_WORLD)
 
 
@@ -50,13 +52,18 @@ def opencv_solve(method: str, F: Array, G: Array) -> tuple[Array, Array] | None:
     return X, pose(nearest_rotation(M[:, :3, :3].sum(axis=0)), M[:, :3, 3].mean(axis=0))
 
 
-def opencv_held_out(method: str, F: Array, G: Array, folds: int = 5) -> HandEyeHeldOut:
-    """Held-out errors of one of METHODS on the folds that weldcal uses; NaN where a fold gave no answer."""
+def opencv_held_out(method: str, F: Array, G: Array, folds: int = 5, most: int | None = None) -> HandEyeHeldOut:
+    """Held-out errors of one of METHODS on the folds that weldcal uses; NaN where a fold gave no answer.
+
+    ``most``: fit each fold to so many of its poses at most, evenly spaced; calibrateHandEye holds all pairs of poses in memory.
+    """
     label = fold_labels(len(F), folds)
     n = len(F)
     out = HandEyeHeldOut(np.full(n, np.nan), np.full(n, np.nan))
     for k in range(folds):
-        train, test = label != k, label == k
+        train, test = np.flatnonzero(label != k), label == k
+        if most is not None and len(train) > most:
+            train = train[np.linspace(0, len(train) - 1, most).round().astype(int)]
         found = opencv_solve(method, F[train], G[train])
         if found is None or not test.any():
             continue

@@ -22,9 +22,14 @@ def motions(problem: Problem, state: State) -> tuple[Array, Array]:
     if problem.tied:
         return A, B
     n = len(A)
-    step = max(1, n * (n - 1) // (2 * _PAIRS))
-    i, j = np.triu_indices(n, 1)
-    i, j = i[::step], j[::step]
+    # every so many of the pairs i < j, row by row, without a list of all of them
+    total = n * (n - 1) // 2
+    k = np.arange(0, total, max(1, total // _PAIRS))
+    row = np.arange(n)
+    begin = row * n - row * (row + 1) // 2
+    i = np.searchsorted(begin, k, side="right") - 1
+    i = np.minimum(i, n - 2)
+    j = k - begin[i] + i + 1
     return inverse(A[i]) @ A[j], inverse(B[i]) @ B[j]
 
 

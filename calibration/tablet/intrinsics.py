@@ -14,6 +14,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
 
+_LEAST_FOCAL_PX = 1e-3  # anything less is no camera, and its rays overflow
 _COUNTS = (4, 5, 8, 12, 14)  # of distortion coefficients that OpenCV knows
 _MATRIX, _DISTORTION = ("camera_matrix", "K", "k", "M"), ("distortion_coefficients", "D", "d", "distortion")
 
@@ -53,7 +54,7 @@ def load_intrinsics(path: Path) -> Intrinsics:
     if distortion.size not in (0, *_COUNTS):
         counts = ", ".join(map(str, _COUNTS))
         raise TabletDataError(f"'{path.name}': distortion holds {distortion.size} numbers; OpenCV knows {counts}.")
-    if not (np.abs([*numbers, *distortion]) <= LARGEST_NUMBER).all() or min(numbers[:2]) <= 0.0:
+    if not (np.abs([*numbers, *distortion]) <= LARGEST_NUMBER).all() or min(numbers[:2]) < _LEAST_FOCAL_PX:
         raise TabletDataError(
             f"'{path.name}' holds a focal length that is not positive, or a value that is not a number."
         )

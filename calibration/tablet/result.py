@@ -17,10 +17,12 @@ from weldcal.calibration.data.results import (
     software_version,
     write_atomically,
 )
-from weldcal.models.documents import read_document
+from weldcal.models.documents import Section, as_number, read_document
 from weldcal.models.errors import InputError
+from weldcal.models.limits import LARGEST_NUMBER
 
 RESULT_FILE = "tablet.yaml"
+_CONFIGURATION = "eye_in_hand_tablet"
 PARENT, CHILD = "flange", "camera_optical_frame"
 
 
@@ -54,7 +56,7 @@ class TabletResult:
         return {
             "schema": 1,
             "software": software_version(),
-            "configuration": "eye_in_hand_tablet",
+            "configuration": _CONFIGURATION,
             "model": self.model,
             "parameters": dict(self.parameters),
             "covariance": self.covariance,
@@ -97,18 +99,39 @@ def load_tablet_result(path: Path) -> TabletResult:
     path = path / RESULT_FILE if path.is_dir() else path
     if not path.exists():
         raise InputError(f"There is no tablet calibration at '{path}'; give a folder of 'weldcal tablet calibrate'.")
-    d = read_document(path)
-    try:
-        if d["schema"] != 1 or d["configuration"] != "eye_in_hand_tablet":
-            raise ValueError(d["schema"])
-        M = None if d["X_FC"] is None else np.array(d["X_FC"]["matrix"], dtype=float)
-        X_FC = None if M is None else RigidTransform(RotationMatrix(M[:3, :3]), M[:3, 3])
-        return TabletResult(
-            d["model"], dict(d["parameters"]), d["covariance"], d["residual_mm"], d["leave_one_out_mm"], X_FC,
-            d["X_FC_covariance"], d["p_FP_m"], d["p_FP_covariance"], d["two_stages"],
-            dict(d["leave_one_out_of_other_models_mm"]), tuple(d["unobservable"]), tuple(d["warnings"]), dict(d["data_sha256"]),
-        )  # fmt: skip
-    except Exception as error:
-        raise InputError(
-            f"'{path.name}' is not a tablet calibration of schema 1; run 'weldcal tablet calibrate'."
-        ) from error
+    document = read_document(path)
+    if not isinstance(document, dict) or (document.get("schema"), document.get("configuration")) != (1, _CONFIGURATION):
+        raise InputError(f"'{path.name}' is not a tablet calibration of schema 1; run 'weldcal tablet calibrate'.")
+    d = Section.of(path.name, document)
+    X_FC = None
+    if d.has("X_FC"):
+        M = d.section("X_FC").array("matrix", 4, 4)
+        if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0.0:
+            raise InputError(f"The rotation of X_FC in '{path.name}' is not orthonormal; the file was changed by hand.")
+        X_FC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3])
+    n = len(d.items("covariance"))
+    left_out = d.items("leave_one_out_mm")
+    if not all(v is None or abs(as_number(v)) <= LARGEST_NUMBER for v in left_out):
+        raise d.wrong("leave_one_out_mm", "a list of numbers, or of nothing")
+    return TabletResult(
+        d.text("model"),
+        _whole(d, "parameters"),
+        d.array("covariance", n, n).tolist(),
+        d.array("residual_mm", -1).tolist(),
+        [None if v is None else as_number(v) for v in left_out],
+        X_FC,
+        d.array("X_FC_covariance", 6, 6).tolist() if d.has("X_FC_covariance") else None,
+        d.array("p_FP_m", 3).tolist() if d.has("p_FP_m") else None,
+        d.array("p_FP_covariance", 3, 3).tolist() if d.has("p_FP_covariance") else None,
+        dict(d.section("two_stages").values) if d.has("two_stages") else None,
+        _whole(d, "leave_one_out_of_other_models_mm"),
+        d.texts("unobservable"),
+        d.texts("warnings"),
+        {str(name): d.section("data_sha256").text(name) for name in d.section("data_sha256").values},
+    )
+
+
+def _whole(d: Section, key: str) -> dict[str, float]:
+    """Numbers by name under a key, none of which is missing."""
+    found = d.section(key)
+    return {str(name): found.number(name) for name in found.values}

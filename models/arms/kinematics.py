@@ -19,6 +19,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
+from weldcal.models.limits import LARGEST_NUMBER
 
 LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 LINK_NAMES = ("base", *(f"{link}_link" for link in LINKS))
@@ -284,9 +285,9 @@ def _number(section: Mapping[str, Any], *keys: str, path: Path | None = None) ->
         value = value.get(key) if isinstance(value, Mapping) else None
     try:
         number = math.nan if isinstance(value, bool) else float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not math.isfinite(number):
+    if not abs(number) <= LARGEST_NUMBER:
         where = f"{path.name}: " if path else ""
         raise InputError(f"{where}{'.'.join(keys)} must be a finite number, it is {value!r}.")
     return number

@@ -1,5 +1,7 @@
 """Checks a scenario before anything is built; each error is one sentence that says what to change."""
 
+import math
+
 from weldcal.calibration.published.algorithm1 import named_cost
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import NoDevice
@@ -9,6 +11,7 @@ from weldcal.systems.scenario.schema import Scenario
 from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
+FARTHEST_WORKPIECE_M = 2.0  # the UR10e reaches 1.3 m; its torch and half a plate add less than the rest
 DRAWN_ARMS = ("ur10e",)
 
 
@@ -55,6 +58,12 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
+    workpiece = scenario.workpiece
+    if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > FARTHEST_WORKPIECE_M:
+        raise InputError(
+            f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; no arm reaches beyond "
+            f"{FARTHEST_WORKPIECE_M:g} m."
+        )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")
     if scenario.job.weld and not scenario.job.calibrate and scenario.job.X_BC is None:

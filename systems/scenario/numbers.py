@@ -2,7 +2,8 @@
 
 import dataclasses as dc
 import math
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, get_args, get_origin
 
 from weldcal.models.errors import InputError
 
@@ -63,14 +64,35 @@ def check_numbers(config: Any, place: str = "") -> None:
         if dc.is_dataclass(value):
             check_numbers(value, f"{key}.")
             continue
+        _check_type(key, field.type, value)
         if isinstance(value, list) and len(value) != LENGTHS.get(field.name, len(value)):
             raise InputError(f"{key} must hold {LENGTHS[field.name]} numbers, not {len(value)}.")
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, int | float) and not isinstance(number, bool):
-                _check(key, field.name, float(number))
+                _check(key, field.name, number)
+
+
+def _check_type(key: str, kind: Any, value: Any) -> None:
+    """Refuses a word where a number belongs: Drake's YAML reader converts plain types, and leaves an optional one as it was."""
+    kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
+    if value is None and NoneType not in kinds:
+        raise InputError(f"{key} has no value; write one, or omit the key.")
+    if value is not None and any(dc.is_dataclass(k) for k in kinds):
+        raise InputError(
+            f"{key} must be a mapping of keys to values, or a device such as !NoDevice {{}}, not {value!r}."
+        )
+    if isinstance(value, str) and str not in kinds and any(k in (int, float, bool) for k in kinds):
+        raise InputError(f"{key} must be a number, not '{value}'.")
+    listed = next((get_args(k) for k in kinds if get_origin(k) is list), None)
+    if isinstance(value, list) and listed in ((float,), (int,)) and not all(isinstance(v, int | float) for v in value):
+        raise InputError(f"{key} must hold numbers, not {value}.")
+    if isinstance(value, float) and float not in kinds and int in kinds and not value.is_integer():
+        raise InputError(f"{key} must be a whole number, not {value:g}.")
 
 
 def _check(key: str, name: str, number: float) -> None:
+    if abs(number) > LARGEST_AT_ALL and math.inf > abs(number):  # a whole number may be too long to be printed
+        raise InputError(f"{key} is beyond {LARGEST_AT_ALL:g}.")
     if not math.isfinite(number):
         raise InputError(f"{key} must be finite, not {number}.")
     if abs(number) > largest(name):

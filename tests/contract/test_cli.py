@@ -74,7 +74,17 @@ def test_help_loads_no_heavy_library() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [["dance"], ["demo", "--colour"], ["demo", "--seed", "-1"], ["calibrate"], ["calibrate", "a", "--scenario", "b"]],
+    [
+        *(
+            ["dance"],
+            ["demo", "--colour"],
+            ["demo", "--seed", "-1"],
+            ["calibrate"],
+            ["calibrate", "a", "--scenario", "b"],
+        ),
+        *(["tablet", "calibrate", "a.csv", "--pen-length-mm", number] for number in ("nan", "inf", "1e308")),
+        ["demo", "--speed-factor", "nan"],
+    ],
 )
 def test_wrong_usage_ends_with_2_and_a_hint(arguments: list[str]) -> None:
     finished = weldcal(*arguments)

@@ -7,6 +7,7 @@ import numpy as np
 
 from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
+from weldcal.calibration.hand_eye.opencv_methods import MOST_COMPARED
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
@@ -88,7 +89,9 @@ class HandEyeReport:
         if self.corners:
             lines += ["", self.corners]
         if self.comparison:
-            lines += ["", "method        held-out deg   held-out mm"]
+            few = 0.8 * len(r.inliers) > MOST_COMPARED
+            note = f"   (OpenCV's methods: fitted to {MOST_COMPARED} of the poses)" if few else ""
+            lines += ["", f"method        held-out deg   held-out mm{note}"]
             for c in self.comparison:
                 failed = not (np.isfinite(c.deg) and np.isfinite(c.mm))
                 lines += [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -90,6 +91,28 @@ def test_feature_in_the_flange_frame_is_read(folder: Path) -> None:
     ("file", "old", "new", "sentence"),
     [
         ("dataset.yaml", "schema: 1", "schema: 2", "schema 2"),
+        ("dataset.yaml", "schema: 1", "schema: 1\nschema: 1", "the key 'schema' twice"),
+        (
+            "dataset.yaml",
+            "note: test",
+            "feature_in_flange: {xyz: [0.1, 0.2]}",
+            r"feature_in_flange\.xyz must hold 3 numbers",
+        ),
+        (
+            "dataset.yaml",
+            "note: test",
+            "feature_in_flange: {wxyz: [1, 0, 0]}",
+            r"feature_in_flange\.wxyz must hold 4 numbers",
+        ),
+        ("dataset.yaml", "note: test", "feature_in_flange: {wxyz: [.nan, 0, 0, 0]}", "not finite"),
+        ("dataset.yaml", "note: test", "scanner_guess: {xyz: [600, 0, 900]}", "must be in metres"),
+        ("dataset.yaml", "note: test", "scanner_guess: {radius_m: .nan}", "radius_m must be a positive number"),
+        ("dataset.yaml", "note: test", "scanner_guess: {radius_m: -0.1}", "radius_m must be a positive number"),
+        ("dataset.yaml", "note: test", "scanner_guess: {radius_m: [1]}", "cannot be read as a dataset description"),
+        ("dataset.yaml", "poses: m}", "poses: mm}", "look like m;"),
+        ("poses.csv", "0.5,0.2,0.4", "0,5,0.2,0.4", "line 3: 9 cells, and the header names 8 columns"),
+        ("poses.csv", "id,x,y,z,qw", "id,x,y,z,x,qw", "two columns 'x'"),
+        ("poses.csv", "0.5,0.2,0.4", "0.5,1e308,0.4", "beyond 1e\\+09"),
         ("dataset.yaml", "clouds: m,", "clouds: inch,", "unit 'inch' for clouds; write m or mm"),
         ("dataset.yaml", "eye_on_base", "eye_in_hand", "configuration 'eye_in_hand'"),
         ("dataset.yaml", "robot: ur10e", "robots: ur10e", "cannot be read as a dataset description"),
@@ -256,3 +279,37 @@ def test_a_scan_that_repeats_another_counts_once(folder: Path) -> None:
     data = load_dataset(folder)
     assert set(data.clouds) == {"a", "b"}
     assert [id for id, _ in data.refused] == ["c"]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.5, 9.0])
+def test_metres_called_millimetres_are_noticed_at_any_reach(folder: Path, scale: float) -> None:
+    """A reach of more than a metre used to pass."""
+    text = POSES.replace("0.5,0.1", f"{0.5 * scale},{0.1 * scale}").replace("0.5,0.2", f"{0.5 * scale},{0.2 * scale}")
+    (folder / "poses.csv").write_text(text)
+    load_dataset(folder)
+    change(folder / "dataset.yaml", "poses: m}", "poses: mm}")
+    with pytest.raises(DatasetError, match="look like m; correct units"):
+        load_dataset(folder)
+
+
+def test_a_cloud_in_another_unit_than_stated_is_refused(folder: Path) -> None:
+    change(folder / "dataset.yaml", "clouds: m,", "clouds: mm,")
+    with pytest.raises(CloudError, match=r"a\.npz lie 0\.000\d+ m from the camera, as mm: they look like m"):
+        load_dataset(folder).cloud("a")
+
+
+def test_a_cloud_that_is_no_file_is_refused_by_name(folder: Path) -> None:
+    (folder / "clouds" / "b.pcd").unlink()
+    os.mkfifo(folder / "clouds" / "b.pcd")
+    data = load_dataset(folder)
+    assert set(data.clouds) == {"a"}
+    assert "is a pipe" in dict(data.refused)["b"]
+
+
+def test_half_a_quaternion_of_a_pair_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "dataset.yaml").write_text(HEADER)
+    rows = [f"{k},{0.1 * k},0.2,0.3,{0.1 * k},0.1,0.5,1,0,0" for k in range(5)]
+    header = "id,base_x,base_y,base_z,camera_x,camera_y,camera_z,base_qw,base_qx,base_qz"
+    (tmp_path / "pairs.csv").write_text("\n".join([header, *rows]))
+    with pytest.raises(DatasetError, match="lacks base_qy of '0'"):
+        load_dataset(tmp_path)

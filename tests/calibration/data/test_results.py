@@ -124,3 +124,46 @@ def test_a_rotation_changed_by_hand_is_noticed(result: CalibrationResult, tmp_pa
 def test_a_missing_result_says_what_to_give(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="folder written by 'weldcal calibrate'"):
         load_result(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        ("used: true", "used: maybe", r"poses\[0\]\.used must be true or false, not 'maybe'"),
+        ("residual_mm: 0.1", "residual_mm: [0.1]", r"poses\[0\]\.residual_mm must be a finite number"),
+        ("residual_mm: 0.1", "residuum_mm: 0.1", r"poses\[0\] has the unknown key 'residuum_mm'"),
+        ("held_out_mm: {", "held_out_mm: {worst: big, ", r"held_out_mm\.worst must be a finite number, not 'big'"),
+        ("seed: 7", "seed: -1", "seed must be a finite number, 0 or more, not '-1'"),
+        ("seed: 7", "seed: 1.5", "seed must be a whole number"),
+        (
+            "rotation_deg: [0.0, 0.1, 0.2]",
+            "rotation_deg: [0.0, 0.1]",
+            r"icp\[0\]\.rotation_deg must be 3 finite numbers",
+        ),
+        ("warnings: [one]", "warnings: one", "warnings must be a list, not 'one'"),
+        ("sigma_position_mm: 0.0", "sigma_position_mm: .nan", "sigma_position_mm must be a finite number"),
+        ("axis_turn_deg: null", "axis_turn_deg: [1.0]", "axis_turn_deg must be 2 finite numbers"),
+        ("joint_covariance: null", "joint_covariance: {matrix: [[1]]}", r"joint_covariance\.matrix must be 6 by 6"),
+        ("data_sha256: {", "data_sha256: {x: [1], ", r"data_sha256\.x must be a text"),
+        ("schema: 1", "schema: 1\nschema: 1", "the key 'schema' twice"),
+        ("robot: ur10e", "robot: [ur10e]", "robot must be a text"),
+    ],
+)
+def test_a_value_changed_by_hand_is_named_with_file_and_key(
+    result: CalibrationResult, tmp_path: Path, old: str, new: str, sentence: str
+) -> None:
+    path = save_result(result, tmp_path)
+    text = path.read_text()
+    assert old in text, text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_result(path)
+    assert "'calibration.yaml'" in str(caught.value)
+
+
+def test_a_covariance_that_is_none_is_refused(result: CalibrationResult, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    save_result(replace(result, covariance=-np.eye(6)), tmp_path)
+    with pytest.raises(InputError, match=r"covariance\.matrix is no covariance"):
+        load_result(tmp_path)

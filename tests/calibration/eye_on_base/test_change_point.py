@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
-from tests.calibration.eye_on_base.test_self_calibration import NOISE_M, RIGHT, WRONG, _cell, _warped_cell
+from tests.calibration.eye_on_base.test_self_calibration import NOISE_M, RIGHT, WRONG, _cell
 from weldcal.calibration.eye_on_base.change_point import find_change
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.tools.studies.flange.warped import warped_observations
 
 
 def moved(observations: list[Observation], at: int, shift_m: float, turn_deg: float = 0.0) -> list[Observation]:
@@ -43,7 +44,7 @@ def test_recordings_without_a_change_show_none() -> None:
         observations, _ = _cell(WRONG if seed % 2 else RIGHT, n=n, seed=seed)
         assert find_change(sorted(observations, key=lambda o: float(o.p_CR[seed % 3]))) is None
     for device in range(3):
-        observations, _ = _warped_cell(device, 18, 0)
+        observations, _ = warped_observations(device, 18, 0)
         assert find_change(sorted(observations, key=lambda o: float(o.p_CR[device % 3]))) is None
 
 

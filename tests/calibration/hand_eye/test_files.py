@@ -13,6 +13,9 @@ from tests.calibration.hand_eye.poses import Array, co_manipulation, eye_in_hand
 from weldcal.calibration.errors import DatasetError, InconsistentPoses
 from weldcal.calibration.geometry.se3 import inverse
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
+from weldcal.calibration.hand_eye.opencv_methods import opencv_held_out
+from weldcal.calibration.hand_eye.problem import full_problem
+from weldcal.calibration.hand_eye.starts import motions
 from weldcal.models.errors import InputError
 from weldcal.tools.commands.hand_eye import run_hand_eye
 
@@ -225,3 +228,38 @@ def test_corners_that_are_of_no_use_leave_the_poses_as_given(tmp_path: Path, pos
         assert sentence in report.corners
         with pytest.raises(DatasetError, match=sentence):
             run_hand_eye("ax-yb", path, tmp_path / "out", corners=True)
+
+
+def test_ragged_and_impossible_numbers_are_named(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = (X.tolist() for X in poses)
+    path = tmp_path / "a.json"
+
+    def said(**change: object) -> str:
+        return read_error(json.dumps({"A": F, "B": G, "mode": "eye_in_hand", **change}), path)
+
+    assert "each row as long as the others" in said(A=[*F[:-1], F[-1][:3]])
+    assert "is not an array of numbers" in said(A=[*F[:-1], 10**400])
+    assert "not finite" in said(A=[*F[:-1], (np.inf * np.ones((4, 4))).tolist()])
+    assert "robot poses and" in said(B=G[:-1])
+    assert "mode by a word" in said(mode=["eye_in_hand"])
+    assert "key 'A' twice" in read_error('{"A": [], "A": []}', path)
+    assert "look like metres" in read_error(json.dumps({"A": F, "B": G}), path, mounting="eye_in_hand", length="mm")
+    (tmp_path / "a.npz").write_bytes(write("npz", tmp_path, *poses).read_bytes()[:-300])
+    with pytest.raises(DatasetError, match="not an npz file, or damaged"):
+        read_pairs(tmp_path / "a.npz")
+
+
+def test_opencv_is_compared_on_as_many_poses_as_it_can_hold(tmp_path: Path, poses: tuple[Array, Array]) -> None:
+    F, G = poses
+    whole = opencv_held_out("PARK", F, G)
+    assert np.array_equal(opencv_held_out("PARK", F, G, most=len(F)).translation, whole.translation)
+    assert not np.array_equal(opencv_held_out("PARK", F, G, most=5).translation, whole.translation)
+
+
+@pytest.mark.parametrize("n", [2, 3, 30, 137])
+def test_motions_are_every_so_many_of_all_pairs(n: int) -> None:
+    F, G, _, _ = eye_in_hand(n, np.random.default_rng(3))
+    i, j = np.triu_indices(n, 1)
+    step = max(1, n * (n - 1) // (2 * 600))
+    P, _ = motions(full_problem(F, G), (np.eye(4),) * 3)
+    np.testing.assert_allclose(P, (inverse(F[i]) @ F[j])[::step], atol=1e-12)

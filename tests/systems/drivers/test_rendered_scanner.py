@@ -22,7 +22,6 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import ImageDepth32F
 
-from weldcal.tools.studies.perfect_world import perfect
 from tests.systems.cells import Q_HOME, the_arm
 from weldcal.models.scanners import apply_noise, depth_to_points, get_scanner
 from weldcal.models.tool import WeldingTool
@@ -39,6 +38,7 @@ from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Scan
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.studies.perfect_world import perfect
 
 DISTANCE_M = 0.7
 HALF_M = np.array([0.10, 0.07])  # half the sides of the plate that is looked at

@@ -206,9 +206,14 @@ def _from_csv(path: Path) -> tuple[dict[str, Floats], tuple[Floats, ...] | None]
 
     def columns(*names: str) -> Floats:
         try:
-            return np.array([[float(row[name] or "nan") for name in names] for row in rows])
+            found = np.array([[float(row[name] or "nan") for name in names] for row in rows])
         except ValueError as e:
             raise InputError(f"'{path.name}' has a cell that is not a number in {', '.join(names)}: {e}.") from e
+        if not float(np.nanmax(np.abs(found), initial=0.0)) <= LARGEST_NUMBER:
+            raise InputError(
+                f"'{path.name}' has a number in {', '.join(names)} that is infinite or beyond {LARGEST_NUMBER:g}."
+            )
+        return found
 
     pose = columns(*wanted)
     turn = float(np.nanmax(np.linalg.norm(pose[:, 3:], axis=1), initial=0.0))

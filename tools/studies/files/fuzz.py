@@ -6,7 +6,6 @@ import selectors
 import shutil
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from weldcal.tools.studies.files.cases import CRASH, GOOD, HANG, MEMORY, Verdict
 from weldcal.tools.studies.files.readers import READERS, Reader
 
 WATCHDOG_S = 10.0
+WORKER = ("-m", "weldcal.tools.studies.files.worker")
 _START_S = 120.0  # to import everything, on a slow computer
 _KEPT = 20  # offending files of each reader and verdict
 
@@ -87,9 +87,8 @@ def fuzz_files(
     with TemporaryDirectory() as place, _Child(Path(place)) as child:
         for n, reader in enumerate(readers):
             for case in range(cases):
-                begin = time.monotonic()
-                verdict = child.ask(reader, seed, case)
-                slowest[reader.name] = max(slowest[reader.name], time.monotonic() - begin)
+                verdict, seconds = child.ask(reader, seed, case)
+                slowest[reader.name] = max(slowest[reader.name], seconds)
                 counts[reader.name][verdict.said] += 1
                 if verdict.said not in GOOD:
                     kept = counts[reader.name][verdict.said] <= _KEPT
@@ -97,8 +96,9 @@ def fuzz_files(
                     findings.append(Finding(reader.name, case, verdict.said, verdict.detail, folder))
                 if case % 50 == 0:
                     progress(reader.name, (n + case / cases) / len(readers))
-    result = FuzzResult(counts, tuple(findings), slowest, seed)
-    write_atomic(out / "findings.json", json.dumps(result.summary(), indent=1) + "\n")
+            # after each reader, since thousands of cases take a while
+            result = FuzzResult(counts, tuple(findings), slowest, seed)
+            write_atomic(out / "findings.json", json.dumps(result.summary(), indent=1) + "\n")
     return result
 
 
@@ -122,8 +122,8 @@ class _Child:
     def __exit__(self, *error: object) -> None:
         self._end()
 
-    def ask(self, reader: Reader, seed: int, case: int) -> Verdict:
-        """The verdict of a case."""
+    def ask(self, reader: Reader, seed: int, case: int) -> tuple[Verdict, float]:
+        """The verdict of a case, and how many seconds it took with making its files."""
         limit = WATCHDOG_S if self._process is not None else WATCHDOG_S + _START_S
         process = self._process or self._start()
         assert process.stdin is not None
@@ -132,25 +132,23 @@ class _Child:
             process.stdin.flush()
         except BrokenPipeError:
             self._end()
-            return Verdict(CRASH, "the worker ended before the case")
+            return Verdict(CRASH, "the worker ended before the case"), 0.0
         answer = self._line(process, limit)
         if answer is None:
             hung = process.poll() is None
             self._end()
-            return (
-                Verdict(HANG, f"no answer within {WATCHDOG_S:g} s")
-                if hung
-                else Verdict(CRASH, f"exit {process.returncode}")
-            )
+            if hung:
+                return Verdict(HANG, f"no answer within {WATCHDOG_S:g} s"), WATCHDOG_S
+            return Verdict(CRASH, f"exit {process.returncode}"), 0.0
         said: dict[str, Any] = json.loads(answer)
         if said["said"] == MEMORY:  # the next case begins with little
             self._end()
-        return Verdict(said["said"], said["detail"])
+        return Verdict(said["said"], said["detail"]), said["seconds"]
 
     def _start(self) -> subprocess.Popen[str]:
         shutil.rmtree(self._place, ignore_errors=True)
         self._place.mkdir()
-        command = [sys.executable, "-P", "-m", "weldcal.tools.studies.files.worker", str(self._place)]
+        command = [sys.executable, "-P", *WORKER, str(self._place)]
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,

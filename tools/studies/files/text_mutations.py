@@ -94,10 +94,10 @@ def table(content: bytes, rng: Rng) -> Damage:
         for row in rows[1:] if rng.random() < 0.5 else rows[k : k + 1]:
             for j in places if rng.random() < 0.5 else places[:1]:
                 row[j] = row[j].replace(".", ",")
-        wrong = True
+        wrong = any(sum(1 + cell.count(",") for cell in row) > len(rows[0]) for row in rows)
     elif kind == 3:
         rows[k].insert(c, f"{rng.normal():.3f}")
-        wrong = True
+        wrong = len(rows[k]) > len(rows[0])
     elif kind == 4:
         del rows[k][c]
     elif kind == 5:

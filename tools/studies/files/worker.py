@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import sys
+import time
 import warnings
 from pathlib import Path
 
@@ -26,12 +27,19 @@ def main() -> None:
     for line in sys.stdin:
         name, seed, case = line.split()
         place = folder / "case"
+        begin = time.monotonic()
         verdict = judge(readers[name], int(seed), int(case), place)
+        seconds = time.monotonic() - begin
         size = sum(p.stat().st_size for p in place.rglob("*") if p.is_file() and not p.is_symlink())
-        if _peak() - idle > FREE + TIMES * size:
+        if too_much(_peak() - idle, size):
             verdict = Verdict(MEMORY, f"{(_peak() - idle) / 2**20:.0f} MiB for {size} bytes; {verdict.said}")
-        answers.write(json.dumps({"said": verdict.said, "detail": verdict.detail, "case": int(case)}) + "\n")
+        answers.write(json.dumps({"said": verdict.said, "detail": verdict.detail, "seconds": seconds}) + "\n")
         answers.flush()
+
+
+def too_much(taken: int, size: int) -> bool:
+    """Whether a case took more bytes than files of so many bytes may."""
+    return taken > FREE + TIMES * size
 
 
 def _peak() -> int:

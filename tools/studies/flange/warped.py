@@ -7,9 +7,10 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.ndimage import map_coordinates
 from scipy.stats import chi2
 
+from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.calibration.eye_on_base.observations import corrected_observation
-from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration, apply_self_calibration
+from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.calibration.flange.holes import HolePattern
