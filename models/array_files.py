@@ -123,7 +123,7 @@ def _array(stream: Any, what: str, size: int) -> AnyArray:
     for n in shape:
         count *= n
     content = np.empty(count * dtype.itemsize, np.uint8)
-    rest = memoryview(content)
+    rest = content.data
     while rest and (n := stream.readinto(rest)):
         rest = rest[n:]
     if rest:

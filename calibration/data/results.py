@@ -13,7 +13,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.data.scanner_correction import TERMS, correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.documents import Section, read_document, shown
@@ -167,10 +167,13 @@ def load_result(path: Path) -> CalibrationResult:
     if not np.allclose(M[:3, :3] @ M[:3, :3].T, np.eye(3), atol=1e-6) or np.linalg.det(M[:3, :3]) < 0:
         raise InputError(f"The rotation in '{path.name}' is not orthonormal; the file was changed by hand.")
     covariance = _covariance(d, "covariance", 6)
-    correction = correction_from_document(d.values.get("scanner_correction"), path.name)
+    correction_from_document(d.values.get("scanner_correction"), path.name)  # it can be read
     joint = None
     if d.has("joint_covariance"):
-        joint = _covariance(d, "joint_covariance", 6 + (0 if correction is None else len(correction.values)))
+        size = len(d.section("joint_covariance").items("matrix"))
+        if size not in (6, *(6 + terms for terms in TERMS.values())):
+            raise d.section("joint_covariance").wrong("matrix", "as large as X_BC and a scanner correction")
+        joint = _covariance(d, "joint_covariance", size)
     turn = d.array("axis_turn_deg", 2) if d.has("axis_turn_deg") else None
     return CalibrationResult(
         X_BC=RigidTransform(RotationMatrix.ProjectToRotationMatrix(M[:3, :3]), M[:3, 3]),

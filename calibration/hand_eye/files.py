@@ -146,9 +146,9 @@ def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str
     robot, camera = poses["robot"], poses["camera"]
     if robot is None or camera is None:
         raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
-    for other, name in ((camera, "camera"), (poses["robot2"], "second robot"), (poses["link"], "arm link")):
-        if other is not None and len(other) != len(robot):
-            raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(other)} {name} poses.")
+    for listed, name in ((camera, "camera"), (poses["robot2"], "second robot"), (poses["link"], "arm link")):
+        if listed is not None and len(listed) != len(robot) and (name != "arm link" or len(listed) != 1):
+            raise DatasetError(f"'{path.name}' holds {len(robot)} robot poses and {len(listed)} {name} poses.")
     if len(robot) == 0:
         raise DatasetError(f"'{path.name}' holds no pairs of robot and camera poses.")
     far = {n: float(np.median(np.linalg.norm(X[:, :3, 3], axis=1))) for X, n in ((robot, "robot"), (camera, "camera"))}

@@ -143,7 +143,11 @@ def test_a_missing_result_says_what_to_give(tmp_path: Path) -> None:
         ("warnings: [one]", "warnings: one", "warnings must be a list, not 'one'"),
         ("sigma_position_mm: 0.0", "sigma_position_mm: .nan", "sigma_position_mm must be a finite number"),
         ("axis_turn_deg: null", "axis_turn_deg: [1.0]", "axis_turn_deg must be 2 finite numbers"),
-        ("joint_covariance: null", "joint_covariance: {matrix: [[1]]}", r"joint_covariance\.matrix must be 6 by 6"),
+        (
+            "joint_covariance: null",
+            "joint_covariance: {matrix: [[1]]}",
+            r"joint_covariance\.matrix must be as large as X_BC",
+        ),
         ("data_sha256: {", "data_sha256: {x: [1], ", r"data_sha256\.x must be a text"),
         ("schema: 1", "schema: 1\nschema: 1", "the key 'schema' twice"),
         ("robot: ur10e", "robot: [ur10e]", "robot must be a text"),

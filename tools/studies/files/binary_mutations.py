@@ -169,7 +169,7 @@ def _lying(body: bytes, rng: Rng) -> bytes:
     if found is None:
         return body[:-1]
     shape = str(_pick(rng, ("900000000,", "70000, 3", "-5,", "99999999999, 9", "4,"))).encode()
-    header_end = 10 + struct.unpack("<H", body[8:10])[0]
+    header_end: int = 10 + struct.unpack("<H", body[8:10])[0]
     head = body[: found.start(1)] + shape + body[found.end(1) : header_end]
     head = head.rstrip(b" \n")
     if len(head) + 1 > header_end:

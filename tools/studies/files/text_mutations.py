@@ -180,7 +180,7 @@ def json_text(content: bytes, rng: Rng) -> Damage:
         if not isinstance(inner, dict | list) or not inner:
             break
         place, key = inner, _pick(rng, list(inner) if isinstance(inner, dict) else range(len(inner)))
-    odd = (
+    odd: tuple[Any, ...] = (
         None,
         True,
         "x",
