@@ -10,7 +10,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 
 from tests.calibration.eye_on_base.test_solve import X_BC, displaced, make_observations
-from tests.places import SHARED_DATA
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import InconsistentPoses
@@ -105,7 +105,7 @@ def test_what_an_arm_is_off_is_not_called_a_tcp() -> None:
         assert find_tcp(off) is None
 
 
-@pytest.mark.skipif(not (SHARED_DATA / "flange").is_dir(), reason="The real flange scans are not beside this checkout.")
+@needs(SHARED_DATA / "flange")
 @pytest.mark.parametrize("name", ["ur10e_phoxi_m", "ur10e_azure_kinect"])
 def test_on_real_pairs_no_tcp_is_named_and_one_that_was_set_is(name: str) -> None:
     pairs = load_dataset(SHARED_DATA / "flange" / name).pairs
