@@ -19,6 +19,7 @@ from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.emulators.ur.process import Emulator, emulator_process
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.studies.perfect_world import perfect
 
 # An address of its own: this module waits for no other.
 HOST = "127.0.0.41"
@@ -54,7 +55,7 @@ scanner: !RenderedScanner {preset: ideal, width: 824, height: 616}
 def finished_job(folder: Path, robot: str, pace: float | None) -> DemoResult:
     """Calibrate, verify, plan, approach, weld, retract: all that a job is, as short as it gets."""
     options = RunOptions("a test's own", folder, SEED, robot=robot, pace=pace, recording=False)
-    return run_scenario(load_scenario("s_groove", SHORTEST), options)
+    return run_scenario(perfect(load_scenario("s_groove", SHORTEST)), options)
 
 
 @pytest.fixture(scope="module")

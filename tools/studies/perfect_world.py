@@ -17,5 +17,5 @@ def perfect(scenario: Scenario) -> Scenario:
         scanner.gradient_error_per_m = [0.0, 0.0]
     scenario.calibration.correct_scanner = False
     scenario.calibration.required_error_mm = 0.10
-    scenario.calibration.maximum_scans = 10
+    scenario.calibration.maximum_scans = min(scenario.calibration.maximum_scans, 10)
     return scenario
