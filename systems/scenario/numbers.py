@@ -77,10 +77,6 @@ def _check_type(key: str, kind: Any, value: Any) -> None:
     kinds = get_args(kind) if isinstance(kind, UnionType) else (kind,)
     if value is None and NoneType not in kinds:
         raise InputError(f"{key} has no value; write one, or omit the key.")
-    if value is not None and any(dc.is_dataclass(k) for k in kinds):
-        raise InputError(
-            f"{key} must be a mapping of keys to values, or a device such as !NoDevice {{}}, not {value!r}."
-        )
     if isinstance(value, str) and str not in kinds and any(k in (int, float, bool) for k in kinds):
         raise InputError(f"{key} must be a number, not '{value}'.")
     listed = next((get_args(k) for k in kinds if get_origin(k) is list), None)

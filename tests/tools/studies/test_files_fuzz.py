@@ -63,8 +63,11 @@ def test_a_careless_reader_is_seen(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         return [[float(v) for v in line.split()[:3]] for line in lines[1:]]
 
     reader = one(monkeypatch, careless)
-    said = {judge(reader, 0, case, tmp_path / "case").said for case in range(150)}
-    assert {INTERNAL, WRONG, REFUSED} <= said
+    said = {judge(reader, 0, case, tmp_path / "case") for case in range(150)}
+    assert {INTERNAL, WRONG, REFUSED} <= {verdict.said for verdict in said}
+    reasons = [verdict.detail for verdict in said if verdict.said == WRONG]
+    assert any("contradicts itself" in reason for reason in reasons)
+    assert any("not finite" in reason for reason in reasons)
 
 
 def test_the_child_is_watched_and_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
