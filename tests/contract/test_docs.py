@@ -156,7 +156,7 @@ def test_the_readme_says_what_is_not_real() -> None:
     text = " ".join((ROOT / "README.md").read_text().split())
     for sentence in (
         "tested against an emulated one, not yet against a real one",
-        "The simulated seam, light and reflections are ideal: a real cell is worse.",
+        "The groove's section, the tip and the light are ideal there.",
         "Nothing here is a safety function.",
     ):
         assert sentence in text
