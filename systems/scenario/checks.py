@@ -28,11 +28,11 @@ def check_scenario(scenario: Scenario) -> None:
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     found = job_of(scenario)  # raises for the parts of two jobs
-    if not found.key and not scenario.job.calibrate and not scenario.job.weld:
-        raise InputError("This scenario has nothing to do: set job.calibrate or job.weld to true.")
     check_numbers(scenario)
     for job in jobs():
         job.check(scenario)
+    if not found.key and not scenario.job.calibrate and not scenario.job.weld:
+        raise InputError("This scenario has nothing to do: set job.calibrate or job.weld to true.")
     if isinstance(scenario.scanner, NoDevice) and (scenario.job.calibrate or scenario.job.weld):
         raise InputError(
             "This job needs a scanner: write scanner: !RenderedScanner {} in the scenario or turn the job off."

@@ -24,17 +24,25 @@ POSITIVE = {
 }
 NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "verification_scans", "payload_kg"),
-    *("repeatability_mm", "work_radius_mm"),
+    *("repeatability_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
     *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
     *("placement_translation_mm", "placement_rotation_deg"),
 }
-LENGTHS = {"xyz_m": 3, "rpy_deg": 3, "work_point_m": 3, "start_m": 3, "home_deg": 6, "payload_cog_m": 3}
+LENGTHS = {
+    "xyz_m": 3,
+    "rpy_deg": 3,
+    "work_point_m": 3,
+    "start_m": 3,
+    "home_deg": 6,
+    "payload_cog_m": 3,
+    "gradient_error_per_m": 2,
+}
 
 
 LARGEST = {
     "width": 4096, "height": 4096, "samples": 8192, "recording_fps": 60, "cloud_points": 1_000_000, "maximum_scans": 200,
-    "minimum_scans": 200, "verification_scans": 200, "scans": 500, "held_out": 500, "touches": 500, "passes": 50, "columns": 20,
-    "rows": 20, "length_mm": 3000, "seam_length_mm": 3000, "maximum_time_s": 86_400, "rate_hz": 1000, "focal_px": 100_000,
+    "minimum_scans": 200, "verification_scans": 200, "scans": 500, "held_out": 500, "touches": 500, "passes": 50, "columns": 100,
+    "rows": 100, "length_mm": 3000, "seam_length_mm": 3000, "maximum_time_s": 86_400, "rate_hz": 1000, "focal_px": 100_000,
     "hole_from_mm": 3000, "theta_max_deg": 89, "speed_mm_s": 500, "control_period_s": 1, "exposure_s": 60, "latency_s": 10,
 }  # fmt: skip
 """Largest value of a key, in any part of a scenario."""
@@ -92,7 +100,7 @@ def _check(key: str, name: str, number: float) -> None:
     if not math.isfinite(number):
         raise InputError(f"{key} must be finite, not {number}.")
     if abs(number) > largest(name):
-        raise InputError(f"{key} is {number:g}; from {-largest(name):g} to {largest(name):g} is possible.")
+        raise InputError(f"{key} is {number:g}; the largest possible size is {largest(name):g}.")
     if name in POSITIVE and number <= 0.0:
         raise InputError(f"{key} must be a positive number, not {number:g}.")
     if name in NOT_NEGATIVE and number < 0.0:
