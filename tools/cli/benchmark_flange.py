@@ -193,7 +193,20 @@ def imperfect(
     return _figures(call, light_runs_table(found))
 
 
-COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect)
+@command("benchmark flange-halves")
+def held_out(
+    call: Call,
+    dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least sixteen scans.")],
+    draws: Annotated[int, option("--draws", "N", "Number of random halves.", min=1)] = 20,
+) -> Outcome:
+    """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
+    from weldcal.tools.studies.flange.held_out import study_halves
+    from weldcal.tools.studies.flange.tables import halves_table
+
+    return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress)))
+
+
+COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect, held_out)
 
 
 def _figures(call: Call, table: "Table") -> Outcome:

@@ -139,7 +139,8 @@ def test_below_eight_poses_the_hole_circle_decides_where_held_out_errors_fall() 
 
 def test_the_held_out_error_of_a_pose_never_saw_it() -> None:
     observations, patterns = _cell(WRONG)
-    scanner, corrected, estimate = apply_self_calibration(observations, estimate_eye_on_base(observations), patterns)
+    rigid = estimate_eye_on_base(observations)
+    scanner, corrected, estimate = apply_self_calibration(observations, rigid, patterns, nested=False)
     assert scanner is not None
     assert scanner.accepted is not None
     o, rest = observations[3], [*observations[:3], *observations[4:]]

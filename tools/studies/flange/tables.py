@@ -8,6 +8,7 @@ from weldcal.models.arrays import Array
 from weldcal.tools.studies.flange.coverage import Coverage
 from weldcal.tools.studies.flange.found import Found, Hidden
 from weldcal.tools.studies.flange.halves import PartRow
+from weldcal.tools.studies.flange.held_out import Halves
 from weldcal.tools.studies.flange.hole_turn import HoleTurn
 from weldcal.tools.studies.flange.imperfect import LightRuns
 from weldcal.tools.studies.flange.live import TARGET_M, TARGET_RAD, LiveRow, joined
@@ -70,6 +71,16 @@ def hole_turn_table(rows: Sequence[HoleTurn]) -> Table:
         for r in rows
     }
     return _rows("rows", rows), lines
+
+
+def halves_table(found: Halves) -> Table:
+    """What halves of a recording state of themselves, and their errors on the others."""
+    lines = {
+        "held-out error stated": f"{found.stated_mm:.3f} mm mean, from {found.scans} scans each",
+        "error on the other half": f"{found.new_mm:.3f} mm mean",
+        "in the stated 95 % interval": f"{found.inside} of {found.draws - found.skipped}",
+    }
+    return {"state": "done", **vars(found)}, lines
 
 
 def light_runs_table(found: LightRuns) -> Table:
