@@ -6,7 +6,7 @@ import numpy as np
 
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.planning.observability import has_orientations, turn_deg
 from weldcal.models.arrays import Array
 
 _TURN_DEG = 15.0  # orientations that differ by less hardly tell a bias of the centre from a shift of the camera
@@ -42,7 +42,12 @@ def sampling_advice(
                 f"{1e3 * width[k]:.0f} mm there (rms), by {1e3 * width[0]:.0f} mm along {_direction(spread[2][0])}."
             )
     turned = turn_deg([o.X_BR for o in used])
-    if turned < _TURN_DEG:
+    if not has_orientations([o.X_BR for o in used]):
+        out.append(
+            "Give the orientations of the poses (base_qw ... base_qz in pairs.csv): without them a constant error of the flange centre or "
+            "of the tool's offset cannot be seen."
+        )
+    elif turned < _TURN_DEG:
         out.append(
             f"Turn and tilt the flange between poses by 20 degrees or more: these poses differ by {turned:.1f} degrees, so a "
             "constant error of the flange centre or of the tool's offset cannot be seen."

@@ -1,5 +1,7 @@
 """Checks the diversity of a set of poses and names the errors that they cannot show."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
@@ -88,6 +90,11 @@ def turn_deg(poses: list[RigidTransform]) -> float:
     return max(float(np.degrees(np.linalg.norm(rotation_vector(first @ X.rotation())))) for X in poses)
 
 
+def has_orientations(poses: Sequence[RigidTransform]) -> bool:
+    """Whether orientations are given: pairs of centres without any carry the identity in every pose."""
+    return any(not X.rotation().IsExactlyIdentity() for X in poses)
+
+
 def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float, normals: bool) -> tuple[str, ...]:
     """Sentences that name the errors these poses cannot show; empty where there are none."""
     if len(poses) < 2:
@@ -103,10 +110,14 @@ def unobservable_sentences(poses: list[RigidTransform], sigma_position_m: float,
             f" these poses show one only roughly, along {seen}."
         )
     elif axes:
+        why = (
+            f"the flange turned by only {turn_deg(poses):.1f} degrees between poses"
+            if has_orientations(poses)
+            else "no orientations are given"
+        )
         out.append(
             f"A constant bias of the flange centre in the flange frame along {', '.join(axes)} (equally a TCP offset): "
-            f"the flange turned by only {turn_deg(poses):.1f} degrees between poses, so it looks like a shift of "
-            "the camera."
+            f"{why}, so it looks like a shift of the camera."
         )
     out.append("A rotation of the flange about its own axis: a circle does not show it.")
     if not normals:

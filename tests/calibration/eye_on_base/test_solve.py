@@ -7,6 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import CoplanarPoses, InconsistentPoses, RepeatedPoses, TooFewPoses
+from weldcal.calibration.eye_on_base.advice import sampling_advice
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base, point_error_covariance
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.rigid import fit_rigid
@@ -144,6 +145,16 @@ def test_constant_orientation_hides_a_bias_of_the_centre_and_it_is_said() -> Non
         for s in still.unobservable
     )
     assert not any("constant bias" in s and "looks like" in s for s in turned.unobservable)
+
+
+def test_pairs_without_orientations_are_not_told_how_far_they_turned() -> None:
+    """Their poses carry the identity, which is no measured turn of zero degrees."""
+    observations = [Observation(o.id, RigidTransform(o.p_BR), o.p_CR) for o in make_observations(12, 3, normals=False)]
+    estimate = estimate_eye_on_base(observations)
+    said = [*estimate.unobservable, *sampling_advice(estimate, observations)]
+    assert any("no orientations are given, so it looks like a shift of the camera" in s for s in said)
+    assert any(s.startswith("Give the orientations of the poses") for s in said)
+    assert not any("0.0 degrees" in s for s in said)
 
 
 def test_numbers_that_are_not_finite_are_refused_at_the_door() -> None:
