@@ -27,6 +27,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
     return render(
         "calibration.html.j2",
         dataset=dataset,
+        interval=report.held_out_interval_mm,
         judged=bool(np.isfinite(r.held_out_mm["median"])),
         fits=bool(report.fits),
         r=r,
@@ -44,7 +45,6 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
             ("rotation vector, deg", fixed_row(np.degrees(rotation_vector(r.X_BC.rotation())), 4)),
             ("one sigma, deg", fixed_row(np.degrees(sigma[:3]), 4)),
             ("noise per axis, one sigma", f"{r.sigma_position_mm:.3f} mm"),
-            *_interval(report.held_out_interval_mm),
             *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
             ("URScript", export_ur_pose(r.X_BC).strip()),
@@ -60,12 +60,6 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
         advice=report.advice,
         knowledge=None if len(p_B) < 2 else knowledge_map(report.estimate, p_B),
     )
-
-
-def _interval(interval: tuple[float, float] | None) -> list[tuple[str, str]]:
-    if interval is None:
-        return []
-    return [("mean error of as many new scans, 95 %", f"{interval[0]:.3f} to {interval[1]:.3f} mm")]
 
 
 def _axis_turn(turn: tuple[float, float] | None) -> list[tuple[str, str]]:
