@@ -39,7 +39,7 @@ def test_an_outlier_is_left_out_and_its_held_out_error_is_large() -> None:
 
 def test_in_the_imperfect_cell_the_stated_region_holds_the_error() -> None:
     """The world's warp and the arm's errors are drawn from models that the estimator does not contain."""
-    runs = 24
+    runs = 16
     found = study_light_runs(load_scenario("s_groove"), runs, seed=3)
     # with a chance of one in a thousand a study of exact regions finds fewer inside
     assert found.inside.sum() >= binom.ppf(1e-3, runs, 0.95)
