@@ -34,7 +34,8 @@ def read_text_cloud(path: Path) -> Array:
     header = [c.strip().lower() for c in _cells(row, separator)]
     columns, width = [0, 1, 2], len(header)
     pending: list[tuple[int, str]] = []
-    if _number(header[0], separator) is None:
+    headed = _number(header[0], separator) is None
+    if headed:
         if {"x", "y", "z"} <= set(header):
             columns = [header.index(c) for c in "xyz"]
         if any(header.count(c) > 1 for c in "xyz"):
@@ -52,7 +53,8 @@ def read_text_cloud(path: Path) -> Array:
         raise CloudError(f"The file {path.name} has a row of fewer than three numbers; x, y and z are needed.")
     blocks: list[Array] = []
     block: list[list[float]] = []
-    whole = separator == ","
+    # a header that names as many columns as a row has cells says that commas separate them
+    whole = separator == "," and not (headed and len(header) == width)
     for line, row in _chain(pending, rows):
         cells = _cells(row, separator)
         if len(cells) != width:

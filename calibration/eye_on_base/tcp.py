@@ -59,8 +59,8 @@ class TcpOffset:
 
     def surely_beyond(self, length_m: float) -> bool:
         """Whether it is longer than that by four sigmas, and by what systematic errors may pretend."""
-        doubt = np.maximum(_SURE_SIGMAS * self.sigma_m, self.pretended_m)[self.known]
-        return self.length_m - float(np.linalg.norm(doubt)) > length_m
+        widest = np.maximum(_SURE_SIGMAS * self.sigma_m, self.pretended_m)[self.known]
+        return self.length_m - float(np.linalg.norm(widest)) > length_m
 
     @property
     def evident(self) -> bool:

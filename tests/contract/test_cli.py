@@ -81,6 +81,7 @@ def test_help_loads_no_heavy_library() -> None:
             ["demo", "--seed", "-1"],
             ["calibrate"],
             ["calibrate", "a", "--scenario", "b"],
+            ["calibrate", "--scenario", "calibrate_only", "--poses", "a:b"],
         ),
         *(["tablet", "calibrate", "a.csv", "--pen-length-mm", number] for number in ("nan", "inf", "1e308")),
         ["demo", "--speed-factor", "nan"],

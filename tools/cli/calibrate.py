@@ -66,6 +66,8 @@ def calibrate(
         return Outcome(report.summary(), rows=rows | pose_rows(report.result.X_BC))
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
+    if poses is not None:
+        raise typer.BadParameter("--poses selects scans of a dataset; omit it with --scenario")
     from weldcal.tools.commands.procedures import calibrate_live
 
     found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)

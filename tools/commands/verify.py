@@ -86,8 +86,8 @@ def verify_dataset(
         source = f"which {100 * FALSE_ALARM:.0f} % of verifications of a calibration as good as it states exceed"
     else:
         source = "as given"
-    doubts = [*differences, *gross, *uncorrected, *_alike(data, observations)]
-    verdict = _verdict([poses[k] for k in new], limit_mm, source, doubts)
+    diagnostics = [*differences, *gross, *uncorrected, *_alike(data, observations)]
+    verdict = _verdict([poses[k] for k in new], limit_mm, source, diagnostics)
     warnings = (
         *uncorrected,
         *(f"{id} was not used: {reason}" for id, reason in seen.refused),
@@ -130,8 +130,8 @@ def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observa
     return tuple(poses)
 
 
-def _verdict(new: list[PoseError], limit_mm: float | None, source: str, doubts: list[str]) -> Verdict:
-    """The verdict on the new scans alone; ``doubts`` are sentences that leave it at "use with care"."""
+def _verdict(new: list[PoseError], limit_mm: float | None, source: str, diagnostics: list[str]) -> Verdict:
+    """The verdict on the new scans alone; ``diagnostics`` are sentences that leave it at "use with care"."""
     if not new:
         return Verdict(NONE, None, "The calibration used all of these scans. Take new scans to verify it.")
     median = float(np.median([p.error_mm for p in new]))
@@ -149,8 +149,8 @@ def _verdict(new: list[PoseError], limit_mm: float | None, source: str, doubts: 
     said += f", within the limit of {limit_mm:.3f} mm, {source}"
     if len(new) < _FEW:
         return Verdict(CARE, limit_mm, f"{said}; fewer than {_FEW} new scans say little.")
-    if doubts:
-        return Verdict(CARE, limit_mm, f"{said}. But: {doubts[0]}")
+    if diagnostics:
+        return Verdict(CARE, limit_mm, f"{said}. But: {diagnostics[0]}")
     return Verdict(USE, limit_mm, f"{said}.")
 
 

@@ -129,6 +129,15 @@ def test_columns_that_a_header_names_are_found_by_their_names(tmp_path: Path) ->
     assert np.array_equal(read_cloud(tmp_path / "a.csv"), POINTS)
 
 
+def test_a_header_of_as_many_columns_says_that_commas_separate_whole_numbers(tmp_path: Path) -> None:
+    """Millimetres with colours: without the header each two of them could be one number."""
+    whole = np.arange(3 * N).reshape(N, 3) + 600
+    cells = "".join(f"{x},{y},{z},255,128,0\n" for x, y, z in whole)
+    (tmp_path / "a.csv").write_text("x,y,z,r,g,b\n" + cells)
+    assert np.array_equal(read_cloud(tmp_path / "a.csv"), whole)
+    assert "could be separators or decimal commas" in reason(tmp_path / "b.csv", cells.encode())
+
+
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [

@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, face_points, get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.studies.flange.hole_turn import study_hole_turn
@@ -140,6 +141,11 @@ def test_no_filled_holes_lead_to_a_wrong_rotation() -> None:
     assert rows[0].right > 0
     assert rows[5].right == 0
     assert rows[5].left_open > 0
+
+
+def test_a_flange_without_holes_has_none_to_fill() -> None:
+    with pytest.raises(InputError, match="has no holes to fill"):
+        study_hole_turn(get_scanner("phoxi_m", 1032), get_flange("tool-ring-63"), 1)
 
 
 def test_a_ring_has_no_pattern() -> None:

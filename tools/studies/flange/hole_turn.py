@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import fit_flange
 from weldcal.calibration.flange.holes import HolePattern, find_holes
+from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.runner import Progress, no_progress
@@ -53,7 +54,12 @@ def study_hole_turn(
     seed: int = 0,
     progress: Progress = no_progress,
 ) -> list[HoleTurn]:
-    """A row for the open pattern, for each opening filled alone and for all pairs of them together. Deterministic for ``seed``."""
+    """A row for the open pattern, for each opening filled alone and for all pairs of them together. Deterministic for ``seed``.
+
+    Raises InputError for a flange without holes.
+    """
+    if standard.n_holes == 0:
+        raise InputError(f"The flange '{standard.designation}' has no holes to fill: give one of ISO 9409-1.")
     cases = list(_cases(standard))
     rows = []
     for c, (name, choices) in enumerate(cases):

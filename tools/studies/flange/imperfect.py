@@ -14,6 +14,7 @@ from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner, random_pose_error
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
@@ -69,10 +70,10 @@ def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: 
 
     The job's own poses and stopping rule; the rendering and the flange fit are replaced by their stated noise. The arm's
     links and the scanner's warp are drawn from models that the estimator does not contain. Deterministic for ``seed``.
+
+    Raises InputError for a scenario without a simulated arm and a rendered scanner in the base.
     """
-    assert isinstance(scenario.robot, SimulatedUr)
-    scanner = scenario.scanner_config()
-    assert isinstance(scanner, RenderedScanner)
+    _simulated(scenario)
     station = make_station(scenario, seed)
     poses = [p.q for p in plan_poses(scenario, station, seed)]
     station.close()
@@ -96,10 +97,19 @@ def study_light_runs(scenario: Scenario, runs: int, *, seed: int = 0, progress: 
     return LightRuns(columns[0], columns[1], columns[2], columns[3].astype(bool), columns[4])
 
 
-def _draw(scenario: Scenario, arm: ArmModel, X_FR: RigidTransform, rng: np.random.Generator) -> _World:
+def _simulated(scenario: Scenario) -> tuple[SimulatedUr, RenderedScanner]:
+    """The scenario's arm and scanner. Raises InputError where they are not simulated, or the scanner moves with the arm."""
     robot, scanner = scenario.robot, scenario.scanner_config()
-    assert isinstance(robot, SimulatedUr)
-    assert isinstance(scanner, RenderedScanner)
+    if not isinstance(robot, SimulatedUr) or not isinstance(scanner, RenderedScanner) or scanner.mounted_on != "base":
+        raise InputError(
+            "This study needs a simulated arm and a scanner that stands in the base: give a scenario with robot: !SimulatedUr and "
+            "scanner: !RenderedScanner, such as s_groove."
+        )
+    return robot, scanner
+
+
+def _draw(scenario: Scenario, arm: ArmModel, X_FR: RigidTransform, rng: np.random.Generator) -> _World:
+    robot, scanner = _simulated(scenario)
     nominal = scenario.calibration.mounting_guess.pose()
     error = random_pose_error(rng, 1e-3 * scanner.mounting_translation_mm, np.deg2rad(scanner.mounting_rotation_deg))
     X_BC = RigidTransform(nominal.rotation() @ error.rotation(), nominal.translation() + error.translation())
