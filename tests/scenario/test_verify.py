@@ -77,8 +77,9 @@ def test_scans_the_calibration_never_saw_are_hit_to_a_fifth_of_a_millimetre(veri
     figures = {"position_error_mm", "tilt_deg", "per_pose", "warnings"}
     assert set(d) == {"state", "verdict", "limit_mm", "reason"} | figures
     assert d["verdict"] == "use with care"  # because the orientations hardly vary
-    # the 95 % percentile of its held-out errors, in one of which nine scans decide against the correction
-    assert d["position_error_mm"]["median"] < d["limit_mm"] < 0.8
+    # nine scans: without one of them the others decide against the correction, and that held-out error sets the limit
+    assert d["limit_mm"] == pytest.approx(verified.result.held_out_mm["p95"])
+    assert d["position_error_mm"]["median"] < 0.6 * d["limit_mm"]
     assert len(d["per_pose"]) == 9
     # nine scans: the paper's method leaves 0.63 on poses it did not use, good centres 0.29, and a corrected scanner 0.16
     assert d["position_error_mm"]["median"] < 0.2
