@@ -16,6 +16,7 @@ from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
+from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
@@ -55,6 +56,7 @@ class Station:
     truth: Truth
     world: SimulatedWorld | None  # None where no device is simulated
     second: ArmModel | None = None
+    background: Background = dc.field(default_factory=Inline)
 
     @property
     def arm(self) -> ArmModel:
@@ -72,8 +74,9 @@ class Station:
         return self.robot.pace
 
     def close(self) -> None:
-        """Stop the arm and release the hardware; a second call has no effect."""
+        """Stop the arm, release the hardware and end the background; a second call has no effect."""
         self.robot.close()
+        self.background.close()
 
 
 def apply_driver_config(config: Any, build: StationBuild) -> Any:
@@ -223,7 +226,9 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
     diagram = builder.Build()
     diagram.set_name("station")
     second = None if furnishing.second is None else furnishing.second.arm
-    return Station(diagram, robot, tool, cad, truth, world, second)
+    # only a Diagram that keeps a robot's pace cannot wait for a computation
+    background = Inline() if robot.pace is None else OwnProcess()
+    return Station(diagram, robot, tool, cad, truth, world, second, background)
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:

@@ -11,6 +11,8 @@ from pydrake.systems.framework import Context, LeafSystem, State
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.systems.messages import Message
 
+LENGTH_S = 10.0  # an estimate of a scan is paired with its pose when it is ready, which a job waits 8 s for
+
 
 @dataclass(frozen=True, eq=False)
 class PoseHistory(Message):
@@ -47,7 +49,7 @@ class PoseRecorder(LeafSystem):
         - history
     """
 
-    def __init__(self, period_s: float = 0.008, length_s: float = 1.6) -> None:
+    def __init__(self, period_s: float = 0.008, length_s: float = LENGTH_S) -> None:
         super().__init__()
         self._length = int(length_s / period_s)
         self._position = self.DeclareVectorInputPort("position_measured", 6)

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from weldcal.models.arrays import Array
-from weldcal.systems.jobs.profiler.procedure import ProfilerState
+from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render

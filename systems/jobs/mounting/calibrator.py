@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.base_circle import fit_base_circle
@@ -21,6 +21,8 @@ from weldcal.calibration.planning.mounting_scene import FLANGE, MountingScene
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.background import Answer, Background
+from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.jobs.mounting.messages import HeldOut, MountingState, MountingStatus, NextBest, SeenCircle
 from weldcal.systems.jobs.weld.flange_estimator import LIVE_FIT
 from weldcal.systems.messages import Scan
@@ -40,7 +42,7 @@ class MountingFitConfig:
     required_error_m: float
 
 
-class MountingCalibrator(LeafSystem):
+class MountingCalibrator(BackgroundSystem):
     """Fits the circle in each scan near its predicted position, and solves the mounting's equation with all observations.
 
     .. pydrake_system::
@@ -58,29 +60,30 @@ class MountingCalibrator(LeafSystem):
     """
 
     def __init__(
-        self, scene: MountingScene, config: MountingFitConfig, plan: Sequence[MountingPose], period_s: float = 0.02
+        self,
+        scene: MountingScene,
+        config: MountingFitConfig,
+        plan: Sequence[MountingPose],
+        background: Background | None = None,
+        period_s: float = 0.02,
     ) -> None:
-        super().__init__()
-        warm_up()
+        super().__init__("status", MountingStatus(), background, period_s)
+        self.background.prepare(warm_up)
         self._scene, self._config, self._plan = scene, config, tuple(plan)
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._state = self.DeclareAbstractInputPort("state", AbstractValue.Make(MountingState()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._history_2 = self.DeclareAbstractInputPort("history_2", AbstractValue.Make(PoseHistory()))
-        self._status = self.DeclareAbstractState(AbstractValue.Make(MountingStatus()))
-        self.DeclareStateOutputPort("status", self._status)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
-    def _update(self, context: Context, state: State) -> None:
+    def ask(self, context: Context, newest: MountingStatus) -> Answer[MountingStatus] | None:
+        """Ask for the status with a new scan."""
         scan: Scan = self._scan.Eval(context)
-        status: MountingStatus = context.get_abstract_state(self._status).get_value()
         job: MountingState = self._state.Eval(context)
-        if scan.sequence <= status.sequence or scan.sequence != job.trigger:
-            return
+        if scan.sequence <= newest.sequence or scan.sequence != job.trigger:
+            return None
         q = self._history.Eval(context).joints_at(scan.capture_time)
         q_2 = self._history_2.Eval(context).joints_at(scan.capture_time) if self._scene.two else None
-        new = digest(status, scan, job, (q, q_2), self._scene, self._config, self._plan)
-        state.get_mutable_abstract_state(self._status).set_value(new)
+        return self.background.ask(digest, newest, scan, job, (q, q_2), self._scene, self._config, self._plan)
 
 
 def digest(

@@ -118,7 +118,9 @@ class Mounting(Job[MountingPlanned]):
             c.minimum_scans,
             c.required_error_mm * 1e-3,
         )
-        calibrator = wiring.add("mounting_calibrator", MountingCalibrator(scene, fit, plan.poses))
+        calibrator = wiring.add(
+            "mounting_calibrator", MountingCalibrator(scene, fit, plan.poses, wiring.station.background)
+        )
         state = procedure.GetOutputPort("state")
         wiring.connect(calibrator, scan=wiring.out("scanner.scan"), state=state)
         wiring.connect(

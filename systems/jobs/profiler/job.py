@@ -16,8 +16,9 @@ from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.profiler.config import ProfilerJob, check_profiler_job
 from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure, ProfilerState
+from weldcal.systems.jobs.profiler.procedure import PLANS, ProfilerProcedure
 from weldcal.systems.jobs.profiler.robot_error import RobotError
+from weldcal.systems.jobs.profiler.state import ProfilerState
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
@@ -84,7 +85,9 @@ class Profiler(Job[PlanningContext]):
         """See Job."""
         profiler = wiring.scenario.profiler
         assert isinstance(profiler, RenderedProfiler)
-        procedure = wiring.add("profiler_procedure", ProfilerProcedure(plan, profiler, wiring.seed))
+        procedure = wiring.add(
+            "profiler_procedure", ProfilerProcedure(plan, profiler, wiring.seed, wiring.station.background)
+        )
         wiring.connect(
             procedure,
             position=spine.arm.position,

@@ -1,66 +1,28 @@
 """ProfilerProcedure: scans the edge, scans and touches the sphere, scans along the groove, then moves the torch along it."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.models.arms.kinematics import forward_kinematics, jacobian
+from weldcal.models.arms.kinematics import jacobian
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
+from weldcal.systems.background import Background, Inline, import_module
 from weldcal.systems.drivers.simulated.rendered_profiler import RenderedProfiler
-from weldcal.systems.jobs.profiler.estimates import (
-    EdgeFound,
-    SeamFound,
-    SphereFound,
-    Taken,
-    feature_sigmas,
-    find_edge,
-    find_seam,
-    find_sphere,
-    sphere_sigmas,
-)
-from weldcal.systems.jobs.profiler.plan import Goal, plan_edge, plan_pass, plan_sphere, plan_torch, plan_touches
+from weldcal.systems.jobs.profiler.estimates import Taken
 from weldcal.systems.jobs.profiler.planning_context import PlanningContext
-from weldcal.systems.messages import JobCommand, Message, ProfileScan, TorchTouch, UrStatus
+from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.jobs.profiler.steps import next_step
+from weldcal.systems.messages import JobCommand, ProfileScan, TorchTouch, UrStatus
 from weldcal.systems.motion.pose_recorder import PoseHistory
-from weldcal.welding.seam.curve import SeamCurve
 
 ENDS = ("done", "held")
 DWELL_S = 0.1  # at rest before a profile is taken
 FEEDBACK_PER_S = 8.0  # feedback gain towards the path
 PLANS = {"edge": ("edge",), "sphere": ("sphere", "touch"), "seam": ("pass", "torch")}  # steps of each stage, in order
-
-
-@dataclass(frozen=True, eq=False)
-class ProfilerState(Message):
-    """State and data of the procedure; `step` is the present one: edge, sphere, touch, pass, torch."""
-
-    phase: str = "start"  # start, move, dwell, await, descend, lift, run, done, held
-    since: float = 0.0
-    goal_id: int = 0
-    step: str = ""
-    steps_left: tuple[str, ...] = ()
-    goals: tuple[Goal, ...] = ()  # the first is the present goal
-    sequence: int = 0  # number of the newest requested profile
-    seen: int = 0  # number of the newest received profile
-    before: int = 0  # number of profiles at the start of the pass
-    felt: int = 0  # number of touches at the start of the descent
-    taken: tuple[Taken, ...] = ()
-    touches: tuple[Array, ...] = ()
-    edge: EdgeFound | None = None
-    sphere: SphereFound | None = None
-    seam: SeamFound | None = None
-    edge_scans: tuple[Taken, ...] = ()
-    sphere_scans: tuple[Taken, ...] = ()
-    seam_scans: tuple[Taken, ...] = ()
-    torch_from_s: float = np.inf
-    torch_until_s: float = np.inf
-    reason: str = ""
-    planning: PlanningContext | None = field(default=None)
 
 
 class ProfilerProcedure(LeafSystem):
@@ -89,9 +51,16 @@ class ProfilerProcedure(LeafSystem):
     """
 
     def __init__(
-        self, planning: PlanningContext, profiler: RenderedProfiler, seed: int, period_s: float = 0.008
+        self,
+        planning: PlanningContext,
+        profiler: RenderedProfiler,
+        seed: int,
+        background: Background | None = None,
+        period_s: float = 0.008,
     ) -> None:
         super().__init__()
+        self._background = background or Inline()
+        self._background.prepare(import_module, next_step.__module__)
         self._planning, self._profiler, self._seed = planning, profiler, seed
         self._position = self.DeclareVectorInputPort("position", 6)
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
@@ -147,7 +116,9 @@ class ProfilerProcedure(LeafSystem):
             return replace(s, phase="held", since=now, reason=reason)
         if s.phase == "start":
             steps = tuple(step for stage in self._planning.job.stages for step in PLANS[stage])
-            return self._begin(replace(s, steps_left=steps), q, now)
+            return self._next_step(replace(s, steps_left=steps), q, now)
+        if s.phase == "compute":
+            return self._stepped(s, now)
         if s.phase == "move" and s.goal_id == int(self._settled.Eval(context)[0]):
             return self._arrived(s, q, now, context)
         if s.phase == "dwell" and now - s.since >= DWELL_S:
@@ -219,69 +190,17 @@ class ProfilerProcedure(LeafSystem):
     def _go_on(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
         if len(s.goals) > 1:
             return replace(s, phase="move", since=now, goal_id=s.goal_id + 1, goals=s.goals[1:])
-        return self._begin(self._concluded(s), q, now)
+        return self._next_step(s, q, now)
 
-    def _begin(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
-        """Plan the next step and move to its first goal; home at the end."""
-        planning = s.planning or self._planning
-        if not s.steps_left:
-            if s.step == "home":
-                return replace(s, phase="done", since=now)
-            goals, step = [Goal("via", planning.q_home)], "home"
-            left: tuple[str, ...] = ()
-            if s.step == "torch":
-                goals = [Goal("via", self._raised(planning, q)), *goals]
-        else:
-            step, *rest = s.steps_left
-            left = tuple(rest)
-            goals = self._planned(s, step, planning, q)
-        return replace(
-            s, phase="move", since=now, goal_id=s.goal_id + 1, step=step, steps_left=left, goals=tuple(goals), taken=()
-        )
-
-    def _planned(self, s: ProfilerState, step: str, planning: PlanningContext, q: Array) -> list[Goal]:
-        if step == "edge":
-            return plan_edge(planning, q, self._seed, feature_sigmas(self._profiler, 0.085))
-        if step == "sphere":
-            return plan_sphere(planning, q, self._seed, sphere_sigmas(self._profiler, planning.job))
-        if step == "touch":
-            return plan_touches(planning, q, self._seed)
-        if step == "pass":
-            return plan_pass(planning, q)
-        assert s.seam is not None
-        return plan_torch(planning, q, s.seam.curve)
+    def _next_step(self, s: ProfilerState, q: Array, now: float) -> ProfilerState:
+        """Evaluate the completed step and plan the next one, beside the control loop, while the arm is at rest."""
+        asked = self._background.ask(next_step, s, q, self._profiler, self._seed)
+        return self._stepped(replace(s, phase="compute", since=now, asked=asked), now)
 
     @staticmethod
-    def _raised(planning: PlanningContext, q: Array) -> Array:
-        up = planning.joints(RigidTransform([0.0, 0.0, 0.05]) @ forward_kinematics(planning.arm, q), q)
-        return planning.q_home if up is None else up
-
-    def _concluded(self, s: ProfilerState) -> ProfilerState:
-        """Evaluate the completed step and update the planning data."""
-        planning, p = s.planning or self._planning, self._profiler
-        if s.step == "edge":
-            found = find_edge(planning.arm, p, planning.job, s.taken)
-            return replace(s, edge=found, edge_scans=s.taken, planning=planning.known(X_FS=found.estimate.X_FS))
-        if s.step == "sphere":
-            first = find_sphere(planning.arm, p, planning.job, s.taken)
-            known = planning.known(X_FS=first.estimate.X_FS, center=first.estimate.center)
-            return replace(s, sphere_scans=s.taken, sphere=first, planning=known)
-        if s.step == "touch":
-            assert s.sphere is not None
-            before = s.sphere.estimate
-            sphere = find_sphere(planning.arm, p, planning.job, s.sphere_scans, s.touches, planning.p_FTip, before)
-            e = sphere.estimate
-            assert e.tip is not None
-            X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(e.rotation), e.translation)
-            return replace(s, sphere=sphere, planning=planning.known(X_FS=X, center=e.center, p_FTip=e.tip))
-        if s.step == "pass":
-            assert s.sphere is not None
-            assert planning.X_BP is not None
-            assert planning.cad is not None
-            drawn = SeamCurve.from_points(np.asarray(planning.cad.seam_P)[::4]).transformed(planning.X_BP)
-            seam = find_seam(planning.arm, s.sphere.estimate, drawn, s.taken, 1e-3 * planning.job.seam.every_mm)
-            return replace(s, seam=seam, seam_scans=s.taken)
-        return s
+    def _stepped(s: ProfilerState, now: float) -> ProfilerState:
+        assert s.asked is not None
+        return replace(s.asked.value, since=now) if s.asked.ready else s
 
     def _job(self, context: Context, output: Any) -> None:
         s: ProfilerState = context.get_abstract_state(self._state).get_value()

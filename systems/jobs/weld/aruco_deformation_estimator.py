@@ -10,6 +10,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import FingerCamera, WeldingTool
+from weldcal.systems.background import Answer, Background, Inline, import_module
 from weldcal.systems.messages import Image, Message
 from weldcal.systems.motion.pose_recorder import PoseHistory
 from weldcal.welding.servo.deformation import TagModel, deflection_from_tag, detect_tag
@@ -30,10 +31,12 @@ class Deformation(Message):
 
 @dc.dataclass(frozen=True, eq=False)
 class _Work(Message):
-    """The last result, and the images that wait for the arm's pose at their capture time, oldest first."""
+    """The last result, the newest image's number, and the images that wait for the arm's pose at their capture time, oldest first."""
 
     found: Deformation = dc.field(default_factory=Deformation)
+    newest_sequence: int = 0
     waiting: tuple[Image, ...] = ()
+    asked: Answer[Deformation] | None = None
 
 
 class ArucoDeformationEstimator(LeafSystem):
@@ -51,11 +54,21 @@ class ArucoDeformationEstimator(LeafSystem):
 
     `deformation` carries a `Deformation`; `deflection` (5) is [tangential, normal, axial] in m, valid (1 or 0) and age s.
     A frame without a reliable tag is reported as invalid with its reason, not as an old value. Images wait for poses that
-    arrive later than they do; if only the newest image were used, its pose would never be known.
+    arrive later than they do; if only the newest image were used, its pose would never be known. The tag is detected beside
+    the control loop; a detection that takes longer than a frame skips the frames between.
     """
 
-    def __init__(self, arm: ArmModel, tool: WeldingTool, camera: FingerCamera, period_s: float = 0.008) -> None:
+    def __init__(
+        self,
+        arm: ArmModel,
+        tool: WeldingTool,
+        camera: FingerCamera,
+        background: Background | None = None,
+        period_s: float = 0.008,
+    ) -> None:
         super().__init__()
+        self._background = background or Inline()
+        self._background.prepare(import_module, __name__)
         self._arm, self._tool, self._K = arm, tool, camera.camera_matrix
         self._tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
         self._image = self.DeclareAbstractInputPort("image", AbstractValue.Make(Image()))
@@ -67,22 +80,28 @@ class ArucoDeformationEstimator(LeafSystem):
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:
+        old: _Work = context.get_abstract_state(self._state).get_value()
+        work = old
         image: Image = self._image.Eval(context)
-        work: _Work = context.get_abstract_state(self._state).get_value()
-        waiting = work.waiting
-        if image.sequence > (waiting[-1].sequence if waiting else work.found.sequence):
-            waiting = (*waiting, image)[-IMAGES_KEPT:]
-        elif not waiting:
-            return
-        found, history = work.found, self._history.Eval(context)
-        # The newest image with a known pose; older ones are discarded.
-        for k in reversed(range(len(waiting))):
-            X_BF = history.pose_at(self._arm, waiting[k].capture_time)
+        if image.sequence > work.newest_sequence:
+            waiting = (*work.waiting, image)[-IMAGES_KEPT:]
+            work = dc.replace(work, newest_sequence=image.sequence, waiting=waiting)
+        if work.asked is None and work.waiting:
+            work = self._asked(work, self._history.Eval(context))
+        if work.asked is not None and work.asked.ready:
+            work = dc.replace(work, found=work.asked.value, asked=None)
+        if work is not old:
+            state.get_mutable_abstract_state(self._state).set_value(work)
+
+    def _asked(self, work: _Work, history: PoseHistory) -> _Work:
+        """Start the detection in the newest image with a known pose; older images are discarded."""
+        for k in reversed(range(len(work.waiting))):
+            image = work.waiting[k]
+            X_BF = history.pose_at(self._arm, image.capture_time)
             if X_BF is not None:
-                found = measure_deformation(waiting[k], X_BF, self._tool, self._tag, self._K)
-                waiting = waiting[k + 1 :]
-                break
-        state.get_mutable_abstract_state(self._state).set_value(_Work(found, waiting))
+                asked = self._background.ask(measure_deformation, image, X_BF, self._tool, self._tag, self._K)
+                return dc.replace(work, waiting=work.waiting[k + 1 :], asked=asked)
+        return work
 
     def _found(self, context: Context) -> Deformation:
         work: _Work = context.get_abstract_state(self._state).get_value()

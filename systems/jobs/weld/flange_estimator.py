@@ -4,7 +4,7 @@ import dataclasses as dc
 
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
@@ -12,6 +12,8 @@ from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.background import Answer, Background
+from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
@@ -19,7 +21,7 @@ from weldcal.systems.motion.pose_recorder import PoseHistory
 LIVE_FIT = FlangeFitConfig(min_coverage=0.85)
 
 
-class FlangeEstimator(LeafSystem):
+class FlangeEstimator(BackgroundSystem):
     """Fits the flange in each calibration scan, near its predicted position.
 
     .. pydrake_system::
@@ -34,7 +36,7 @@ class FlangeEstimator(LeafSystem):
         - flange_estimate
 
     The search sphere is centred at the feature's position predicted from the newest X_BC (at first the nominal one) and the
-    arm's pose at the capture time.
+    arm's pose at the capture time. The fit runs beside the control loop.
     """
 
     def __init__(
@@ -44,32 +46,30 @@ class FlangeEstimator(LeafSystem):
         standard: FlangeStandard,
         X_BC_guess: RigidTransform,
         guess_radius_m: float,
+        background: Background | None = None,
         period_s: float = 0.02,
     ) -> None:
-        super().__init__()
-        warm_up()
+        super().__init__("flange_estimate", FlangeEstimate(), background, period_s)
+        self.background.prepare(warm_up)
         self._arm, self._X_FR, self._standard = arm, X_FR, standard
         self._X_BC_guess, self._guess_radius_m = X_BC_guess, guess_radius_m
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(FlangeEstimate()))
-        self.DeclareStateOutputPort("flange_estimate", self._state)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
-    def _update(self, context: Context, state: State) -> None:
+    def ask(self, context: Context, newest: FlangeEstimate) -> Answer[FlangeEstimate] | None:
+        """Ask for the estimate of a new calibration scan."""
         scan: Scan = self._scan.Eval(context)
         job: JobCommand = self._job.Eval(context)
-        newest: FlangeEstimate = context.get_abstract_state(self._state).get_value()
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose == "workpiece":
-            return
+            return None
         status: CalibrationStatus = self._status.Eval(context)
         X_BF = self._history.Eval(context).pose_at(self._arm, scan.capture_time)
-        estimate = estimate_flange(
-            scan, job, X_BF, self._X_FR, self._standard, status.X_BC or self._X_BC_guess, self._guess_radius_m
+        X_BC = status.X_BC or self._X_BC_guess
+        return self.background.ask(
+            estimate_flange, scan, job, X_BF, self._X_FR, self._standard, X_BC, self._guess_radius_m
         )
-        state.get_mutable_abstract_state(self._state).set_value(estimate)
 
 
 def estimate_flange(

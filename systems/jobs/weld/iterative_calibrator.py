@@ -1,13 +1,12 @@
 """IterativeCalibrator: estimates X_BC from the flange estimates until its expected error is small enough."""
 
 import dataclasses as dc
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context
 
 from weldcal.calibration.eye_on_base.joint_fit import estimate_jointly
 from weldcal.calibration.eye_on_base.observations import corrected_observation
@@ -25,6 +24,8 @@ from weldcal.calibration.published.icp import make_verification
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.systems.background import Answer, Background
+from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, VerificationResult
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
@@ -44,7 +45,7 @@ class CalibratorConfig:
     correct_scanner: bool = True
 
 
-class IterativeCalibrator(LeafSystem):
+class IterativeCalibrator(BackgroundSystem):
     """Computes Algorithm 1 with its pool of four, and the robust estimate from all scans, which is the result.
 
     .. pydrake_system::
@@ -67,39 +68,28 @@ class IterativeCalibrator(LeafSystem):
         X_FR: RigidTransform,
         standard: FlangeStandard,
         config: CalibratorConfig,
+        background: Background | None = None,
         period_s: float = 0.02,
     ) -> None:
-        super().__init__()
+        super().__init__("calibration_status", CalibrationStatus(), background, period_s)
         self._arm, self._X_FR, self._config = arm, X_FR, config
         self._standard = standard
         self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(CalibrationStatus()))
-        self.DeclareAbstractOutputPort(
-            "calibration_status",
-            lambda: AbstractValue.Make(CalibrationStatus()),
-            self._output,
-            {self.abstract_state_ticket(self._state)},
-        )
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def status(self, context: Context) -> CalibrationStatus:
         """The newest status in this system's context."""
-        status: CalibrationStatus = context.get_abstract_state(self._state).get_value()
+        status: CalibrationStatus = self.newest(context)
         return status
 
-    def _update(self, context: Context, state: State) -> None:
+    def ask(self, context: Context, newest: CalibrationStatus) -> Answer[CalibrationStatus] | None:
+        """Ask for the status with a new flange estimate."""
         estimate: FlangeEstimate = self._estimate.Eval(context)
-        status = self.status(context)
-        if estimate.sequence <= status.sequence:
-            return
+        if estimate.sequence <= newest.sequence:
+            return None
         X_BF = self._history.Eval(context).pose_at(self._arm, estimate.capture_time)
         X_BR = None if X_BF is None else X_BF @ self._X_FR
-        new = digest(status, estimate, X_BR, self._standard, self._config)
-        state.get_mutable_abstract_state(self._state).set_value(new)
-
-    def _output(self, context: Context, output: Any) -> None:
-        output.set_value(self.status(context))
+        return self.background.ask(digest, newest, estimate, X_BR, self._standard, self._config)
 
 
 def digest(

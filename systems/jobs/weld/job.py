@@ -13,7 +13,7 @@ from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformati
 from weldcal.systems.jobs.weld.calibration_pose_planner import CalibrationPosePlanner
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
 from weldcal.systems.jobs.weld.iterative_calibrator import IterativeCalibrator
-from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner
+from weldcal.systems.jobs.weld.seam_planner import DrawnSeamPlanner, SeamPlanner, SeamPlanning
 from weldcal.systems.jobs.weld.sequencer import JobSequencer
 from weldcal.systems.jobs.weld.settings import (
     calibrator_config,
@@ -129,10 +129,12 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         sequencer = wiring.add("job_sequencer", JobSequencer(times))
         command, history = sequencer.GetOutputPort("job"), spine.arm.history
         estimator = wiring.add(
-            "flange_estimator", FlangeEstimator(station.arm, X_FR, standard, X_BC_guess, c.guess_radius_mm * 1e-3)
+            "flange_estimator",
+            FlangeEstimator(station.arm, X_FR, standard, X_BC_guess, c.guess_radius_mm * 1e-3, station.background),
         )
         calibrator = wiring.add(
-            "iterative_calibrator", IterativeCalibrator(station.arm, X_FR, standard, calibrator_config(scenario))
+            "iterative_calibrator",
+            IterativeCalibrator(station.arm, X_FR, standard, calibrator_config(scenario), station.background),
         )
         status = calibrator.GetOutputPort("calibration_status")
         chooser = wiring.add("calibration_pose_planner", CalibrationPosePlanner(plan))
@@ -194,21 +196,25 @@ def _add_welding(
     planner = wiring.add(
         "seam_planner",
         kind(
-            station.arm,
-            tool,
-            station.cad,
-            spec.pose_guess.pose(),
-            config,
-            np.deg2rad(scenario.home_deg),
-            welding.clearance_mm * 1e-3,
-            None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
+            SeamPlanning(
+                station.arm,
+                tool,
+                station.cad,
+                spec.pose_guess.pose(),
+                config,
+                np.deg2rad(scenario.home_deg),
+                welding.clearance_mm * 1e-3,
+                None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
+                scenario.planning.planning_method(),
+            ),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
-            scenario.planning.planning_method(),
+            station.background,
         ),
     )
     wiring.connect(planner, scan=out("scanner.scan"), job=command, calibration_status=status)
     finger = wiring.add(
-        "deformation_estimator", ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera())
+        "deformation_estimator",
+        ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera(), station.background),
     )
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))

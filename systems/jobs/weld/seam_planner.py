@@ -1,12 +1,13 @@
 """SeamPlanner: plans the seam in the base, and the arm's approach, from a scan of the workpiece."""
 
+import dataclasses as dc
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.models.arms.inverse import nearest_solution
@@ -14,6 +15,8 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
+from weldcal.systems.background import Answer, Background
+from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
@@ -22,7 +25,31 @@ from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
 
-class SeamPlanner(LeafSystem):
+@dc.dataclass(frozen=True, eq=False)
+class SeamPlanning:
+    """What a seam is planned from besides the scan: arm, tool, nominal part and its expected pose, and the job's limits."""
+
+    arm: ArmModel
+    tool: WeldingTool
+    workpiece: Workpiece
+    X_BP_guess: RigidTransform
+    config: ServoConfig
+    q_near: NDArray[np.float64]
+    clearance_m: float
+    seam_length_m: float | None
+    method: PlanningMethod = dc.field(default_factory=PlanningMethod)
+
+    def waypoints(self, seam: SeamCurve) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Joint positions of the approach; see arm_waypoints.
+
+        Raises:
+            WeldcalError: the seam is not feasible, or out of reach.
+        """
+        check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
+        return arm_waypoints(self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m)
+
+
+class SeamPlanner(BackgroundSystem):
     """Plans the seam from the workpiece's scan, with its CAD or from the cloud only, and maps it to the base by X_BC.
 
     .. pydrake_system::
@@ -35,77 +62,69 @@ class SeamPlanner(LeafSystem):
         output_ports:
         - planned_seam
 
-    Without calibration in the job, `X_BC_known` is used, with the scan as it is.
+    Without calibration in the job, `X_BC_known` is used, with the scan as it is. The plan is made beside the control loop.
     """
 
     def __init__(
         self,
-        arm: ArmModel,
-        tool: WeldingTool,
-        workpiece: Workpiece,
-        X_BP_guess: RigidTransform,
-        config: ServoConfig,
-        q_near: NDArray[np.float64],
-        clearance_m: float,
-        seam_length_m: float | None,
+        planning: SeamPlanning,
         X_BC_known: RigidTransform | None = None,
-        method: PlanningMethod | None = None,
+        background: Background | None = None,
         period_s: float = 0.02,
     ) -> None:
-        super().__init__()
-        self._arm, self._tool, self._workpiece, self._config = arm, tool, workpiece, config
-        self._X_BP_guess, self._q_near, self._clearance_m = X_BP_guess, q_near, clearance_m
-        self._seam_length_m, self._X_BC_known = seam_length_m, X_BC_known
-        self._method = method or PlanningMethod()
+        super().__init__("planned_seam", PlannedSeam(), background, period_s)
+        self._planning, self._X_BC_known = planning, X_BC_known
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._status = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
-        self._state = self.DeclareAbstractState(AbstractValue.Make(PlannedSeam()))
-        self.DeclareStateOutputPort("planned_seam", self._state)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
-    def _update(self, context: Context, state: State) -> None:
+    def ask(self, context: Context, newest: PlannedSeam) -> Answer[PlannedSeam] | None:
+        """Ask for the plan from a new scan of the workpiece."""
         scan: Scan = self._scan.Eval(context)
         job: JobCommand = self._job.Eval(context)
-        newest: PlannedSeam = context.get_abstract_state(self._state).get_value()
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose != "workpiece":
-            return
+            return None
         X_BC, correction = self._X_BC_known, ScannerCorrection()
         if X_BC is None:
             status: CalibrationStatus = self._status.Eval(context)
             X_BC, correction = status.X_BC, status.correction
-        state.get_mutable_abstract_state(self._state).set_value(self._plan(scan, X_BC, correction))
+        return self.plan(scan, X_BC, correction)
 
-    def _plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> PlannedSeam:
-        if X_BC is None:
-            return PlannedSeam(
-                sequence=scan.sequence, reason="The seam cannot be computed in the base: the scanner is not calibrated."
-            )
-        points_C = scan.points_C.reshape(-1, 3).astype(float)
-        points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
-        points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
-        try:
-            found = plan_root(points_B, self._workpiece, self._X_BP_guess, self._method, X_BC.translation())
-            seam = seam_above(found, self._tool, self._seam_length_m)
-            check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)
-            q_start, q_above, q_retract = arm_waypoints(
-                self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m
-            )
-        except WeldcalError as error:
-            return PlannedSeam(sequence=scan.sequence, reason=str(error))
+    def plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+        """Start the plan from this scan."""
+        return self.background.ask(plan_seam, self._planning, scan, X_BC, correction)
+
+
+def plan_seam(
+    planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
+) -> PlannedSeam:
+    """Plan the seam from a scan of the part; where that fails the plan holds the reason, and no exception is raised."""
+    if X_BC is None:
         return PlannedSeam(
-            scan.sequence,
-            seam,
-            found.X_BP,
-            found.rms_m,
-            found.confidence,
-            q_start,
-            q_above,
-            q_retract,
-            points_B,
-            sigma_m=found.sigma_m,
-            summary=found.summary,
+            sequence=scan.sequence, reason="The seam cannot be computed in the base: the scanner is not calibrated."
         )
+    points_C = scan.points_C.reshape(-1, 3).astype(float)
+    points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
+    points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
+    try:
+        found = plan_root(points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation())
+        seam = seam_above(found, planning.tool, planning.seam_length_m)
+        q_start, q_above, q_retract = planning.waypoints(seam)
+    except WeldcalError as error:
+        return PlannedSeam(sequence=scan.sequence, reason=str(error))
+    return PlannedSeam(
+        scan.sequence,
+        seam,
+        found.X_BP,
+        found.rms_m,
+        found.confidence,
+        q_start,
+        q_above,
+        q_retract,
+        points_B,
+        sigma_m=found.sigma_m,
+        summary=found.summary,
+    )
 
 
 class SeamOutOfReach(WeldcalError):
@@ -183,25 +202,28 @@ class DrawnSeamPlanner(SeamPlanner):
         - planned_seam
     """
 
-    def _plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> PlannedSeam:
-        try:
-            seam = tip_seam(self._workpiece, self._X_BP_guess, self._tool, self._seam_length_m)
-            check_feasible(seam, self._tool.chord_m, self._config.weld_speed_m_s)
-            q_start, q_above, q_retract = arm_waypoints(
-                self._arm, self._tool, seam, self._config, self._q_near, self._clearance_m
-            )
-        except WeldcalError as error:
-            return PlannedSeam(sequence=scan.sequence, reason=str(error))
-        points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
-        return PlannedSeam(
-            scan.sequence,
-            seam,
-            self._X_BP_guess,
-            0.0,
-            1.0,
-            q_start,
-            q_above,
-            q_retract,
-            points_B,
-            summary="the pose of the part is from the fixture's drawing; the scan was not used",
-        )
+    def plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+        """Start the plan; of the scan only its number is used."""
+        return self.background.ask(plan_drawn_seam, self._planning, scan.sequence)
+
+
+def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
+    """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
+    try:
+        seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
+        q_start, q_above, q_retract = planning.waypoints(seam)
+    except WeldcalError as error:
+        return PlannedSeam(sequence=sequence, reason=str(error))
+    points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
+    return PlannedSeam(
+        sequence,
+        seam,
+        planning.X_BP_guess,
+        0.0,
+        1.0,
+        q_start,
+        q_above,
+        q_retract,
+        points_B,
+        summary="the pose of the part is from the fixture's drawing; the scan was not used",
+    )

@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from tests.systems.cells import EXACT_PLATE, Q_HOME, SMALL_IDEAL_SCANNER, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.workpieces import make_workpiece
-from weldcal.systems.jobs.weld.seam_planner import SeamOutOfReach, SeamPlanner, arm_waypoints, tip_seam
+from weldcal.systems.jobs.weld.seam_planner import SeamOutOfReach, SeamPlanner, SeamPlanning, arm_waypoints, tip_seam
 from weldcal.systems.jobs.weld.settings import servo_config
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
 from weldcal.welding.locate.planning import PlanningMethod
@@ -51,7 +51,10 @@ def planned(
 ) -> PlannedSeam:
     """What the system makes of one scan; the guess of the plate's place is off by some millimetres and a degree."""
     error = RigidTransform(RollPitchYaw(0.0, 0.0, np.radians(1.0)), [0.004 + offset_m, -0.003, 0.0])
-    system = SeamPlanner(the_arm(), TOOL, STRAIGHT, X_BP @ error, config, Q_HOME, CLEARANCE_M, 0.1, X_BC, method)
+    planning = SeamPlanning(
+        the_arm(), TOOL, STRAIGHT, X_BP @ error, config, Q_HOME, CLEARANCE_M, 0.1, method or PlanningMethod()
+    )
+    system = SeamPlanner(planning, X_BC)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     for name, value in {"scan": scan, "job": job, "calibration_status": CalibrationStatus()}.items():

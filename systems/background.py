@@ -1,0 +1,122 @@
+"""Runs computations that take longer than a tick: at once in a simulation, in a process of their own with a robot."""
+
+import importlib
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar
+
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.messages import Message
+
+Found = TypeVar("Found")
+
+
+class BackgroundFailed(WeldcalError):
+    """The process that computes for the cell has ended."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answer(Message, Generic[Found]):
+    """A computation under way: a system keeps it in its state and looks at each of its updates whether it is ready."""
+
+    future: "Future[Found]"
+
+    @property
+    def ready(self) -> bool:
+        """Whether the value is there. Never blocks."""
+        return self.future.done()
+
+    @property
+    def value(self) -> Found:
+        """The computed value; waits for it where it is not ready.
+
+        Raises:
+            BackgroundFailed: the computing process has ended. Otherwise what the function raised.
+        """
+        try:
+            return self.future.result()
+        except BrokenProcessPool as error:
+            raise BackgroundFailed(
+                "The process that computes beside the control loop has ended, perhaps for want of memory: "
+                "close other programs and start again."
+            ) from error
+
+
+class Background(Protocol):
+    """Computes functions of immutable, picklable arguments for the systems of a cell."""
+
+    def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """Run a function once before the arm moves, for what its first call costs: imports and compiled loops."""
+
+    def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
+        """Start a computation of a module's function. Never blocks, except in a simulation."""
+
+    def settle(self) -> None:
+        """Wait until everything that is prepared has run."""
+
+    def close(self) -> None:
+        """End what runs; a second call has no effect."""
+
+
+class Inline:
+    """Computes at once, in the caller's thread. The Diagram's time does not pass meanwhile, so the same seed gives the same run
+    on any computer."""
+
+    def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """See Background."""
+        function(*arguments)
+
+    def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
+        """See Background."""
+        future: Future[Found] = Future()
+        try:
+            future.set_result(function(*arguments))
+        except WeldcalError as error:
+            future.set_exception(error)
+        return Answer(future)
+
+    def settle(self) -> None:
+        """See Background."""
+
+    def close(self) -> None:
+        """See Background."""
+
+
+@dataclass(eq=False)
+class OwnProcess:
+    """Computes in one process with ordinary priority, beside a Diagram that keeps the pace of a robot.
+
+    A thread would share the interpreter's lock with the Diagram: each tick would wait for it. The process is spawned, not
+    forked, because a fork copies the locks of the link's and the renderer's threads.
+    """
+
+    _pool: ProcessPoolExecutor = field(
+        default_factory=lambda: ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+    )
+    _preparing: "list[Future[Any]]" = field(default_factory=list)
+
+    def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """See Background."""
+        self._preparing.append(self._pool.submit(function, *arguments))
+
+    def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
+        """See Background."""
+        return Answer(self._pool.submit(function, *arguments))
+
+    def settle(self) -> None:
+        """See Background."""
+        for future in self._preparing:
+            _ = Answer(future).value
+        self._preparing.clear()
+
+    def close(self) -> None:
+        """See Background."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def import_module(name: str) -> None:
+    """Import a module by name, for Background.prepare."""
+    importlib.import_module(name)
