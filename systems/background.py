@@ -2,9 +2,11 @@
 
 import importlib
 import multiprocessing
+import os
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -12,6 +14,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.systems.messages import Message
 
 Found = TypeVar("Found")
+NICE = -5  # three times the share of an ordinary program, and no precedence over a robot's peer that wakes up
 
 
 class BackgroundFailed(WeldcalError):
@@ -87,14 +90,16 @@ class Inline:
 
 @dataclass(eq=False)
 class OwnProcess:
-    """Computes in one process with ordinary priority, beside a Diagram that keeps the pace of a robot.
+    """Computes in one process without real-time priority, beside a Diagram that keeps the pace of a robot.
 
     A thread would share the interpreter's lock with the Diagram: each tick would wait for it. The process is spawned, not
     forked, because a fork copies the locks of the link's and the renderer's threads.
     """
 
     _pool: ProcessPoolExecutor = field(
-        default_factory=lambda: ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
+        default_factory=lambda: ProcessPoolExecutor(
+            1, mp_context=multiprocessing.get_context("spawn"), initializer=before_other_programs
+        )
     )
     _preparing: "list[Future[Any]]" = field(default_factory=list)
 
@@ -120,3 +125,9 @@ class OwnProcess:
 def import_module(name: str) -> None:
     """Import a module by name, for Background.prepare."""
     importlib.import_module(name)
+
+
+def before_other_programs(thread: int = 0) -> None:
+    """Give a thread (0: the caller's) a larger share of the processor than other programs have, where the system allows it."""
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, thread, NICE)

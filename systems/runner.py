@@ -17,7 +17,8 @@ from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.systems.motion.spine import FIRST
-from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
+from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
+from weldcal.systems.wall_clock import WallClock
 
 Progress = Callable[[str, float], None]
 LOOKS = {
@@ -90,10 +91,7 @@ class Run(Generic[JobOf]):
             "real_time_factor": self.real_time_factor(),
         }
         if self.clock is not None:
-            found["late_ms"], found["thinking_ms"] = 1e3 * self.clock.late_s, 1e3 * self.clock.thinking_s
-            found["reanchored"] = self.clock.reanchored
-            if (behind := self.clock.sentence()) is not None:
-                found["fell_behind"] = behind
+            found |= self.clock.summary()
         return found
 
 
@@ -106,7 +104,7 @@ def run_cell(
     always closed, also on Ctrl-C, which stops its arm.
     """
     simulator, station = Simulator(cell.diagram), cell.station
-    run = Run(cell, simulator, clock=None if station.pace is None else WallClock(station.pace))
+    run = Run(cell, simulator, clock=station.robot.clock)
     if realtime and run.clock is None:
         simulator.set_target_realtime_rate(1.0)
         if meshcat is not None:
@@ -150,6 +148,8 @@ def run_cell(
             if run.clock is not None:
                 around.enter_context(no_long_garbage_collections())
                 _first_pictures(cell, run.root)
+                station.background.settle()
+                around.enter_context(short_turns())
                 around.enter_context(real_time_priority())
             simulator.Initialize()
             simulator.AdvanceTo(cell.job.maximum_time_s + OVERTIME_S)

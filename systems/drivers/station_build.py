@@ -9,6 +9,7 @@ from pydrake.systems.framework import DiagramBuilder, InputPort, OutputPort
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.tool import WeldingTool
+from weldcal.systems.wall_clock import WallClock
 
 Part = TypeVar("Part")
 
@@ -24,14 +25,19 @@ class Closable(Protocol):
 class PreparedRobot:
     """The state of the robot before the station is built, as the driver's `PrepareRobot` returns it.
 
-    `q_start` (6,) rad is the arm's present configuration. `pace` is the robot's seconds of the Diagram per second of the wall
-    clock; None: the Diagram may run as fast as possible.
+    `q_start` (6,) rad is the arm's present configuration. `clock` paces the Diagram by the wall clock; None: the Diagram may run
+    as fast as possible.
     """
 
     arm: ArmModel
     q_start: np.ndarray
     handle: Closable | None = None
-    pace: float | None = None
+    clock: WallClock | None = None
+
+    @property
+    def pace(self) -> float | None:
+        """Seconds of the robot per second of the wall clock; None without a clock."""
+        return None if self.clock is None else self.clock.pace
 
     def close(self) -> None:
         """Close the resource that the driver holds open."""
@@ -56,6 +62,11 @@ class StationBuild:
     parts: Sequence[object] = ()
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
+
+    @property
+    def may_wait(self) -> bool:
+        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot."""
+        return self.robot is None or self.robot.clock is None
 
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""

@@ -19,8 +19,8 @@ from weldcal.systems.drivers.ur.off_switch import MASK, VALUE
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
-from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
+from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME

@@ -19,8 +19,8 @@ from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY, LOOP_PRIORITY
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
-from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
+from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.process import emulator_process
 
 # An address of its own: this module waits for no other.

@@ -82,6 +82,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
+from weldcal.systems.wall_clock import WallClock
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.settings import ServoConfig
 
@@ -108,7 +109,7 @@ def seam_planning() -> SeamPlanning:
 
 MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
-    UrRtdeArm: lambda: UrRtdeArm(the_arm(), StillLink(Q_HOME), 1.0),
+    UrRtdeArm: lambda: UrRtdeArm(the_arm(), StillLink(Q_HOME), WallClock(1.0)),
     DepthSensor: lambda: DepthSensor(IDEAL, 0, 0.1),
     StreamingColourCamera: lambda: StreamingColourCamera(
         RenderedFingerCamera(), 0, 0.002, lambda poses, finish: Future()

@@ -23,6 +23,7 @@ from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.messages import Image, JobCommand, Scan
 from weldcal.systems.scenario.loading import scenario_class
 from weldcal.systems.station import Station, apply_driver_config, make_station
+from weldcal.systems.wall_clock import WallClock
 
 INPUTS = {"ur10e.velocity_command", "scanner.trigger", "finger_camera.streaming"}
 OUTPUTS = {
@@ -81,7 +82,7 @@ class OpenLine:
 
 
 def found_robot() -> PreparedRobot:
-    return PreparedRobot(dc.replace(the_arm(), calibration="its own"), Q_HOME + 0.05, OpenLine(), 0.5)
+    return PreparedRobot(dc.replace(the_arm(), calibration="its own"), Q_HOME + 0.05, OpenLine(), WallClock(0.5))
 
 
 def test_a_driver_may_say_which_arm_there_is_and_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 from pydrake.systems.sensors import ImageRgba8U, RgbdSensor
 
-PICTURE_THREAD = "pictures"  # prefix of the thread names, by which their priority is set
+PICTURE_THREAD = "pictures"  # prefix of the thread names
 Pixels = NDArray[np.uint8]
 Finish = Callable[[Pixels], Pixels]
 Draw = Callable[[FramePoseVector, Finish], "Future[Pixels]"]

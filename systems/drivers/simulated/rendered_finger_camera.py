@@ -93,16 +93,18 @@ class StreamingColourCamera(LeafSystem):
         - capture_time
 
     A frame shows the world at the plant's last step, and its capture time is the time of that step. `frame_poses`
-    (FramePoseVector): poses of the bodies in the camera's scene; `draw` starts a picture of them, and the system waits for
-    the picture when the frame arrives.
+    (FramePoseVector): poses of the bodies in the camera's scene; `draw` starts a picture of them. Where it is not ready when
+    the frame arrives the system waits for it, or with `waits` off, beside a robot, the frame arrives later.
     """
 
-    def __init__(self, config: RenderedFingerCamera, seed: int, plant_period_s: float, draw: Draw) -> None:
+    def __init__(
+        self, config: RenderedFingerCamera, seed: int, plant_period_s: float, draw: Draw, waits: bool = True
+    ) -> None:
         super().__init__()
         self._config = config
         self._seed = seed
         self._plant_period_s = plant_period_s
-        self._draw = draw
+        self._draw, self._waits = draw, waits
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
         self._poses = self.DeclareAbstractInputPort("frame_poses", AbstractValue.Make(FramePoseVector()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(_Stream()))
@@ -119,6 +121,8 @@ class StreamingColourCamera(LeafSystem):
         stream: _Stream = context.get_abstract_state(self._state).get_value()
         if self._streaming.Eval(context)[0] < 0.5:
             return
+        if not self._waits and stream.frames and not stream.frames[-1].pixels.done():
+            return  # the renderer is late: this frame is dropped, so that pictures do not pile up
         now = context.get_time()
         started = stream.started if np.isfinite(stream.started) else now
         hidden = self._config.hidden_from_s is not None and now - started >= self._config.hidden_from_s
@@ -136,7 +140,7 @@ class StreamingColourCamera(LeafSystem):
             np.ceil(now / step - 1e-6) - 1.0
         ) * step  # at the time of a tick the plant's outputs still show the previous step
         frame = _Exposed(Image(stream.count + 1, taken, exposed_at=now), pixels)
-        kept = 2 + int(self._config.latency_s * self._config.rate_hz)  # enough frames to cover the latency
+        kept = 4 + int(self._config.latency_s * self._config.rate_hz)  # enough frames to cover the latency
         new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
         state.get_mutable_abstract_state(self._state).set_value(new)
 
@@ -144,6 +148,7 @@ class StreamingColourCamera(LeafSystem):
         stream: _Stream = context.get_abstract_state(self._state).get_value()
         now = context.get_time()
         ripe = [e for e in stream.frames if now >= e.frame.exposed_at + self._config.latency_s - 1e-9]
+        ripe = [e for e in ripe if self._waits or e.pixels.done()]
         return dc.replace(ripe[-1].frame, pixels=ripe[-1].pixels.result()) if ripe else Image()
 
     def _image(self, context: Context, output: Any) -> None:
@@ -171,7 +176,9 @@ def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None
     view.apart.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     worker = PictureWorker(view.apart, sensor)
     stream = build.builder.AddSystem(
-        StreamingColourCamera(config, int(build.rng.integers(2**31)), world.plant.time_step(), worker.draw)
+        StreamingColourCamera(
+            config, int(build.rng.integers(2**31)), world.plant.time_step(), worker.draw, build.may_wait
+        )
     )
     stream.set_name("finger_camera")
     build.builder.Connect(view.poses.GetOutputPort("frame_poses"), stream.GetInputPort("frame_poses"))

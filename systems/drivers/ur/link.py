@@ -12,6 +12,7 @@ import threading
 import time
 import weakref
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +43,6 @@ class LinkState:
     robot_time: float
     sampled_at: float
     age_s: float
-    status: UrStatus
     fault: Fault
     fault_time: float
     sent: int
@@ -53,6 +53,36 @@ class LinkState:
     clock_residual_s: float
     clock_drift: float
     process_on: bool = False  # process output as reported by the controller
+    detail: float = 0.0  # of the fault
+    robot_mode: int = 7
+    safety_mode: int = 1
+    program_running: bool = True
+    speed_scaling: float = 1.0
+
+    @property
+    def codes(self) -> tuple[float, ...]:
+        """The numbers that `status_of` reads."""
+        running = float(self.program_running)
+        return float(self.robot_mode), float(self.safety_mode), running, self.speed_scaling, self.fault, self.detail
+
+    @property
+    def status(self) -> UrStatus:
+        """The state of the controller in words."""
+        return status_of(self.codes)
+
+
+@lru_cache(maxsize=64)
+def status_of(codes: tuple[float, ...]) -> UrStatus:
+    """The state of the controller in words, from robot mode, safety mode, running (0 or 1), speed scaling, fault and its detail."""
+    robot_mode, safety_mode, running, scaling, code, detail = codes
+    fault = Fault(int(code))
+    return UrStatus(
+        robot_mode=ROBOT_MODES.get(int(robot_mode), "UNKNOWN"),
+        safety_mode=SAFETY_MODES.get(int(safety_mode), "UNKNOWN"),
+        program_running=running > 0.5,
+        speed_scaling=scaling,
+        fault=None if fault is Fault.NONE else sentence(fault, detail),
+    )
 
 
 class UrLink:
@@ -157,13 +187,6 @@ class UrLink:
         paused = found[_AT["runtime_state"]] in (PAUSING, PAUSED)
         if fault is not Fault.NONE and (paused or ACTIONS.get(fault, Action.LEAVE) in (Action.STOP, Action.LEAVE)):
             self._see_to_the_stop()
-        status = UrStatus(
-            robot_mode=ROBOT_MODES.get(int(found[_AT["robot_mode"]]), "UNKNOWN"),
-            safety_mode=SAFETY_MODES.get(int(found[_AT["safety_mode"]]), "UNKNOWN"),
-            program_running=found[_AT["runtime_state"]] == PLAYING and fault is Fault.NONE,
-            speed_scaling=found[_AT["speed_scaling"]],
-            fault=None if fault is Fault.NONE else sentence(fault, detail),
-        )
         q, qd = (np.array(found[_AT[name] : _AT[name] + 6]) for name in ("q0", "qd0"))
         sampled_at = found[_AT["host_time"]]
         return LinkState(
@@ -172,7 +195,6 @@ class UrLink:
             found[_AT["robot_time"]],
             sampled_at,
             now - sampled_at,
-            status,
             fault,
             fault_time,
             int(found[_AT["number"]]),
@@ -183,6 +205,11 @@ class UrLink:
             found[_AT["residual"]],
             found[_AT["drift"]],
             found[_AT["process"]] > 0.5,
+            detail,
+            int(found[_AT["robot_mode"]]),
+            int(found[_AT["safety_mode"]]),
+            found[_AT["runtime_state"]] == PLAYING and fault is Fault.NONE,
+            found[_AT["speed_scaling"]],
         )
 
     def close(self) -> None:

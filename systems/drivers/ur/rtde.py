@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, EventStatus, LeafSystem, State
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, EventStatus, LeafSystem
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.errors import InputError
@@ -14,10 +14,11 @@ from weldcal.systems.addresses import controller_address, is_loopback
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
-from weldcal.systems.drivers.ur.link import UrLink
+from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import Limits
+from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
 STILL_RAD_S = 1e-9
@@ -67,51 +68,55 @@ class UrRtdeArm(LeafSystem):
     update less the sample's age, computed from robot time mapped to host time. `desired_state` (12) rad, rad/s is the
     predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
     feedthrough.
+    On a computer that is late the clock's `rate` is below 1: velocities are sent, and read, in proportion to it.
     `process_on` (1) switches the torch's digital output, where one is wired; unconnected means off.
     """
 
     def __init__(
-        self, arm: ArmModel, link: UrLink, pace: float, period_s: float = 0.002, send_s: float = 0.004
+        self, arm: ArmModel, link: UrLink, clock: WallClock, period_s: float = 0.002, send_s: float = 0.004
     ) -> None:
         super().__init__()
-        self._arm, self._link, self._pace, self._period_s = arm, link, pace, period_s
+        self._arm, self._link, self._clock, self._period_s = arm, link, clock, period_s
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._process = self.DeclareVectorInputPort("process_on", 1)
-        # q, qd, sample time, desired q, desired qd
-        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6)])
+        # q, qd, sample time, desired q, desired qd, codes of the status: numbers only, because an update of abstract state
+        # would make Drake copy and compute everything anew, 500 times a second
+        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6), found.codes])
         vector = self.DeclareDiscreteState(start)
-        self._said = self.DeclareAbstractState(AbstractValue.Make(found.status))
         ticket = {self.discrete_state_ticket(vector)}
         self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
         self.DeclareVectorOutputPort("position_measured", 6, self._position, ticket)
         self.DeclareVectorOutputPort("velocity_measured", 6, self._velocity, ticket)
         self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
         self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
-        self.DeclareStateOutputPort("status", self._said)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._read)
+        self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(found.status), self._status, ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._read)
         self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
 
-    def _read(self, context: Context, state: State) -> None:
+    def _read(self, context: Context, discrete: DiscreteValues) -> None:
         found = self._link.state()
         old = context.get_discrete_state_vector().value()
-        sampled = max(context.get_time() - self._pace * found.age_s, float(old[12]))
+        rate = self._clock.rate
+        sampled = max(context.get_time() - self._clock.pace * rate * found.age_s, float(old[12]))
+        qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
-        desired = np.clip(found.q + ahead * found.qd, self._arm.position_lower, self._arm.position_upper)
-        new = np.concatenate([found.q, found.qd, [sampled], desired, found.qd])
-        state.get_mutable_discrete_state(0).set_value(new)
-        if found.status != context.get_abstract_state(self._said).get_value():
-            state.get_mutable_abstract_state(self._said).set_value(found.status)
+        desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
+        discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, found.codes]))
 
     def _send(self, context: Context) -> EventStatus:
         wanted = np.array(self._command.Eval(context))
         # at rest exactly zero is sent: only then may the cell compute without a time limit
         process = self._process.HasValue(context) and bool(self._process.Eval(context)[0] > 0.5)
-        self._link.command(np.zeros(6) if np.abs(wanted).max() < STILL_RAD_S else wanted, process)
+        moving = (
+            not np.abs(wanted).max() < STILL_RAD_S
+        )  # so that what is no number reaches the worker, which refuses it
+        self._clock.velocity_leaves(context.get_time(), moving)
+        self._link.command(self._clock.rate * wanted if moving else np.zeros(6), process)
         return EventStatus.Succeeded()
 
     def _desired(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(context.get_discrete_state_vector().value()[13:])
+        output.SetFromVector(context.get_discrete_state_vector().value()[13:25])
 
     def _position(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[:6])
@@ -121,6 +126,9 @@ class UrRtdeArm(LeafSystem):
 
     def _pose(self, context: Context, output: Any) -> None:
         output.set_value(forward_kinematics(self._arm, context.get_discrete_state_vector().value()[:6]))
+
+    def _status(self, context: Context, output: Any) -> None:
+        output.set_value(status_of(tuple(context.get_discrete_state_vector().value()[25:])))
 
     def _time(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
@@ -158,14 +166,14 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         payload_cog_m=(x, y, z),
         process_output=config.process_output,
     )
-    return PreparedRobot(arm, link.state().q, link, config.pace)
+    return PreparedRobot(arm, link.state().q, link, WallClock(config.pace))
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     """Add the arm with its link; the simulated arm follows the real one, for the rendered sensors."""
-    if build.robot is None or not isinstance(build.robot.handle, UrLink):
+    if build.robot is None or not isinstance(build.robot.handle, UrLink) or build.robot.clock is None:
         raise RuntimeError("the robot was not prepared")
-    arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, config.pace))
+    arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, build.robot.clock))
     arm.set_name("ur10e_link")
     if (world := build.find(SimulatedWorld)) is not None:
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from weldcal.systems.drivers.ur.faults import Fault, sentence
+from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState
-from weldcal.systems.messages import UrStatus
 
 
 class StillLink:
@@ -21,8 +20,6 @@ class StillLink:
 
     def state(self) -> LinkState:
         """What a worker would have written."""
-        text = None if self.fault is Fault.NONE else sentence(self.fault)
-        status = UrStatus(program_running=self.fault is Fault.NONE, fault=text)
         counts = {"sent": 0, "heard": 0, "late_periods": 0}
         times = dict.fromkeys(
             ("fault_time", "echo_latency_s", "worst_period_s", "clock_residual_s", "clock_drift"), 0.0
@@ -33,8 +30,8 @@ class StillLink:
             robot_time=0.0,
             sampled_at=0.0,
             age_s=self.age_s,
-            status=status,
             fault=self.fault,
+            program_running=self.fault is Fault.NONE,
             **counts,
             **times,
         )

@@ -11,6 +11,7 @@ from tests.systems.drivers.still_link import StillLink
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
+from weldcal.systems.wall_clock import WallClock
 
 Q = np.array([0.0, -1.4, 1.9, -2.1, -1.6, 0.0])
 
@@ -24,7 +25,8 @@ class Driven:
     """The system alone in a simulator."""
 
     def __init__(self, link: StillLink, pace: float = 1.0) -> None:
-        self.system = UrRtdeArm(load_arm(), link, pace)
+        self.clock = WallClock(pace)
+        self.system = UrRtdeArm(load_arm(), link, self.clock)
         self.simulator = Simulator(self.system)
         self.tell(np.zeros(6))
 

@@ -19,8 +19,9 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
-from weldcal.systems.pacing import WallClock, no_long_garbage_collections, real_time_priority
+from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.process import HOST, emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
@@ -166,8 +167,8 @@ class StreamReport:
 
 def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_progress) -> StreamReport:
     """Moves the arm for so long, paced by the wall clock; ends early where the link latches a fault."""
-    builder = DiagramBuilder()
-    robot = builder.AddNamedSystem("robot", UrRtdeArm(arm, cast(UrLink, tap), 1.0, READ_S, 1.0 / RATE_HZ))
+    builder, clock = DiagramBuilder(), WallClock(1.0)
+    robot = builder.AddNamedSystem("robot", UrRtdeArm(arm, cast(UrLink, tap), clock, READ_S, 1.0 / RATE_HZ))
     frequencies = np.full(6, 2.0 * np.pi * SWING_HZ)
     swing = builder.AddNamedSystem("swing", Sine(SWING, frequencies, np.zeros(6), True))
     steps = builder.AddNamedSystem("steps", TrajectorySource(_steps(seconds)))
@@ -176,7 +177,7 @@ def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_
     builder.Connect(steps.get_output_port(), both.get_input_port(1))
     builder.Connect(both.get_output_port(), robot.GetInputPort("velocity_command"))
     diagram = builder.Build()
-    simulator, clock = Simulator(diagram), WallClock(1.0)
+    simulator = Simulator(diagram)
 
     def watch(root: Context) -> EventStatus:
         now = root.get_time()

@@ -1,0 +1,131 @@
+"""Paces the Diagram by the wall clock: waits while it is ahead, slows the path while it is late, counts how late each tick was."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+LATE_S = 0.020  # of robot time: a longer delay is not made up for
+LIMITS_MS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0)  # upper limits of the histogram's bins; the last bin has none
+ON_TIME_MS = 4.0
+# The path's rate falls from 1 at SLOW_FROM_S late by 1 per SLOW_SPAN_S, no faster than FALL_PER_S, and rises by RISE_PER_S.
+# A computer that manages half of the rate then settles 4 ms late, within one period of the commands.
+SLOW_FROM_S, SLOW_SPAN_S = 0.0015, 0.005
+FALL_PER_S, RISE_PER_S = 10.0, 2.0  # at 1 rad/s a fall adds 10 rad/s^2, within the acceleration that the link allows
+SLOWEST = 0.1
+
+
+@dataclass
+class Lateness:
+    """A histogram of how late velocities left the Diagram while the arm moved, in robot time."""
+
+    counts: list[int] = field(default_factory=lambda: [0] * (len(LIMITS_MS) + 1))
+    worst_ms: float = 0.0
+
+    def add(self, late_ms: float) -> None:
+        """Count one velocity."""
+        self.counts[sum(late_ms >= limit for limit in LIMITS_MS)] += 1
+        self.worst_ms = max(self.worst_ms, late_ms)
+
+    @property
+    def on_time_percent(self) -> float:
+        """Share of the velocities that were less than ON_TIME_MS late."""
+        total = sum(self.counts)
+        return 100.0 * sum(self.counts[: LIMITS_MS.index(ON_TIME_MS) + 1]) / total if total else 100.0
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object: limits and counts of the bins (one more than limits), the share on time, and the worst."""
+        return {
+            "limits_ms": list(LIMITS_MS),
+            "velocities": list(self.counts),
+            "under_4_ms_percent": self.on_time_percent,
+            "worst_ms": self.worst_ms,
+        }
+
+
+class WallClock:
+    """Advances the Diagram's time at `pace` seconds per second of the wall clock, or slower.
+
+    `rate` is the Diagram's seconds per second of the robot. It is 1 on a computer that keeps up. On a late one it falls, and
+    the driver scales each velocity by it: the path stays the same, and the arm follows it more slowly, as with the speed
+    slider. A single delay of more than LATE_S is never made up for, because a robot executes commands when they arrive: the
+    Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the arm was commanded to move,
+    `thinking_s` the maximum while it was at rest, where computing time is not limited. `reanchored` counts the delays of more
+    than LATE_S during motion, and `lost_s` is their sum.
+    """
+
+    def __init__(
+        self, pace: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self.pace, self._clock, self._sleep = pace, clock, sleep
+        self._due = 0.0  # wall clock at which the Diagram's time is _at
+        self._at: float | None = None
+        self.rate, self.slowest_rate = 1.0, 1.0
+        self.slowed_s = 0.0
+        self.late_s = 0.0
+        self.thinking_s = 0.0
+        self.reanchored = 0
+        self.lost_s = 0.0
+        self.lateness = Lateness()
+
+    def wait_for(self, diagram_time: float, moving: bool) -> None:
+        """Wait until the wall clock reaches this time of the Diagram. `moving`: the arm is commanded to move."""
+        now = self._clock()
+        if self._at is None:
+            self._due, self._at = now, diagram_time
+        step = diagram_time - self._at
+        self._due += step / (self.pace * self.rate)
+        self._at = diagram_time
+        late = (now - self._due) * self.pace
+        self._set_rate(step, late, moving)
+        if late <= 0.0:
+            self._sleep(self._due - now)
+            return
+        if moving:
+            self.late_s = max(self.late_s, late)
+        else:
+            self.thinking_s = max(self.thinking_s, late)
+        if late > LATE_S:
+            self._due = now
+            self.reanchored += int(moving)
+            self.lost_s += late if moving else 0.0
+
+    def velocity_leaves(self, diagram_time: float, moving: bool) -> None:
+        """Count how late a velocity of this time of the Diagram leaves it; one at rest is not counted."""
+        if moving and self._at is not None:
+            due = self._due + (diagram_time - self._at) / (self.pace * self.rate)
+            self.lateness.add(max(1e3 * (self._clock() - due) * self.pace, 0.0))
+
+    def _set_rate(self, step: float, late: float, moving: bool) -> None:
+        wanted = min(max(1.0 - (late - SLOW_FROM_S) / SLOW_SPAN_S, SLOWEST), 1.0)
+        # a single long delay says nothing about the rate that the computer can keep
+        if not moving or late > LATE_S:
+            wanted = 1.0
+        robot_step = step / self.rate
+        self.slowed_s += robot_step - step
+        self.rate = min(max(wanted, self.rate - FALL_PER_S * robot_step), self.rate + RISE_PER_S * robot_step)
+        self.slowest_rate = min(self.slowest_rate, self.rate)
+
+    def summary(self) -> dict[str, object]:
+        """The JSON values of a paced run."""
+        found: dict[str, object] = {
+            "late_ms": 1e3 * self.late_s,
+            "thinking_ms": 1e3 * self.thinking_s,
+            "reanchored": self.reanchored,
+            "tick_lateness": self.lateness.summary(),
+            "slowed_to_percent": 100.0 * self.slowest_rate,
+            "slowed_s": self.slowed_s,
+        }
+        if (behind := self.sentence()) is not None:
+            found["fell_behind"] = behind
+        return found
+
+    def sentence(self) -> str | None:
+        """A warning where the run did not keep up with its robot; None where it did."""
+        if not self.reanchored:
+            return None
+        times = "once" if self.reanchored == 1 else f"{self.reanchored} times"
+        return (
+            f"The computer fell behind the robot {times} while the arm moved, by {1e3 * self.lost_s:.0f} ms in all. "
+            "The arm slowed down during that time, and the times of the run are too short by the same amount. "
+            "Close other programs."
+        )
