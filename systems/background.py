@@ -14,7 +14,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.systems.messages import Message
 
 Found = TypeVar("Found")
-NICE = -5  # three times the share of an ordinary program, and no precedence over a robot's peer that wakes up
+NICE = -10  # nine times the share of an ordinary program, and no precedence over a robot's peer that wakes up
 
 
 class BackgroundFailed(WeldcalError):

@@ -10,7 +10,7 @@ ON_TIME_MS = 4.0
 # The path's rate falls from 1 at SLOW_FROM_S late by 1 per SLOW_SPAN_S, no faster than FALL_PER_S, and rises by RISE_PER_S.
 # A computer that manages half of the rate then settles 4 ms late, within one period of the commands.
 SLOW_FROM_S, SLOW_SPAN_S = 0.0015, 0.005
-FALL_PER_S, RISE_PER_S = 10.0, 2.0  # at 1 rad/s a fall adds 10 rad/s^2, within the acceleration that the link allows
+FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 rad/s^2 to them, and the link allows 40
 SLOWEST = 0.1
 
 

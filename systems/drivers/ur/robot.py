@@ -21,6 +21,7 @@ from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, Robot
 
 RTDE_PORT = 30004
 START_LIMIT_S = 8.0
+EXCUSED_S = 0.5
 ALWAYS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", "speed_scaling")
 
 
@@ -93,6 +94,7 @@ class Robot:
         self._sockets = _sockets_to(RTDE_PORT)
         self._switch = None if output is None else self._off_switch(host, output)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
+        self._excused = 0.0
         self._sent: dict[float, float] = {}
         self._number = 0.0
         self._heard = self._first_unheard = 0.0
@@ -151,7 +153,7 @@ class Robot:
             if robot_time == receive.getTimestamp():
                 break
         if robot_time != self._robot_time:
-            self._robot_time, self._fresh_at = robot_time, now
+            self._robot_time, self._fresh_at, self._excused = robot_time, now, 0.0
             self.clock.update(robot_time, now)
         self._listen(echo, now)
         return RobotSample(
@@ -168,6 +170,13 @@ class Robot:
             float(np.linalg.norm(kinematics_and_jacobian(self._arm, q)[1] - np.array(pose[:3]))),
             now - self._first_unheard if self._sent else 0.0,
         )
+
+    def excuse(self, seconds: float) -> None:
+        """Do not count this time, in which the process was suspended, as silence of the robot; at most EXCUSED_S in a row."""
+        seconds = min(seconds, max(EXCUSED_S - self._excused, 0.0))
+        self._excused += seconds
+        self._fresh_at += seconds
+        self._first_unheard += seconds
 
     def _connected(self) -> bool:
         """Whether both connections are still those of the start; ur_rtde reconnects by itself and then reports no error."""

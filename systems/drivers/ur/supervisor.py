@@ -46,6 +46,7 @@ class Limits:
     acceleration: Array
     stale_s: float = 0.040
     late_s: float = 0.050
+    lost_s: float = 0.5  # the arm is at rest since late_s
     deaf_s: float = 0.080
     jump_s: float = 0.5
     braking: float = 5.0
@@ -56,7 +57,12 @@ class Limits:
     def slowed(self, pace: float) -> Limits:
         """The same limits where the controller runs at `pace` seconds per host second."""
         return replace(
-            self, stale_s=self.stale_s / pace, late_s=self.late_s / pace, deaf_s=self.deaf_s / pace, pace=pace
+            self,
+            stale_s=self.stale_s / pace,
+            late_s=self.late_s / pace,
+            lost_s=self.lost_s / pace,
+            deaf_s=self.deaf_s / pace,
+            pace=pace,
         )
 
 
@@ -88,6 +94,12 @@ class Command:
     stop: bool = False
     orphaned: bool = False  # the cell's process has ended
     process: bool = False  # the process output is enabled
+    scale: float = 1.0  # of the velocity while the command is late
+
+    @property
+    def scaled_qd(self) -> Array:
+        """The velocity (6,) rad/s that is sent."""
+        return np.asarray(self.scale * self.qd)
 
 
 @dataclass(frozen=True)
@@ -127,6 +139,10 @@ class Supervisor:
         if self.latched.fault is Fault.NONE and (command.stop or command.orphaned):
             return Decision(Action.BRAKE)
         return self.latched
+
+    def excuse(self) -> None:
+        """Forget where the commands lead: for some time none was sent, and the guard has slowed the arm."""
+        self._reference = None
 
     def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
         for look in (self._link(now, robot), self._safety(robot), self._program(robot)):
@@ -191,19 +207,22 @@ class Supervisor:
         if share.max() > 1.0 + 1e-9:
             return Fault.COMMAND_TOO_FAST, float(np.abs(command.qd)[int(np.argmax(share))])
         late = now - command.given_at
-        if command.qd.any() and late > limits.late_s and not (command.stop or command.orphaned):
+        # a late command slows the arm to rest within late_s; a torch may not burn there
+        longest = limits.late_s if command.process else limits.lost_s
+        if command.qd.any() and late > longest and not (command.stop or command.orphaned):
             return Fault.COMMAND_LATE, 1e3 * late
         if command.number != self._command.number:
             # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip commands
             passed = limits.pace * max(command.given_at - self._command.given_at, 0.0)
             if passed > MADE_UP_FOR_S:
                 passed = limits.pace * (now - self._stepped_at)
-            jump = np.abs(command.qd - self._command.qd)
+            jump = np.abs(command.scaled_qd - self._command.scaled_qd)
             if (jump > limits.acceleration * (passed + 0.02)).any():
                 return Fault.COMMAND_JUMPED, float(jump.max())
-        ahead = robot.q + command.qd * np.abs(command.qd) / (2.0 * limits.braking) + 0.05 * command.qd
-        outside = (ahead > limits.position_upper - limits.position_margin) & (command.qd > 0.0)
-        outside |= (ahead < limits.position_lower + limits.position_margin) & (command.qd < 0.0)
+        qd = command.scaled_qd
+        ahead = robot.q + qd * np.abs(qd) / (2.0 * limits.braking) + 0.05 * qd
+        outside = (ahead > limits.position_upper - limits.position_margin) & (qd > 0.0)
+        outside |= (ahead < limits.position_lower + limits.position_margin) & (qd < 0.0)
         if outside.any():
             return Fault.JOINT_LIMIT, float(np.argmax(outside) + 1)
         return self._tracking(now, robot, command)
@@ -215,8 +234,10 @@ class Supervisor:
             self._reference, self._referred_at = robot.q.copy(), now
         dt = limits.pace * min(now - self._referred_at, 0.1)
         self._referred_at = now
-        self._reference = self._reference + dt * self._command.qd + (robot.q - self._reference) * min(dt / 0.5, 1.0)
+        self._reference = (
+            self._reference + dt * self._command.scaled_qd + (robot.q - self._reference) * min(dt / 0.5, 1.0)
+        )
         apart = float(np.abs(self._reference - robot.q).max())
-        # commands and state together have up to 40 ms of delay
+        # commands and state together have up to 40 ms of delay; the arm may still have the speed of before the scaling
         allowed = limits.tracking_rad + 0.04 * float(np.abs(command.qd).max())
         return (Fault.TRACKING, apart) if apart > allowed else (Fault.NONE, 0.0)

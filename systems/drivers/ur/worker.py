@@ -12,7 +12,7 @@ import pickle
 import signal
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -23,6 +23,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.precedence import poll_beside_the_cell, take_priority
 from weldcal.systems.drivers.ur.shared import Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
+from weldcal.systems.drivers.ur.time_scale import TimeScale
 
 if TYPE_CHECKING:
     from weldcal.systems.drivers.ur.robot import Robot
@@ -64,6 +65,7 @@ class Worker:
     def __init__(self, config: WorkerConfig, memory: Memory) -> None:
         self._config, self._memory = config, memory
         self._supervisor = Supervisor(config.limits)
+        self._scale = TimeScale(config.limits.pace)
         self._phase = Phase.STARTING
         self._fault_time = 0.0
         self._worst = 0.0
@@ -87,11 +89,14 @@ class Worker:
             self._worst = max(self._worst, now - last)
             self._late += now - last > period + LATE_PASS_S
             if now - last > LATE_PASS_S:
-                # the whole process was suspended: let the receiving thread read the pending data before the checks
+                # this process was suspended: let the receiving thread read the pending data before the checks, and count
+                # only the time in which the data could have been read
                 time.sleep(0.003)
+                robot.excuse(now - last)
+                self._supervisor.excuse()
                 now = time.monotonic()
             last, deadline = now, max(deadline + period, now)
-            sample, command = robot.sample(now), self._command()
+            sample, command = robot.sample(now), self._scaled(self._command(), now)
             decision = self._supervisor.step(now, sample, command)
             if decision.fault is not Fault.NONE and self._fault_time == 0.0:
                 self._fault_time = now
@@ -120,11 +125,15 @@ class Worker:
         number, given_at, stop, process, *qd = found
         return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
 
+    def _scaled(self, command: Command, now: float) -> Command:
+        """The command with the factor that slows the arm while it is late."""
+        return replace(command, scale=self._scale.step(now, now - command.given_at))
+
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
             process = command.process and now - command.given_at <= self._config.limits.late_s
-            if not robot.send(command.qd, ACCELERATION, process):
+            if not robot.send(command.scaled_qd, ACCELERATION, process):
                 self._phase = Phase.STOPPED  # the next sample shows the cause
         elif decision.action is Action.STOP:
             robot.forget()

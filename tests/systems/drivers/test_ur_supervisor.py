@@ -44,7 +44,7 @@ VELOCITY = np.array([0.1, 0.0, -0.05, 0.0, 0.0, 0.1])
 class Rig:
     """A supervisor at 250 Hz, an arm that follows its commands, a cell that gives one every 8 ms; `lag_s` is the arm's."""
 
-    def __init__(self, limits: Limits = LIMITS, velocity: np.ndarray = VELOCITY) -> None:
+    def __init__(self, limits: Limits = LIMITS, velocity: np.ndarray = VELOCITY, *, process: bool = False) -> None:
         self.supervisor = Supervisor(limits)
         self.now, self.velocity, self.lag_s = 1000.0, velocity, 0.0
         self.pace = limits.pace
@@ -61,7 +61,7 @@ class Rig:
             guard=OBEYING,
             connected=True,
         )
-        self.command = Command(1, self.now, velocity)
+        self.command = Command(1, self.now, velocity, process=process)
 
     def passes(self, seconds: float, *, state: bool = True, commands: bool = True) -> Decision:
         """So long with or without new states and commands; the last decision."""
@@ -153,8 +153,12 @@ def test_a_state_that_stays_the_same_is_stale_after_40_ms(rig: Rig) -> None:
     assert 40.0 < decision.detail < 45.0
 
 
-def test_a_command_that_grows_old_while_the_arm_moves_brakes_it_after_50_ms(rig: Rig) -> None:
-    assert rig.passes(0.044, commands=False) == Decision(Action.SEND)
+@pytest.mark.parametrize(("process", "limit_s"), [(True, 0.05), (False, 0.5)])
+def test_a_command_that_grows_old_brakes_a_burning_torch_at_once_and_an_arm_that_was_slowed_to_rest_later(
+    process: bool, limit_s: float
+) -> None:
+    rig = Rig(process=process)
+    assert rig.passes(limit_s - 0.006, commands=False) == Decision(Action.SEND)
     decision = rig.passes(0.016, commands=False)
     assert (decision.action, decision.fault) == (Action.BRAKE, Fault.COMMAND_LATE)
 
