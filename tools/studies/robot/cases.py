@@ -40,6 +40,7 @@ class Case:
     watch_s: float = 0.6
     rest_s: float = REST_S
     wrist_3: float = 0.0
+    may_rest: bool = False  # GO, and the arm may rest for a moment
     elsewhere: bool = False  # link and commands in a process of their own
     says: str = ""  # what a refusal's sentence must contain
     random: bool = True  # also in the random sequences
@@ -126,7 +127,11 @@ RUNNING: tuple[Case, ...] = (
     _stops("commanding connection closed", _fault("close_tcp", index=1), LINK, short=False),
     _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
-    _stops("controller ignores commands for 60 ms", _fault("mute_input", seconds=0.06), DEAF, short=False),
+    # the guard slows the arm, and the next number gives it its speed back
+    Case("numbers 15 ms late", _fault("mute_input", seconds=0.015), GO, may_rest=True),
+    Case("numbers 30 ms late", _fault("mute_input", seconds=0.030), GO, may_rest=True, short=False),
+    Case("numbers 60 ms late", _fault("mute_input", seconds=0.060), GO, may_rest=True, short=False),
+    Case("numbers 120 ms late", _fault("mute_input", seconds=0.120), GO, may_rest=True),
     _either("one byte wrong in a package", _fault("corrupt", n=1), ALL, *CLEAR),
     _either("bytes wrong in 20 packages", _fault("corrupt", n=20), ALL, *CLEAR, short=False),
     _either("one package of a wrong size", _fault("wrong_size", n=1), ALL, *CLEAR),

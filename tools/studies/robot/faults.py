@@ -113,7 +113,7 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
     at = case.throw(bench)
     time.sleep(GOING_S)
     if case.must != STOP:
-        paused = bench.at_rest_after(at, REST_S)["rest_after_s"] is not None and case.must == GO
+        paused = case.must == GO and not case.may_rest and bench.at_rest_after(at, REST_S)["rest_after_s"] is not None
         if not paused and bench.stream.state.fault is Fault.NONE:
             speed = bench.tool_speed()
             problems = () if abs(speed - SPEED_M_S) < 0.1 * SPEED_M_S else (f"its speed is {speed:.4f} m/s",)
