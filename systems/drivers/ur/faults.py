@@ -55,7 +55,7 @@ SENTENCES = {
     Fault.JOINT_LIMIT: "JOINT LIMIT: joint {detail:.0f} would have reached its limit; start the job from another arm configuration.",
     Fault.TRACKING: "TRACKING: a joint is {detail:.3f} rad from where its commands lead; check payload, speed slider and that nothing holds the arm.",
     Fault.POSE_MISMATCH: "POSE: the controller's pose is {detail:.2f} mm off that of the joints; set the TCP to zero in Installation > General > TCP.",
-    Fault.SPEED_SLIDER: "SPEED SLIDER: the speed slider stands at {detail:.0f} %; move it to 100 % on the pendant and start again.",
+    Fault.SPEED_SLIDER: "SPEED SLIDER: the controller lets {detail:.0f} % of the speed through; move the speed slider to 100 % on the pendant and start again.",
     Fault.GUARD_LATCHED: "GUARD: the script on the controller stopped the arm, {reason}; check the cable and the load of this computer, then start again.",
     Fault.PROCESS_OUTPUT: "PROCESS OUTPUT: the torch's output {reason}; find what else writes it "
     "(a program, a PLC, Modbus, an action in Installation > I/O), stop that and start again.",

@@ -55,6 +55,11 @@ def _sends(twist: Callable[[Array], Array], seconds: float = 0.05) -> Callable[[
     return lambda bench: bench.send(twist, seconds)
 
 
+def _slider(percent: int) -> Callable[[Bench], float]:
+    """The slider alone: the scaling that a controller reports beside it stays at 100 %."""
+    return _fault("speed_scaling", value=0.01 * percent)
+
+
 def _joint(number: int, speed: float) -> Array:
     qd: Array = speed * np.eye(6)[number]
     return qd
@@ -159,6 +164,11 @@ RUNNING: tuple[Case, ...] = (
     _stops("program paused", _fault("pause_program"), Fault.PROGRAM_PAUSED),
     _stops("program replaced", _fault("replace_program"), ALL),
     _stops("speed slider to 50 % in 0.2 s", _fault("speed_scaling", value=0.5, ramp=0.2), Fault.SPEED_SLIDER),
+    *(
+        _stops(f"speed slider to {percent} %", _slider(percent), Fault.SPEED_SLIDER, short=percent in (10, 90))
+        for percent in (10, 30, 50, 70, 90)
+    ),
+    _stops("trajectory limiter at 60 %", _fault("limiter", value=0.6), Fault.SPEED_SLIDER, short=False),
     _stops("speed slider to 0", _fault("speed_scaling", value=0.0), Fault.SPEED_SLIDER, short=False),
     _either("arm follows 0.1 s late", _fault("tracking_lag", seconds=0.1), {Fault.TRACKING}, short=False),
     _stops("arm is held fast", _fault("tracking_lag", seconds=1e6), Fault.TRACKING, watch_s=1.0),

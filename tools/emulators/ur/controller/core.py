@@ -177,7 +177,7 @@ class Controller(ControllerState):
         playing = self.runtime_state == RuntimeState.PLAYING and self.ready
         driven = playing and self.program is not None and self.program.owner is not None
         try:
-            self.arm.step(driven, self.speed_scaling)
+            self.arm.step(driven, self.motion_scaling)
         except MotionRefused as refused:
             self.protective_stop(str(refused))
         if not driven and self.arm.at_rest:

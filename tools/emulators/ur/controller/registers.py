@@ -55,6 +55,7 @@ class Terminals:
         self.analog_outputs = [0.0, 0.0]
         self.analog_output_types = 0
         self.speed_slider = 1.0
+        self.limiter = 1.0  # of the trajectory: what RTDE calls speed_scaling
 
     def set_digital(self, first: int, mask: int, value: int) -> None:
         """Sets the outputs that `mask` names, counted from `first` (0 standard, 8 configurable, 16 tool)."""

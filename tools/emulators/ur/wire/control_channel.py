@@ -75,6 +75,7 @@ class ControlServer(Server):
             "local_mode": lambda r, now: setattr(c, "remote", False),
             "registers_in_use": lambda r, now: rtde.claim_elsewhere([str(n) for n in r.get("names", ())]),
             "speed_scaling": self._slider,
+            "limiter": lambda r, now: setattr(c.terminals, "limiter", _number(r, "value")),
             "timestamp_jump": lambda r, now: setattr(c, "timestamp", max(0.0, c.timestamp + _number(r, "seconds"))),
             "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
             "jitter": lambda r, now: setattr(self._world, "jitter_s", _number(r, "seconds")),
@@ -194,7 +195,7 @@ class ControlServer(Server):
         c.set_safety_mode(SafetyMode.NORMAL)
         c.robot_mode, c.remote, c.refuse_upload = RobotMode.RUNNING, True, False
         c.start_delay_s, c.clock_rate, c.tool_contact_steps = 0.0, 1.0, 0
-        c.terminals.speed_slider, c.arm.lag_s = 1.0, 0.0
+        c.terminals.speed_slider, c.terminals.limiter, c.arm.lag_s = 1.0, 1.0, 0.0
         c.set_tcp([0.0] * 6)
 
     def _close(self, request: Request, *, reset: bool) -> None:
