@@ -332,6 +332,16 @@ def test_the_trajectory_limiter_scales_the_motion_too(robot: Emulator) -> None:
     assert row["actual_qd"][0] == pytest.approx(0.25 * SPEED_RAD_S, rel=1e-3)
 
 
+def test_another_client_writes_an_output_in_every_frame_for_a_while(robot: Emulator) -> None:
+    robot.fault("replace_program", script="def p():\nwhile True:\nset_standard_digital_out(2, False)\nsync()\nend\nend")
+    at = robot.fault("set_digital_out", n=2, on=True, seconds=0.1, latch=False)
+    time.sleep(0.25)
+    found = robot.ask(check="output_on_after", fault_time=at, output=2)
+    assert found["on_s"] == pytest.approx(0.1, abs=0.005)
+    assert found["last_on_s"] == pytest.approx(0.1, abs=0.02)
+    assert robot.ask(check="output_on_after", fault_time=at, output=5)["last_on_s"] is None
+
+
 def test_the_clock_may_jump_and_run_fast(robot: Emulator) -> None:
     with Rtde().watch("timestamp", "control_step") as client:
         first = client.next()

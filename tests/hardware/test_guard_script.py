@@ -16,7 +16,7 @@ from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.versions import parse_version
 
-OBEYING, STALE, SILENT, TOO_FAST = 1, 2, 3, 4
+OBEYING, STALE, TOO_FAST, SILENT = 1, 2, 4, 5
 MOVE_J, MOVE_L, SPEED_J, SPEED_STOP, PAYLOAD, TCP, STOP = 1, 3, 9, 15, 17, 29, 255
 
 

@@ -79,8 +79,9 @@ SENTENCES = {
 
 # codes that the guard script writes into its output register when it latches
 GUARD_REASONS = {
-    3: "because no new command came for 40 ms (torch on) or 150 ms (torch off)",
+    3: "because no new command came for 40 ms while the torch was on",
     4: "because a joint velocity was too high",
+    5: "because no new command came for 150 ms",
 }
 
 
