@@ -312,14 +312,34 @@ def test_the_speed_slider_ramps_and_scales_the_motion(robot: Emulator) -> None:
         client.next()
         robot.fault("speed_scaling", value=0.25, ramp=0.1, latch=False)
         rows = client.during(0.2)
-    scaling = np.array([row["speed_scaling"] for row in rows])
+    scaling = np.array([row["target_speed_fraction"] for row in rows])
     assert (scaling[0] > 0.9, scaling[-1]) == (True, 0.25)
     assert np.diff([row["timestamp"] for row in rows]) == pytest.approx(FRAME_S)
     # 0.75 over 50 frames, the first of them too
     assert np.diff([1.0, *scaling]).min() == pytest.approx(-0.015)
     assert np.diff(scaling).max() <= 0.0
-    assert rows[-1]["target_speed_fraction"] == 0.25
+    assert {row["speed_scaling"] for row in rows} == {1.0}  # the limiter's, in which no controller shows its slider
     assert rows[-1]["actual_qd"][0] == pytest.approx(0.25 * SPEED_RAD_S, rel=1e-3)
+
+
+def test_the_trajectory_limiter_scales_the_motion_too(robot: Emulator) -> None:
+    move(robot)
+    robot.fault("speed_scaling", value=0.5, latch=False)
+    robot.fault("limiter", value=0.5, latch=False)
+    with Rtde().watch("speed_scaling", "target_speed_fraction", "actual_qd") as client:
+        row = client.during(0.2)[-1]
+    assert (row["speed_scaling"], row["target_speed_fraction"]) == (0.5, 0.5)
+    assert row["actual_qd"][0] == pytest.approx(0.25 * SPEED_RAD_S, rel=1e-3)
+
+
+def test_another_client_writes_an_output_in_every_frame_for_a_while(robot: Emulator) -> None:
+    robot.fault("replace_program", script="def p():\nwhile True:\nset_standard_digital_out(2, False)\nsync()\nend\nend")
+    at = robot.fault("set_digital_out", n=2, on=True, seconds=0.1, latch=False)
+    time.sleep(0.25)
+    found = robot.ask(check="output_on_after", fault_time=at, output=2)
+    assert found["on_s"] == pytest.approx(0.1, abs=0.005)
+    assert found["last_on_s"] == pytest.approx(0.1, abs=0.02)
+    assert robot.ask(check="output_on_after", fault_time=at, output=5)["last_on_s"] is None
 
 
 def test_the_clock_may_jump_and_run_fast(robot: Emulator) -> None:

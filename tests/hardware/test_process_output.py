@@ -15,6 +15,7 @@ from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenari
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.errors import RobotRefused
+from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.off_switch import MASK, VALUE
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
@@ -33,11 +34,12 @@ OUTPUT = 3
 HOST = "127.0.0.47"  # an address of its own: this module waits for no other
 TURNING = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
 BASE = 24
-SPEED_J, MOVE_J, SPEED_STOP, END = 9, 1, 15, 255
+SILENT = 3
+SPEED_J, SPEED_STOP, END = 9, 15, 255
 
 
 class Guarded:
-    """The guard in a controller, frame by frame; a half behind the number asks for the process."""
+    """The guard in a controller, frame by frame; a negative number asks for the process."""
 
     def __init__(self, output: int | None = OUTPUT) -> None:
         self.controller = Controller(load_arm(), np.array(HOME), parse_version("5.21"))
@@ -62,7 +64,7 @@ class Guarded:
     def speed(self, qd: Sequence[float], frames: int, process: bool) -> None:
         for _ in range(frames):
             self.number += 1.0
-            self.write(SPEED_J, [*qd, 40.0, self.number + 0.5 * process])
+            self.write(SPEED_J, [*qd, 40.0, -self.number if process else self.number])
             self.frames(1)
 
     @property
@@ -105,7 +107,7 @@ def silence(guarded: Guarded) -> None:
 
 def stale_number(guarded: Guarded) -> None:
     for _ in range(60):
-        guarded.write(SPEED_J, [*TURNING, 40.0, guarded.number + 0.5])
+        guarded.write(SPEED_J, [*TURNING, 40.0, -guarded.number])
         guarded.frames(1)
 
 
@@ -123,13 +125,8 @@ def told_to_end(guarded: Guarded) -> None:
     guarded.frames(60)
 
 
-def another_move(guarded: Guarded) -> None:
-    guarded.write(MOVE_J, [*HOME, 1.0, 3.0])
-    guarded.frames(60)
-
-
 def watchdog(guarded: Guarded) -> None:
-    guarded.frames(60, fed=False)
+    guarded.frames(120, fed=False)
 
 
 def program_stopped(guarded: Guarded) -> None:
@@ -138,7 +135,7 @@ def program_stopped(guarded: Guarded) -> None:
 
 
 @pytest.mark.parametrize(
-    "stop", [silence, stale_number, too_fast, told_to_stop, told_to_end, another_move, watchdog, program_stopped]
+    "stop", [silence, stale_number, too_fast, told_to_stop, told_to_end, watchdog, program_stopped]
 )
 def test_whatever_brakes_the_arm_turns_the_process_off_first(stop: Callable[[Guarded], None]) -> None:
     guarded = Guarded()
@@ -149,14 +146,30 @@ def test_whatever_brakes_the_arm_turns_the_process_off_first(stop: Callable[[Gua
     assert guarded.off_before_slower()
 
 
-def test_an_arm_at_rest_keeps_its_guard_without_numbers_but_not_its_arc() -> None:
+@pytest.mark.parametrize("qd", [TURNING, [0.0] * 6], ids=["moving", "at rest"])
+def test_a_torch_that_silence_turned_off_stays_off_whatever_comes(qd: Sequence[float]) -> None:
     guarded = Guarded()
-    guarded.speed([0.0] * 6, 50, process=True)
+    guarded.speed(qd, 50, process=True)
     guarded.frames(19)
     assert guarded.on
     guarded.frames(3)  # 44 ms
     assert not guarded.on
     assert guarded.controller.runtime_state == RuntimeState.PLAYING
+    assert guarded.controller.outputs.integers[BASE + 12] == SILENT
+    guarded.speed(qd, 100, process=True)
+    assert not any(on for on, _ in guarded.history[-100:])
+
+
+def test_the_output_is_written_in_every_frame() -> None:
+    guarded = Guarded()
+    guarded.speed(TURNING, 20, process=False)
+    guarded.controller.submit(f"sec theirs():\nset_standard_digital_out({OUTPUT}, True)\nend\n")
+    guarded.speed(TURNING, 20, process=False)
+    assert not any(on for on, _ in guarded.history[-20:])
+    guarded.speed(TURNING, 20, process=True)
+    guarded.controller.terminals.digital_outputs = 0
+    guarded.speed(TURNING, 1, process=True)
+    assert guarded.on
 
 
 @pytest.fixture(scope="module")
@@ -191,6 +204,7 @@ FAULTS: dict[str, tuple[Callable[[Bench], float], float]] = {
     # deadman's 40 ms, or the 50 ms after which the worker calls a silent cell late; each with what a busy computer adds
     "the cell wants it off": (lambda b: (setattr(b.stream, "process", False), time.monotonic())[1], 0.05),
     "the cell falls silent": (lambda b: b.send(lambda qd: None, 1e9), 0.12),
+    "numbers 60 ms late": (lambda b: b.emulator.fault("mute_input", seconds=0.06), 0.06),
     "protective stop": (lambda b: b.emulator.fault("protective_stop"), 0.06),
     "emergency stop": (lambda b: b.emulator.fault("estop"), 0.06),
     "program stopped": (lambda b: b.emulator.fault("stop_program"), 0.06),
@@ -208,10 +222,18 @@ def test_the_torch_goes_out_before_the_arm_stops(burning: Bench, name: str) -> N
     off = answer["off_after_s"]
     assert isinstance(off, float)
     assert off < limit_s, answer
-    if name in ("the cell falls silent", "connection reset", "worker killed", "program stopped"):
+    if name in ("numbers 60 ms late", "the cell falls silent", "connection reset", "worker killed", "program stopped"):
         frames = answer["frames_before_braking"]
         assert isinstance(frames, int)
         assert frames >= 0, answer
+
+
+def test_numbers_30_ms_late_leave_the_torch_on_and_the_arm_at_its_speed(burning: Bench) -> None:
+    at = burning.emulator.fault("mute_input", seconds=0.03)
+    answer = answer_of(burning, at)
+    assert answer["off_after_s"] is None, answer
+    assert answer["slows_after_s"] is None or answer["slows_after_s"] > 0.06, answer
+    assert burning.stream.state.fault is Fault.NONE
 
 
 def test_the_stock_clients_output_reaches_the_terminals_and_the_state_stream(bench: Bench) -> None:

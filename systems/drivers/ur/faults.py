@@ -22,6 +22,7 @@ class Fault(IntEnum):
     POSE_MISMATCH = 16
     SPEED_SLIDER = 17
     GUARD_LATCHED = 18
+    PROCESS_OUTPUT = 19
     PROTECTIVE_STOP = 20
     SAFEGUARD_STOP = 21
     EMERGENCY_STOP = 22
@@ -36,6 +37,7 @@ class Fault(IntEnum):
     START_FAILED = 33
     TCP_NOT_ZERO = 34
     OUTPUT_IN_USE = 35
+    PAYLOAD_NOT_SET = 36
 
 
 SENTENCES = {
@@ -53,8 +55,10 @@ SENTENCES = {
     Fault.JOINT_LIMIT: "JOINT LIMIT: joint {detail:.0f} would have reached its limit; start the job from another arm configuration.",
     Fault.TRACKING: "TRACKING: a joint is {detail:.3f} rad from where its commands lead; check payload, speed slider and that nothing holds the arm.",
     Fault.POSE_MISMATCH: "POSE: the controller's pose is {detail:.2f} mm off that of the joints; set the TCP to zero in Installation > General > TCP.",
-    Fault.SPEED_SLIDER: "SPEED SLIDER: the speed slider stands at {detail:.0f} %; move it to 100 % on the pendant and start again.",
+    Fault.SPEED_SLIDER: "SPEED SLIDER: the controller lets {detail:.0f} % of the speed through; move the speed slider to 100 % on the pendant and start again.",
     Fault.GUARD_LATCHED: "GUARD: the script on the controller stopped the arm, {reason}; check the cable and the load of this computer, then start again.",
+    Fault.PROCESS_OUTPUT: "PROCESS OUTPUT: the torch's output {reason}; find what else writes it "
+    "(a program, a PLC, Modbus, an action in Installation > I/O), stop that and start again.",
     Fault.PROTECTIVE_STOP: "PROTECTIVE STOP: look for the cause, press Enable Robot on the pendant after 5 s, and start again.",
     Fault.SAFEGUARD_STOP: "SAFEGUARD STOP: close the safeguard, press its reset, and start again.",
     Fault.EMERGENCY_STOP: "EMERGENCY STOP: release the button, switch the arm on and release its brakes on the pendant, and start again.",
@@ -67,6 +71,7 @@ SENTENCES = {
     Fault.UPLOAD_REFUSED: "The controller did not start the guard script: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
     Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",
     Fault.TCP_NOT_ZERO: "The TCP could not be set to zero: set it to zero in Installation > General > TCP on the pendant and start again.",
+    Fault.PAYLOAD_NOT_SET: "The controller did not take the payload: set it in Installation > General > Payload on the pendant and start again.",
     Fault.OUTPUT_IN_USE: "The digital output of the process (robot.process_output) is taken: close the other RTDE client or fieldbus that writes the outputs.",
     Fault.START_FAILED: "The worker process of the robot link could not start; run `weldcal check-robot` and try again.",
 }
@@ -74,12 +79,17 @@ SENTENCES = {
 
 # codes that the guard script writes into its output register when it latches
 GUARD_REASONS = {
-    3: "because no new command came for 40 ms",
+    3: "because no new command came for 40 ms while the torch was on",
     4: "because a joint velocity was too high",
-    5: "because a velocity came in the middle of a move",
+    5: "because no new command came for 150 ms",
 }
+
+
+# the detail of a PROCESS_OUTPUT fault: the output's level
+OUTPUT_REASONS = {0: "is off although it should be on", 1: "went on although it should be off"}
 
 
 def sentence(fault: Fault, detail: float = 0.0) -> str:
     """The message of a fault, with the operator action."""
-    return SENTENCES[fault].format(detail=detail, reason=GUARD_REASONS.get(int(detail), "for an unknown reason"))
+    reasons = OUTPUT_REASONS if fault is Fault.PROCESS_OUTPUT else GUARD_REASONS
+    return SENTENCES[fault].format(detail=detail, reason=reasons.get(int(detail), "for an unknown reason"))

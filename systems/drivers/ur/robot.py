@@ -6,7 +6,9 @@ import socket
 import stat
 import sys
 import tempfile
+import threading
 import time
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -17,12 +19,25 @@ from weldcal.systems.drivers.ur.clock import ClockMap
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.off_switch import OffSwitch
+from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
 
 RTDE_PORT = 30004
 START_LIMIT_S = 8.0
 EXCUSED_S = 0.5
-ALWAYS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", "speed_scaling")
+ONLY_WITH_OUTPUT = "# only with an output"
+READ_BACK = ("tcp_offset", "payload", "payload_cog")
+READ_BACK_LIMIT_S = 1.0
+SCALINGS = ("speed_scaling", "target_speed_fraction")
+ALWAYS = ("timestamp", "actual_q", "actual_qd", "robot_mode", "safety_mode", "runtime_state", *SCALINGS)
+
+
+def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[float]) -> bool:
+    """Whether the controller reports this payload, within what it may round: 0.01 kg and 1 mm."""
+    if not {"payload", "payload_cog"} <= found.keys():
+        return False
+    mass, cog = np.array(found["payload"]), np.array(found["payload_cog"])
+    return bool(abs(mass - mass_kg) <= 0.0101 and np.abs(cog - np.array(cog_m)).max() <= 1.01e-3)
 
 
 class Refused(Exception):
@@ -38,7 +53,10 @@ def guard_script(upper_registers: bool, output: int | None = None) -> str:
     standard digital output of the process, None where none is wired.
     """
     text = files("weldcal.systems.drivers.ur").joinpath("guard.script").read_text(encoding="utf-8")
-    if output is not None:
+    if output is None:
+        # a controller may refuse a program for the name of a function that it never calls
+        text = "".join(line for line in text.splitlines(keepends=True) if ONLY_WITH_OUTPUT not in line)
+    else:
         text = text.replace("global output = -1", f"global output = {output}")
     if upper_registers:
         return text
@@ -60,6 +78,15 @@ def _sockets_to(port: int) -> dict[int, int]:
     return found
 
 
+def _send_at_once(descriptors: Iterable[int]) -> None:
+    """Send every package when it is written. ur_rtde leaves Nagle's algorithm on: where the controller's packages are lost, and
+    with them its acknowledgements, commands would wait for up to 40 ms.
+    """
+    for descriptor in descriptors:
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as copy:
+            copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
 class Robot:
     """Both ur_rtde interfaces, the clock map and the newest complete package."""
 
@@ -68,6 +95,7 @@ class Robot:
         from rtde_control import RTDEControlInterface
         from rtde_receive import RTDEReceiveInterface
 
+        self._host = host
         self._word = 36 if upper else 12
         self._script = guard_script(upper, output)
         self._output = output
@@ -81,8 +109,8 @@ class Robot:
             *ALWAYS,
             "actual_TCP_pose",
             f"output_int_register_{self._word}",
-            # echo of the newest command number, and the TCP read back
-            *(f"output_double_register_{self._word + i}" for i in range(7)),
+            # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
+            *(f"output_double_register_{self._word + i}" for i in range(3)),
             *(() if output is None else ("actual_digital_output_bits",)),
         ]
         try:
@@ -92,10 +120,12 @@ class Robot:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
         self._sockets = _sockets_to(RTDE_PORT)
+        _send_at_once(self._sockets)
         self._switch = None if output is None else self._off_switch(host, output)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._excused = 0.0
         self._sent: dict[float, float] = {}
+        self._passes, self._passed_at = -1.0, 0.0
         self._number = 0.0
         self._heard = self._first_unheard = 0.0
         self.echo_latency = 0.0
@@ -128,33 +158,48 @@ class Robot:
             Path(file.name).unlink(missing_ok=True)
 
     def set_load(self, mass_kg: float, cog_m: list[float]) -> None:
-        """Set the payload, and read back the TCP, which the guard has set to zero."""
+        """Set the payload, then read it back, and the TCP, which the guard has set to zero."""
         if not self.control.setPayload(mass_kg, cog_m):
             raise Refused(Fault.START_FAILED)
-        # the register in which the client expects the answer depends on the controller's version: read our own registers
-        self.control.getTCPOffset()
-        asked = self.receive.getTimestamp()
-        until = time.monotonic() + 0.5 / self._pace
-        while self.receive.getTimestamp() - asked < 0.008 and time.monotonic() < until:
+        found: dict[str, Value] = {}
+        reader = threading.Thread(target=self._read_back, args=(found, mass_kg, cog_m), daemon=True)
+        reader.start()
+        while reader.is_alive():
             self.control.kickWatchdog()
-            time.sleep(0.002)
-        offset = [self.receive.getOutputDoubleRegister(self._word + 1 + i) for i in range(6)]
-        if np.abs(offset).max() > 1e-6:
+            reader.join(0.01)
+        if np.abs(np.array(found.get("tcp_offset", np.inf))).max() > 1e-6:
             raise Refused(Fault.TCP_NOT_ZERO)
+        if not same_payload(found, mass_kg, cog_m):
+            raise Refused(Fault.PAYLOAD_NOT_SET)
+
+    def _read_back(self, found: dict[str, Value], mass_kg: float, cog_m: list[float]) -> None:
+        """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
+        waits for a package. ur_rtde cannot read the TCP, and not all of its getters wait for their answer.
+        """
+        until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
+        with contextlib.suppress(RobotUnreachable), RtdeProbe(self._host) as probe:
+            while True:
+                found.update(probe.read(READ_BACK))
+                if same_payload(found, mass_kg, cog_m) or time.monotonic() > until:
+                    return
+                time.sleep(0.01)
 
     def sample(self, now: float) -> RobotSample:
         """The newest sample, all fields of one package."""
-        receive = self.receive
+        receive, word = self.receive, self._word
         for _ in range(5):
             robot_time = float(receive.getTimestamp())
             q, qd = np.array(receive.getActualQ()), np.array(receive.getActualQd())
             pose = receive.getActualTCPPose()
-            echo = float(receive.getOutputDoubleRegister(self._word))
+            echo, lost_s, passes = (float(receive.getOutputDoubleRegister(word + i)) for i in range(3))
+            process_on = None if self._output is None else self.process_on
             if robot_time == receive.getTimestamp():
                 break
         if robot_time != self._robot_time:
             self._robot_time, self._fresh_at, self._excused = robot_time, now, 0.0
             self.clock.update(robot_time, now)
+        if passes != self._passes:
+            self._passes, self._passed_at = passes, robot_time
         self._listen(echo, now)
         return RobotSample(
             robot_time,
@@ -164,11 +209,16 @@ class Robot:
             int(receive.getRobotMode()),
             int(receive.getSafetyMode()),
             int(receive.getRuntimeState()),
-            float(receive.getSpeedScaling()),
-            int(receive.getOutputIntRegister(self._word)),
+            # the slider is in the second one; the first is the limiter's
+            float(receive.getSpeedScaling()) * float(receive.getTargetSpeedFraction()),
+            int(receive.getOutputIntRegister(word)),
             self._connected(),
             float(np.linalg.norm(kinematics_and_jacobian(self._arm, q)[1] - np.array(pose[:3]))),
             now - self._first_unheard if self._sent else 0.0,
+            lost_s,
+            robot_time - self._passed_at,
+            process_on,
+            echo < 0.0,
         )
 
     def excuse(self, seconds: float) -> None:
@@ -194,10 +244,10 @@ class Robot:
             self._first_unheard = min(self._sent.values(), default=now)
 
     def send(self, qd: np.ndarray, acceleration: float, process: bool = False) -> bool:
-        """Send one velocity, numbered for the guard's watchdog; a number plus one half enables the process. Returns False where
-        the program does not run.
+        """Send one velocity, numbered for the guard's watchdog; a negative number enables the process. Returns False where the
+        program does not run.
         """
-        self._number = np.floor(self._number) % 1_000_000.0 + (1.5 if process else 1.0)
+        self._number = (abs(self._number) % 1_000_000.0 + 1.0) * (-1.0 if process else 1.0)
         now = time.monotonic()
         if not self._sent:
             self._first_unheard = now
@@ -218,7 +268,7 @@ class Robot:
     def numbers(self) -> tuple[float, float, float]:
         """Number of the newest command sent, its time, and the newest number that the guard has read."""
         sent_at = self._sent.get(self._number, 0.0)
-        return self._number, sent_at, float(self.receive.getOutputDoubleRegister(self._word))
+        return abs(self._number), sent_at, abs(float(self.receive.getOutputDoubleRegister(self._word)))
 
     def forget(self) -> None:
         """Clear the command register: a call while the program does not run writes zero."""

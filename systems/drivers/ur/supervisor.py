@@ -17,6 +17,13 @@ PLAYING, PAUSING, PAUSED = 2, 3, 4
 # states that the guard script writes into its output register
 OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time
+# of the controller's time: the guard shows a pass in every frame
+GUARD_SILENT_S = 0.08
+# The guard writes its number and the output in the same frame. A terminal may follow 5 frames later, and number and output may
+# be of two packages, 2 frames apart: after 10 frames an output that is on without being asked for is somebody else's.
+OUTPUT_ON_S = 0.020
+# The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
+OUTPUT_OFF_S = 0.050
 
 
 class Action(IntEnum):
@@ -31,7 +38,7 @@ class Action(IntEnum):
 ACTIONS = {
     **dict.fromkeys((Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF, Fault.CLOCK_JUMPED), Action.LEAVE),
     Fault.STATE_IMPLAUSIBLE: Action.LEAVE,
-    **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault <= Fault.GUARD_LATCHED},
+    **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault < Fault.PROTECTIVE_STOP},
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
 }
 
@@ -47,7 +54,7 @@ class Limits:
     stale_s: float = 0.040
     late_s: float = 0.050
     lost_s: float = 0.5  # the arm is at rest since late_s
-    deaf_s: float = 0.080
+    deaf_s: float = 0.200  # later than the guard, which latches after 150 ms without a number
     jump_s: float = 0.5
     braking: float = 5.0
     tracking_rad: float = 0.01
@@ -77,11 +84,15 @@ class RobotSample:
     robot_mode: int
     safety_mode: int
     runtime_state: int
-    speed_scaling: float
+    speed_scaling: float  # the product of the slider's and the limiter's
     guard: int
     connected: bool
     pose_error_m: float = 0.0
     unheard_s: float = 0.0  # time for which the guard script has read no newer command
+    lost_s: float = 0.0  # time for which the guard script has kept the arm from moving, since its start
+    guard_silent_s: float = 0.0  # of the controller's time, since the newest pass of the guard script
+    process_on: bool | None = None  # the process output; None where none is wired
+    process_asked: bool = False  # whether the newest number that the guard script has read asks for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +132,10 @@ class Supervisor:
         self._stepped_at = 0.0
         self._reference: Array | None = None
         self._referred_at = 0.0
+        self._lost_s = 0.0
         self._slow_since: float | None = None
+        self._asked, self._asked_at = False, -np.inf
+        self._off_since: float | None = None
         self.latched = Decision(Action.SEND)
 
     def step(self, now: float, robot: RobotSample, command: Command) -> Decision:
@@ -145,7 +159,7 @@ class Supervisor:
         self._reference = None
 
     def _look(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
-        for look in (self._link(now, robot), self._safety(robot), self._program(robot)):
+        for look in (self._link(now, robot), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
         return self._motion(now, robot, command)
@@ -192,11 +206,31 @@ class Supervisor:
             return Fault.GUARD_LATCHED, float(robot.guard)
         return Fault.NONE, 0.0
 
+    def _output(self, robot: RobotSample) -> tuple[Fault, float]:
+        """Compare the process output with what the guard script was asked for; both are of one package."""
+        if robot.process_on is None:
+            return Fault.NONE, 0.0
+        if robot.process_asked != self._asked or self._last is None:
+            self._asked, self._asked_at = robot.process_asked, robot.robot_time
+        if robot.process_on and not self._asked and robot.robot_time - self._asked_at > OUTPUT_ON_S:
+            return Fault.PROCESS_OUTPUT, 1.0
+        if robot.process_on or not self._asked:
+            self._off_since = None
+        else:
+            self._off_since = robot.robot_time if self._off_since is None else self._off_since
+            if robot.robot_time - self._off_since > OUTPUT_OFF_S:
+                return Fault.PROCESS_OUTPUT, 0.0
+        return Fault.NONE, 0.0
+
     def _motion(self, now: float, robot: RobotSample, command: Command) -> tuple[Fault, float]:
         limits = self._limits
         if robot.unheard_s > limits.deaf_s:
             return Fault.CONTROLLER_DEAF, 1e3 * robot.unheard_s
-        self._slow_since = (self._slow_since or now) if robot.speed_scaling < 0.99 else None
+        if robot.guard_silent_s > GUARD_SILENT_S:
+            return Fault.CONTROLLER_DEAF, 1e3 * robot.guard_silent_s
+        # only of an arm that is to move: the scaling may ramp up when a program starts
+        slow = robot.speed_scaling < 0.99 and bool(command.qd.any())
+        self._slow_since = (self._slow_since or now) if slow else None
         if self._slow_since is not None and now - self._slow_since > limits.late_s:
             return Fault.SPEED_SLIDER, 100.0 * robot.speed_scaling
         if robot.pose_error_m > 5e-5:
@@ -233,10 +267,10 @@ class Supervisor:
         if self._reference is None:
             self._reference, self._referred_at = robot.q.copy(), now
         dt = limits.pace * min(now - self._referred_at, 0.1)
-        self._referred_at = now
-        self._reference = (
-            self._reference + dt * self._command.scaled_qd + (robot.q - self._reference) * min(dt / 0.5, 1.0)
-        )
+        kept_s = min(max(robot.lost_s - self._lost_s, 0.0), 0.1)  # the guard slows the arm where numbers come late
+        self._referred_at, self._lost_s = now, robot.lost_s
+        led = (dt - kept_s) * self._command.scaled_qd
+        self._reference = self._reference + led + (robot.q - self._reference) * min(dt / 0.5, 1.0)
         apart = float(np.abs(self._reference - robot.q).max())
         # commands and state together have up to 40 ms of delay; the arm may still have the speed of before the scaling
         allowed = limits.tracking_rad + 0.04 * float(np.abs(command.qd).max())

@@ -104,7 +104,8 @@ OF_THE_SAMPLE = [
     ({"robot_time": 150.0}, Fault.CLOCK_JUMPED),
     ({"q": np.full(6, 0.5)}, Fault.STATE_IMPLAUSIBLE),
     ({"q": np.full(6, np.nan)}, Fault.STATE_IMPLAUSIBLE),
-    ({"unheard_s": 0.081}, Fault.CONTROLLER_DEAF),
+    ({"unheard_s": 0.201}, Fault.CONTROLLER_DEAF),
+    ({"guard_silent_s": 0.081}, Fault.CONTROLLER_DEAF),
     ({"safety_mode": PROTECTIVE}, Fault.PROTECTIVE_STOP),
     ({"safety_mode": RECOVERY}, Fault.RECOVERY_MODE),
     ({"safety_mode": SAFEGUARD}, Fault.SAFEGUARD_STOP),
@@ -189,6 +190,51 @@ def test_a_slider_that_stays_slow_is_a_fault(rig: Rig) -> None:
     decisions = [rig.one(speed_scaling=0.5) for _ in range(15)]
     assert decisions[0] == Decision(Action.SEND)
     assert decisions[-1] == Decision(Action.BRAKE, Fault.SPEED_SLIDER, 50.0)
+
+
+def test_a_slider_is_judged_while_the_arm_is_to_move() -> None:
+    rig = Rig(velocity=np.zeros(6))
+    assert all(rig.one(speed_scaling=0.5) == Decision(Action.SEND) for _ in range(50))  # ramps up when a program starts
+    rig.velocity = VELOCITY
+    assert [rig.one(speed_scaling=0.5) for _ in range(15)][-1].fault is Fault.SPEED_SLIDER
+
+
+ON = {"process_on": True, "process_asked": True}
+
+
+def test_an_output_that_goes_on_without_being_asked_for_is_a_fault_in_the_first_sample(rig: Rig) -> None:
+    assert rig.one(process_on=False) == Decision(Action.SEND)
+    rig.passes(0.1)
+    decision = rig.one(process_on=True)
+    assert decision == Decision(Action.BRAKE, Fault.PROCESS_OUTPUT, 1.0)
+    assert "went on" in sentence(decision.fault, decision.detail)
+
+
+def test_an_output_that_goes_off_unasked_is_a_fault_once_the_guard_would_have_said_so(rig: Rig) -> None:
+    for _ in range(25):
+        assert rig.one(**ON) == Decision(Action.SEND)  # type: ignore[arg-type]
+    decisions = [rig.one(process_on=False, process_asked=True) for _ in range(15)]
+    assert decisions[12] == Decision(Action.SEND)  # 48 ms
+    assert decisions[-1] == Decision(Action.BRAKE, Fault.PROCESS_OUTPUT, 0.0)
+    assert "is off" in sentence(decisions[-1].fault, decisions[-1].detail)
+
+
+def test_an_output_that_follows_its_command_some_frames_later_is_none(rig: Rig) -> None:
+    for k in range(100):  # on and off, each for 0.1 s, shown 16 ms later
+        assert rig.one(process_asked=k % 50 < 25, process_on=(k - 4) % 50 < 25 and k >= 4) == Decision(Action.SEND)
+
+
+def test_an_arm_that_the_guard_slows_is_where_it_is_expected() -> None:
+    for told, fault in ((True, Fault.NONE), (False, Fault.TRACKING)):
+        rig = Rig(velocity=np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        rig.passes(0.3)
+        decision, start_s, lost_s = Decision(Action.SEND), rig.now, 0.0
+        while rig.now < start_s + 0.2:  # it stands still for the second tenth of a second
+            if rig.now > start_s + 0.1:
+                lost_s += PERIOD_S
+                rig._led = rig._led - PERIOD_S * rig.velocity
+            decision = rig.one(lost_s=lost_s if told else 0.0)
+        assert decision.fault is fault
 
 
 def test_reduced_mode_goes_on(rig: Rig) -> None:
@@ -287,6 +333,7 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
     seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
     seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
+    seen |= {Fault.PROCESS_OUTPUT}
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)

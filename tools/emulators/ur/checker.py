@@ -136,6 +136,14 @@ class Checker:
             "on_again_s": seconds(again),
         }
 
+    def output_on_after(self, fault_time: float, output: int) -> dict[str, Any]:
+        """For how long a digital output was on after a point in time (s), and when it was on for the last time (None: never)."""
+        rows = self._rows()
+        rows = rows[rows[:, TIME] >= fault_time]
+        on = (rows[:, OUTPUTS].astype(np.int64) >> output & 1).astype(bool)
+        last = float(rows[np.flatnonzero(on)[-1], TIME] - fault_time) * self._pace if on.any() else None
+        return {"ok": True, "on_s": float(on.sum() * STEP_S), "last_on_s": last}
+
     def summary(self) -> dict[str, Any]:
         """Counts since the start."""
         return {

@@ -28,6 +28,7 @@ STROKE_M = 0.04  # to either side of where the arm starts
 RUNWAY_M = 0.022  # left before the turn where a fault is thrown in: 0.44 s at full speed
 DIRECTION = np.array([0.0, 0.6, 0.8])
 CRUISE_LIMIT_S = 8.0
+OUTPUT = 3  # the digital output of the process
 
 
 class StoppedUnasked(WeldcalError):
@@ -96,7 +97,7 @@ class Stream(threading.Thread):
     @property
     def cruising(self) -> bool:
         """The arm goes at full speed and will for a while."""
-        going = self.state.fault is Fault.NONE and self.state.sent > 25
+        going = self.state.fault is Fault.NONE and self.state.sent > 25 and self.state.process_on == self.process
         return going and self._stroke.cruising and float(np.abs(self.state.qd).max()) > 0.05
 
 
@@ -120,8 +121,10 @@ class Bench:
         assert self._stream is not None, "start it first"
         return self._stream
 
-    def start(self, *, look: bool = False) -> None:
+    def start(self, *, look: bool = False, wired: bool = False, process: bool = False) -> None:
         """Acknowledge faults, then start a new link (`look`: with pre-flight checks) and the command stream.
+
+        `wired`: with a process output, also where the bench has none; `process`: it is asked for.
 
         Raises:
             RobotRefused: the controller is not ready.
@@ -131,8 +134,10 @@ class Bench:
         self.emulator.do("reset_checker")
         config = UrRtde(host=self.host)
         limits = config.limits(self.arm)
-        self.link = UrLink.start(self.host, self.arm, limits, payload_kg=config.payload_kg, process_output=self.output)
+        output = OUTPUT if wired or process else self.output
+        self.link = UrLink.start(self.host, self.arm, limits, payload_kg=config.payload_kg, process_output=output)
         self._stream = Stream(self.link, self.arm, self.home)
+        self._stream.process = process
         self._stream.start()
 
     def start_elsewhere(self) -> list[int]:

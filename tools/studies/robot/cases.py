@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.tools.studies.robot.bench import Bench
+from weldcal.tools.studies.robot.bench import OUTPUT, Bench
 
 STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3
@@ -40,6 +40,10 @@ class Case:
     watch_s: float = 0.6
     rest_s: float = REST_S
     wrist_3: float = 0.0
+    may_rest: bool = False  # GO, and the arm may rest for a moment
+    wired: bool = False  # with a process output
+    process: bool = False  # with a process output that is on
+    burns_s: float = 0.0  # how long after the fault the process output may be on
     elsewhere: bool = False  # link and commands in a process of their own
     says: str = ""  # what a refusal's sentence must contain
     random: bool = True  # also in the random sequences
@@ -52,6 +56,20 @@ def _fault(name: str, **values: object) -> Callable[[Bench], float]:
 
 def _sends(twist: Callable[[Array], Array], seconds: float = 0.05) -> Callable[[Bench], float]:
     return lambda bench: bench.send(twist, seconds)
+
+
+FOREIGN_S = 0.2
+SETS_OUTPUT = f"sec theirs():\n  set_standard_digital_out({OUTPUT}, True)\nend\n"
+
+
+def _output(on: bool) -> Callable[[Bench], float]:
+    """Another client writes the output in every frame."""
+    return _fault("set_digital_out", n=OUTPUT, on=on, seconds=FOREIGN_S)
+
+
+def _slider(percent: int) -> Callable[[Bench], float]:
+    """The slider alone: the scaling that a controller reports beside it stays at 100 %."""
+    return _fault("speed_scaling", value=0.01 * percent)
 
 
 def _joint(number: int, speed: float) -> Array:
@@ -126,7 +144,11 @@ RUNNING: tuple[Case, ...] = (
     _stops("commanding connection closed", _fault("close_tcp", index=1), LINK, short=False),
     _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
-    _stops("controller ignores commands for 60 ms", _fault("mute_input", seconds=0.06), DEAF, short=False),
+    # the guard slows the arm, and the next number gives it its speed back
+    Case("numbers 15 ms late", _fault("mute_input", seconds=0.015), GO, may_rest=True),
+    Case("numbers 30 ms late", _fault("mute_input", seconds=0.030), GO, may_rest=True, short=False),
+    Case("numbers 60 ms late", _fault("mute_input", seconds=0.060), GO, may_rest=True, short=False),
+    Case("numbers 120 ms late", _fault("mute_input", seconds=0.120), GO, may_rest=True),
     _either("one byte wrong in a package", _fault("corrupt", n=1), ALL, *CLEAR),
     _either("bytes wrong in 20 packages", _fault("corrupt", n=20), ALL, *CLEAR, short=False),
     _either("one package of a wrong size", _fault("wrong_size", n=1), ALL, *CLEAR),
@@ -154,11 +176,47 @@ RUNNING: tuple[Case, ...] = (
     _stops("program paused", _fault("pause_program"), Fault.PROGRAM_PAUSED),
     _stops("program replaced", _fault("replace_program"), ALL),
     _stops("speed slider to 50 % in 0.2 s", _fault("speed_scaling", value=0.5, ramp=0.2), Fault.SPEED_SLIDER),
+    *(
+        _stops(f"speed slider to {percent} %", _slider(percent), Fault.SPEED_SLIDER, short=percent in (10, 90))
+        for percent in (10, 30, 50, 70, 90)
+    ),
+    _stops("trajectory limiter at 60 %", _fault("limiter", value=0.6), Fault.SPEED_SLIDER, short=False),
     _stops("speed slider to 0", _fault("speed_scaling", value=0.0), Fault.SPEED_SLIDER, short=False),
     _either("arm follows 0.1 s late", _fault("tracking_lag", seconds=0.1), {Fault.TRACKING}, short=False),
     _stops("arm is held fast", _fault("tracking_lag", seconds=1e6), Fault.TRACKING, watch_s=1.0),
     _stops("another TCP is set", _fault("wrong_tcp"), Fault.POSE_MISMATCH),
     _stops("joints jump", _fault("set_q", q=[0.5, -1.6, 1.6, -1.6, -1.6, 0.0]), Fault.STATE_IMPLAUSIBLE),
+    # the process output
+    _stops(
+        "process on by somebody else",
+        _output(True),
+        Fault.PROCESS_OUTPUT,
+        wired=True,
+        burns_s=FOREIGN_S + 0.01,
+        random=False,
+    ),
+    _stops(
+        "process off by somebody else", _output(False), Fault.PROCESS_OUTPUT, process=True, burns_s=0.01, random=False
+    ),
+    # the guard writes the output in the same frame: it never goes on
+    Case("process on in another program", _fault("foreign_program", script=SETS_OUTPUT), GO, wired=True, random=False),
+    Case(
+        "numbers 30 ms late, process on",
+        _fault("mute_input", seconds=0.030),
+        GO,
+        process=True,
+        burns_s=1e9,
+        random=False,
+        short=False,
+    ),
+    _stops(
+        "numbers 60 ms late, process on",
+        _fault("mute_input", seconds=0.060),
+        Fault.GUARD_LATCHED,
+        process=True,
+        burns_s=0.06,
+        random=False,
+    ),
     # this computer
     _stops("cell silent for 0.3 s", lambda b: b.send(lambda qd: None, 0.3), Fault.COMMAND_LATE),
     _stops("cell silent for ever", lambda b: b.send(lambda qd: None, 1e9), Fault.COMMAND_LATE, short=False),

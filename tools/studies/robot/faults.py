@@ -18,7 +18,7 @@ from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.emulators.ur.process import HOST, emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.robot.bench import SPEED_M_S, Bench, StoppedUnasked
+from weldcal.tools.studies.robot.bench import OUTPUT, SPEED_M_S, Bench, StoppedUnasked
 from weldcal.tools.studies.robot.cases import AT_START, GO, REFUSE, REST_S, RUNNING, STOP, Case
 from weldcal.tools.studies.robot.sequences import Sequence, run_sequence
 
@@ -108,16 +108,17 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
     if case.elsewhere:
         children = bench.start_elsewhere()
     else:
-        bench.start()
+        bench.start(wired=case.wired, process=case.process)
     bench.cruise()
     at = case.throw(bench)
     time.sleep(GOING_S)
     if case.must != STOP:
-        paused = bench.at_rest_after(at, REST_S)["rest_after_s"] is not None and case.must == GO
+        paused = case.must == GO and not case.may_rest and bench.at_rest_after(at, REST_S)["rest_after_s"] is not None
         if not paused and bench.stream.state.fault is Fault.NONE:
             speed = bench.tool_speed()
-            problems = () if abs(speed - SPEED_M_S) < 0.1 * SPEED_M_S else (f"its speed is {speed:.4f} m/s",)
-            return Outcome(case.name, case.must, "went on", "", "", problems=problems)
+            problems = [] if abs(speed - SPEED_M_S) < 0.1 * SPEED_M_S else [f"its speed is {speed:.4f} m/s"]
+            problems += _burnt(bench, case, at)
+            return Outcome(case.name, case.must, "went on", "", "", problems=tuple(problems))
     time.sleep(max(0.0, case.watch_s - GOING_S - (HASTE_S if hasty else 0.0)))
     return _stopped(bench, case, at, children, PLAYED_S - (HASTE_S if hasty else 0.0))
 
@@ -148,9 +149,19 @@ def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played
     summary = bench.emulator.ask(check="summary")
     if summary["moves_without_a_command"]:
         problems.append("it moved without a command")
+    problems += _burnt(bench, case, at)
     rest_ms, travel_mm = (None if value is None else 1e3 * float(value) for value in (rest, travel))
     name = fault.name if fault else ""
     return Outcome(case.name, case.must, "stopped", name, sentence, rest_ms, travel_mm, seen, played, tuple(problems))
+
+
+def _burnt(bench: Bench, case: Case, at: float) -> list[str]:
+    """What is wrong with the process output, where the case has one."""
+    if not (case.wired or case.process):
+        return []
+    last = bench.emulator.ask(check="output_on_after", fault_time=at, output=OUTPUT)["last_on_s"]
+    wrong = last is not None and last > case.burns_s
+    return [f"the process output was on {last:.3f} s after the fault"] if wrong else []
 
 
 def _repair_and_play(bench: Bench, case: Case, watch_s: float) -> str:

@@ -124,6 +124,7 @@ class Controller(ControllerState):
         self.inputs, self.outputs = Registers(), Registers()
         self.terminals.digital_outputs = 0
         self.terminals.runstate.clear()
+        self.terminals.foreign.clear()
         self.robot_mode, self.safety_mode = RobotMode.POWER_OFF, SafetyMode.NORMAL
         self.runtime_state = RuntimeState.STOPPED
         self.timestamp = 0.0
@@ -145,6 +146,7 @@ class Controller(ControllerState):
             self._run(program)
         if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
             self._run(self.program)
+        self.terminals.write_foreign(self.frame)
         self._move()
 
     def _run(self, program: Program) -> None:
@@ -177,7 +179,7 @@ class Controller(ControllerState):
         playing = self.runtime_state == RuntimeState.PLAYING and self.ready
         driven = playing and self.program is not None and self.program.owner is not None
         try:
-            self.arm.step(driven, self.speed_scaling)
+            self.arm.step(driven, self.motion_scaling)
         except MotionRefused as refused:
             self.protective_stop(str(refused))
         if not driven and self.arm.at_rest:

@@ -52,13 +52,23 @@ class Terminals:
         self.digital_outputs = 0
         # of standard outputs: what set_runstate_standard_digital_output_to_value chose
         self.runstate: dict[int, int] = {}
+        # outputs that somebody else than the program writes in every frame (Modbus, a PLC): level, and until which frame
+        self.foreign: dict[int, tuple[bool, int]] = {}
         self.analog_outputs = [0.0, 0.0]
         self.analog_output_types = 0
         self.speed_slider = 1.0
+        self.limiter = 1.0  # of the trajectory: what RTDE calls speed_scaling
 
     def set_digital(self, first: int, mask: int, value: int) -> None:
         """Sets the outputs that `mask` names, counted from `first` (0 standard, 8 configurable, 16 tool)."""
         self.digital_outputs = self.digital_outputs & ~(mask << first) | (value & mask) << first
+
+    def write_foreign(self, frame: int) -> None:
+        """What that somebody does in this frame, after the programs."""
+        for n, (on, until) in list(self.foreign.items()):
+            self.set_digital(0, 1 << n, int(on) << n)
+            if frame >= until:
+                del self.foreign[n]
 
     def program_ended(self) -> None:
         """Outputs that follow the program's state take their level for a program that does not run."""

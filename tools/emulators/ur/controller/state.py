@@ -51,8 +51,13 @@ class ControllerState:
 
     @property
     def speed_scaling(self) -> float:
-        """Share of the commanded speed that the slider lets through."""
-        return self.terminals.speed_slider
+        """Share of the commanded speed that the trajectory limiter lets through; the slider is not in it."""
+        return self.terminals.limiter
+
+    @property
+    def motion_scaling(self) -> float:
+        """Share of the commanded speed that the arm gets: the slider's times the limiter's."""
+        return self.terminals.speed_slider * self.terminals.limiter
 
     @property
     def ready(self) -> bool:

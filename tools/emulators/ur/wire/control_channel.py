@@ -75,6 +75,8 @@ class ControlServer(Server):
             "local_mode": lambda r, now: setattr(c, "remote", False),
             "registers_in_use": lambda r, now: rtde.claim_elsewhere([str(n) for n in r.get("names", ())]),
             "speed_scaling": self._slider,
+            "set_digital_out": self._foreign_output,
+            "limiter": lambda r, now: setattr(c.terminals, "limiter", _number(r, "value")),
             "timestamp_jump": lambda r, now: setattr(c, "timestamp", max(0.0, c.timestamp + _number(r, "seconds"))),
             "clock_skew": lambda r, now: setattr(c, "clock_rate", 1.0 + _number(r, "ppm") * 1e-6),
             "jitter": lambda r, now: setattr(self._world, "jitter_s", _number(r, "seconds")),
@@ -141,6 +143,8 @@ class ControlServer(Server):
             )
         if request.get("check") == "output_after":
             return self._checker.output_after(_number(request, "fault_time"), int(_number(request, "output")))
+        if request.get("check") == "output_on_after":
+            return self._checker.output_on_after(_number(request, "fault_time"), int(_number(request, "output")))
         if request.get("check") == "summary":
             return self._checker.summary()
         if request.get("ask") == "state":
@@ -152,7 +156,7 @@ class ControlServer(Server):
         if request.get("ask") == "connections":
             return {"connections": [c.kind for c in self._network.of_kind("all")]}
         raise InputError(
-            "Send fault, do, check (at_rest_after, output_after, summary) or ask (state, log, program, connections)."
+            "Send fault, do, check (at_rest_after, output_after, output_on_after, summary) or ask (state, log, program, connections)."
         )
 
     def _links(self, request: Request) -> list[Connection]:
@@ -194,8 +198,9 @@ class ControlServer(Server):
         c.set_safety_mode(SafetyMode.NORMAL)
         c.robot_mode, c.remote, c.refuse_upload = RobotMode.RUNNING, True, False
         c.start_delay_s, c.clock_rate, c.tool_contact_steps = 0.0, 1.0, 0
-        c.terminals.speed_slider, c.arm.lag_s = 1.0, 0.0
+        c.terminals.speed_slider, c.terminals.limiter, c.arm.lag_s = 1.0, 1.0, 0.0
         c.set_tcp([0.0] * 6)
+        c.terminals.foreign.clear()
 
     def _close(self, request: Request, *, reset: bool) -> None:
         for connection in self._links(request):
@@ -227,6 +232,11 @@ class ControlServer(Server):
                 self._controller.later(STEP_S, lambda: step(i + 1))
 
         self._controller.later(STEP_S, lambda: step(1))
+
+    def _foreign_output(self, request: Request, now: float) -> None:
+        frames = max(1, round(_number(request, "seconds", 0.0) / STEP_S))
+        until = self._controller.frame + frames
+        self._controller.terminals.foreign[int(_number(request, "n"))] = (bool(request.get("on", True)), until)
 
     def _reboot(self, request: Request, now: float) -> None:
         self._network.unplug(self)
