@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from weldcal.tools.emulators.ur.process import CONTROL_PORT, HOST, Emulator, emulator_process
+from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator, emulator_process
 
-__all__ = ["CONTROL_PORT", "HOST", "Emulator", "emulator", "emulator_process", "run_client", "start_client"]
+__all__ = ["CONTROL_PORT", "Emulator", "emulator", "emulator_process", "run_client", "start_client"]
 
 
 @pytest.fixture
@@ -20,11 +20,14 @@ def emulator() -> Iterator[Emulator]:
         yield made
 
 
-def run_client(script: str, limit_s: float = 20.0) -> subprocess.CompletedProcess[str]:
-    """Runs Python text that uses ur_rtde's classes in a process of its own: they hold the GIL and may crash."""
-    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=limit_s, check=False)
+def run_client(host: str, script: str, limit_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """Runs Python text that uses ur_rtde's classes in a process of its own: they hold the GIL and may crash. The text finds
+    `host` in sys.argv[1]."""
+    return subprocess.run(
+        [sys.executable, "-c", script, host], capture_output=True, text=True, timeout=limit_s, check=False
+    )
 
 
-def start_client(script: str) -> subprocess.Popen[str]:
+def start_client(host: str, script: str, *arguments: str) -> subprocess.Popen[str]:
     """Like `run_client`, left running."""
-    return subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen([sys.executable, "-c", script, host, *arguments], stdout=subprocess.PIPE, text=True)

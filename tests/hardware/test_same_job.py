@@ -21,8 +21,6 @@ from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.studies.perfect_world import perfect
 
-# An address of its own: this module waits for no other.
-HOST = "127.0.0.41"
 # Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the edge of
 # the flange, 0.02 mm of the fit (test_cell). The largest error of a torch is a single tick's: 2 ms at 16 mm/s are 0.03 mm more.
 SAME_MM = {
@@ -68,7 +66,7 @@ def emulated_job(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
     for _ in range(2):
         WATCH.pauses.clear()
         with WATCH:
-            job = finished_job(tmp_path_factory.mktemp("emulated") / "run", f"emulated@{HOST}", PACE)
+            job = finished_job(tmp_path_factory.mktemp("emulated") / "run", "emulated", PACE)
         assert job.run.clock is not None
         stopped = str(job.summary().get("reason")).startswith(STOOD_STILL) or job.run.clock.lost_s > FELL_BEHIND_S
         if not (stopped and WATCH.pauses):
@@ -111,7 +109,7 @@ def controller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
     assert "x: -0.6127" in text
     path = tmp_path_factory.mktemp("robot") / "calibration.yaml"
     path.write_text(text.replace("x: -0.6127", "x: -0.6131"))
-    with emulator_process(host=HOST, q=Q_START.tolist(), kinematics=path, pace=PACE) as made:
+    with emulator_process(q=Q_START.tolist(), kinematics=path, pace=PACE) as made:
         yield made
 
 
@@ -128,7 +126,7 @@ def weld_only() -> Scenario:
 
 def test_a_dry_run_has_the_robots_kinematics_and_joints_and_sends_it_nothing(controller: Emulator) -> None:
     scenario = weld_only()
-    with chosen_robot(HOST, scenario, dry_run=True, pace=PACE) as robot:
+    with chosen_robot(controller.host, scenario, dry_run=True, pace=PACE) as robot:
         assert robot.prepared is not None
         assert robot.prepared.q_start == pytest.approx(Q_START)
         assert robot.prepared.pace is None
@@ -148,7 +146,7 @@ def run_until(controller: Emulator, folder: Path, stage: str, happens: Callable[
         if phase == stage:
             happens()
 
-    options = RunOptions("a test's own", folder, robot=HOST, pace=PACE, recording=False)
+    options = RunOptions("a test's own", folder, robot=controller.host, pace=PACE, recording=False)
     controller.do("reset_checker")
     result = run_scenario(weld_only(), options, watch)
     assert result.state == "held"

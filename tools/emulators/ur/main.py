@@ -15,6 +15,14 @@ import numpy as np
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.addresses import loopback_address
+from weldcal.tools.emulators.ur.addresses import (
+    DASHBOARD_PORT,
+    DEFAULT,
+    PRIMARY_PORT,
+    REAL_TIME_PORT,
+    RTDE_PORT,
+    SECONDARY_PORT,
+)
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
@@ -27,7 +35,6 @@ from weldcal.tools.emulators.ur.wire.net import Network
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 from weldcal.tools.emulators.ur.wire.script_ports import PrimaryServer, RealTimeServer
 
-PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, DASHBOARD_PORT = 30001, 30002, 30003, 30004, 29999
 # the elbow up, the tool down, away from every singularity
 HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)
 # beyond this (of the controller's time) the loop gives up on catching up and skips frames, and says so in its state
@@ -38,7 +45,7 @@ PARENT_CHECK_S = 0.2
 
 def run_emulator(
     *,
-    host: str = "127.0.0.1",
+    host: str = DEFAULT,
     control_port: int = CONTROL_PORT,
     polyscope: str = "5.21",
     robot: str = "ur10e",
@@ -178,7 +185,7 @@ def _alive(process: int) -> bool:
 def main() -> None:
     """Entry point of `python -m weldcal.tools.emulators.ur`."""
     parser = argparse.ArgumentParser(prog="python -m weldcal.tools.emulators.ur", description=__doc__)
-    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
+    parser.add_argument("--host", default=DEFAULT, help="loopback address to listen on")
     parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
     parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
     parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")

@@ -15,7 +15,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.emulators.ur.process import HOST, emulator_process
+from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.robot.bench import SPEED_M_S, Bench, StoppedUnasked
@@ -246,7 +246,7 @@ class FaultReport:
 def run_fault_benchmark(
     out: Path,
     *,
-    address: str = HOST,
+    address: str | None = None,
     sequences: int = 20,
     seconds: float = 60.0,
     seed: int = 0,
