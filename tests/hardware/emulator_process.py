@@ -8,15 +8,15 @@ from collections.abc import Iterator
 
 import pytest
 
-from weldcal.tools.emulators.ur.process import CONTROL_PORT, Emulator, emulator_process
+from weldcal.tools.emulators.ur.process import CONTROL_PORT, LOCKSTEP_S, Emulator, emulator_process
 
-__all__ = ["CONTROL_PORT", "Emulator", "emulator", "emulator_process", "run_client", "start_client"]
+__all__ = ["CONTROL_PORT", "LOCKSTEP_S", "Emulator", "emulator", "emulator_process", "run_client", "start_client"]
 
 
 @pytest.fixture
 def emulator() -> Iterator[Emulator]:
-    """A fresh PolyScope 5.21 controller."""
-    with emulator_process() as made:
+    """A fresh PolyScope 5.21 controller whose time waits for a client that is late."""
+    with emulator_process(lockstep=LOCKSTEP_S) as made:
         yield made
 
 

@@ -24,7 +24,7 @@ from weldcal.systems.station import make_station
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME
-from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.studies.robot.bench import Bench
 from weldcal.tools.studies.robot.faults import recover
@@ -161,7 +161,7 @@ def test_an_arm_at_rest_keeps_its_guard_without_numbers_but_not_its_arc() -> Non
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     """One controller for all that happens over the wire, and a link whose torch is wired."""
-    with emulator_process() as emulator:
+    with emulator_process(lockstep=LOCKSTEP_S) as emulator:
         yield Bench(emulator, OUTPUT)
 
 

@@ -16,7 +16,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.commands.robots import chosen_robot
-from weldcal.tools.emulators.ur.process import Emulator, emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.studies.perfect_world import perfect
@@ -109,7 +109,7 @@ def controller(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
     assert "x: -0.6127" in text
     path = tmp_path_factory.mktemp("robot") / "calibration.yaml"
     path.write_text(text.replace("x: -0.6127", "x: -0.6131"))
-    with emulator_process(q=Q_START.tolist(), kinematics=path, pace=PACE) as made:
+    with emulator_process(q=Q_START.tolist(), kinematics=path, pace=PACE, lockstep=LOCKSTEP_S) as made:
         yield made
 
 

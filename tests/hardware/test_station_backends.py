@@ -21,7 +21,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.pacing import WallClock
 from weldcal.systems.station import make_station
-from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
 SPEEDS = "ur10e.velocity_command"
 PACE = 0.5
@@ -91,7 +91,7 @@ def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
         yield Backend("simulated", simulated, latches_silence=False)
         return
     home = np.deg2rad(scenario().home_deg).tolist()
-    with emulator_process(q=home, pace=PACE) as emulator:
+    with emulator_process(q=home, pace=PACE, lockstep=LOCKSTEP_S) as emulator:
 
         def emulated() -> PacedDrive:
             drive = build(UrRtde(host=emulator.host, pace=PACE))

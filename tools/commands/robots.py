@@ -17,7 +17,7 @@ from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
@@ -85,7 +85,9 @@ def chosen_robot(
         require_ur_rtde()
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
-    with emulator_process(host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace) as emulator:
+    with emulator_process(
+        host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
+    ) as emulator:
         yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
 
 

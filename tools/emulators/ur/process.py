@@ -17,6 +17,7 @@ from weldcal.tools.emulators.ur.addresses import PORTS, free_address, take_addre
 
 CONTROL_PORT = 30090
 READY = "ready"
+LOCKSTEP_S = 2.0  # where nobody measures real time
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
 
@@ -100,6 +101,7 @@ def emulator_process(
     q: Sequence[float] | None = None,
     kinematics: Path | None = None,
     pace: float = 1.0,
+    lockstep: float = 0.0,
     seed: int = 0,
     wait_for_lock_s: float = 120.0,
 ) -> Iterator[Emulator]:
@@ -115,6 +117,7 @@ def emulator_process(
         q: joint angles at the start (6,) (rad); the emulator's home where None.
         kinematics: a robot's factory calibration; nominal where None.
         pace: controller seconds per host second, 0.05 to 1.
+        lockstep: for so long (s of the host) its time waits for a client that streams and is late; 0: never.
         seed: everything random follows from it.
         wait_for_lock_s: how long to wait for another owner of `host` to finish (s).
 
@@ -125,7 +128,7 @@ def emulator_process(
     with take_address(host, wait_for_lock_s) if host is not None else free_address(ports) as address:
         command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", address]
         command += ["--control-port", str(control_port), "--polyscope", polyscope]
-        command += ["--pace", str(pace), "--seed", str(seed)]
+        command += ["--pace", str(pace), "--lockstep", str(lockstep), "--seed", str(seed)]
         if q is not None:
             command += ["--q", *(repr(float(angle)) for angle in q)]
         if kinematics is not None:
