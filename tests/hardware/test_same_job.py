@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.hardware.computer_pauses import PauseWatch
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
@@ -31,14 +30,6 @@ SAME_MM = {
     "plan_max_mm": 0.04,
 }
 PACE = 0.5  # a faster one leaves the link less time than a busy machine of two cores may take
-# how it shows that the computer stood still: in the worker, in the cell, or in the controller while the worker's core did
-STOOD_STILL = (
-    "LINK: no new state",
-    "COMMAND LATE",
-    "GUARD: the script on the controller stopped the arm, because no new command",
-)
-FELL_BEHIND_S = 1.0  # of the job's forty
-WATCH = PauseWatch()
 NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 
 
@@ -58,20 +49,8 @@ def finished_job(folder: Path, robot: str, pace: float | None) -> DemoResult:
 
 @pytest.fixture(scope="module")
 def emulated_job(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    """The job on the emulated controller.
-
-    Where the computer as a whole stands still for a tenth of a second the link stops the arm, as it must; the job is done
-    once more only where a bystander saw that.
-    """
-    for _ in range(2):
-        WATCH.pauses.clear()
-        with WATCH:
-            job = finished_job(tmp_path_factory.mktemp("emulated") / "run", "emulated", PACE)
-        assert job.run.clock is not None
-        stopped = str(job.summary().get("reason")).startswith(STOOD_STILL) or job.run.clock.lost_s > FELL_BEHIND_S
-        if not (stopped and WATCH.pauses):
-            break
-    return job
+    """The job on the emulated controller, whose time waits for a computer that is busy."""
+    return finished_job(tmp_path_factory.mktemp("emulated") / "run", "emulated", PACE)
 
 
 def test_the_same_job_on_the_emulated_robot_ends_with_the_same_figures(
@@ -79,7 +58,7 @@ def test_the_same_job_on_the_emulated_robot_ends_with_the_same_figures(
 ) -> None:
     emulated = emulated_job.summary()
     simulated = finished_job(tmp_path / "run", "simulated", None).summary()
-    assert emulated["state"] == "done", f"{emulated.get('reason')} ({WATCH.sentence})"
+    assert emulated["state"] == "done", emulated.get("reason")
     assert simulated["state"] == "done", simulated.get("reason")
     for key, same_mm in SAME_MM.items():
         assert emulated[key] == pytest.approx(simulated[key], abs=same_mm), key

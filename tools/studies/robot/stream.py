@@ -196,7 +196,13 @@ def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_
 
 
 def run_robot_benchmark(
-    out: Path, *, address: str | None = None, minutes: float = 10.0, seed: int = 0, progress: Progress = no_progress
+    out: Path,
+    *,
+    address: str | None = None,
+    minutes: float = 10.0,
+    seed: int = 0,
+    lockstep: float = 0.0,
+    progress: Progress = no_progress,
 ) -> StreamReport:
     """On an emulated controller of its own; robot.json and missed.csv are written into `out`.
 
@@ -204,7 +210,7 @@ def run_robot_benchmark(
     goes on over a new link.
     """
     left, stops, tap = 60.0 * minutes, list[Stopped](), None
-    with emulator_process(host=address, seed=seed) as emulator:
+    with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
         while True:
             prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
             link = cast(UrLink, prepared.handle)
