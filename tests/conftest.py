@@ -14,6 +14,7 @@ import pytest
 
 from tests.browser import browser
 from tests.places import SHARED_DATA, require_data
+from tests.scheduling import Scheduling, order, processes
 from tests.short_job import short_jobs
 from tests.ur_rtde import NEEDS_UR_RTDE
 
@@ -35,18 +36,27 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         require_data(*mark.args)
 
 
-SLOWEST = ("test_cell.py", "test_readme.py")  # a core that is left with one of these at the end keeps the other waiting
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int:
+    """What `-n auto` means."""
+    return processes()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """File by file; what streams to an emulated robot one by one."""
+    return Scheduling(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes longest comes first: files are dealt to the cores one by one, in this order.
+    """Files are dealt to the processes one by one, in this order.
 
     The tests on the emulated robot need its client library.
     """
     for item in items:
         if item.path.parent.name == "hardware":
             item.add_marker(NEEDS_UR_RTDE)
-    items.sort(key=lambda item: (item.path.name not in SLOWEST, item.path.parent.name != "scenario"))
+    items.sort(key=order)
 
 
 def pytest_collection_finish() -> None:

@@ -7,8 +7,12 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from tests.places import ROOT
+from tests.scheduling import STREAMING, Scheduling, order
 
 COREUTILS = ("sh", "dirname", "readlink", "cksum", "cat", "rm", "mv", "mkdir", "cp", "chmod", "grep", "env", "flock")
 LIBRARIES = {
@@ -246,12 +250,23 @@ def test_test_runs_pytest_in_the_project(machine: Machine) -> None:
     assert "browser" not in finished.stderr
 
 
-def test_all_tests_run_side_by_side_but_those_of_the_emulated_robot_one_by_one(machine: Machine) -> None:
+def test_all_tests_run_side_by_side_in_one_run(machine: Machine) -> None:
     said = machine.run("test").stdout.splitlines()
-    assert said.count("<pytest>") == 2
-    first, second = said[: said.index("<pytest>", said.index("<pytest>") + 1)], said[-1]
-    assert first[first.index("<--ignore>") : first.index("<--ignore>") + 2] == ["<--ignore>", "<tests/hardware>"]
-    assert second == "<tests/hardware>"
+    assert said.count("<pytest>") == 1
+    assert said[said.index("<-n>") + 1] == "<auto>"
+    assert said[said.index("<--dist>") + 1] == "<loadfile>"
+    assert not any("tests/" in word or "ignore" in word for word in said)
+
+
+def test_what_streams_to_the_emulated_robot_runs_one_by_one_and_first() -> None:
+    scheduling = Scheduling.__new__(Scheduling)  # its plugin need not be loaded
+    streams = [f"tests/hardware/{name}::test_a" for name in STREAMING]
+    assert all((ROOT / path.partition("::")[0]).is_file() for path in streams)
+    assert len({scheduling._split_scope(test) for test in streams}) == 1
+    others = ["tests/hardware/test_emulator_wire.py::test_a", "tests/scenario/test_cell.py::test_a[b/c.py::d]"]
+    assert [scheduling._split_scope(test) for test in others] == [test.partition("::")[0] for test in others]
+    first, last = (SimpleNamespace(path=ROOT / test.partition("::")[0]) for test in (streams[-1], others[-1]))
+    assert order(first) < order(last)  # type: ignore[arg-type]
 
 
 def test_without_a_browser_the_tests_still_run_and_the_line_to_type_is_shown(machine: Machine) -> None:

@@ -7,8 +7,6 @@ import struct
 import time
 from typing import Any
 
-from tests.hardware.emulator_process import HOST
-
 CODES = {
     "DOUBLE": "d",
     "INT32": "i",
@@ -25,8 +23,8 @@ CODES = {
 class Rtde:
     """One connection to port 30004."""
 
-    def __init__(self, version: int = 2) -> None:
-        self.socket = socket.create_connection((HOST, 30004), timeout=5.0)
+    def __init__(self, host: str, version: int = 2) -> None:
+        self.socket = socket.create_connection((host, 30004), timeout=5.0)
         assert self.send(b"V", struct.pack(">H", version)) == b"\x01"
         self.fields: list[tuple[str, struct.Struct]] = []
 

@@ -28,13 +28,9 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo,
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
 from weldcal.tools.commands.check_robot import emit_table
+from weldcal.tools.emulators.ur.addresses import PORTS, free_address
 from weldcal.tools.emulators.ur.main import HOME
 
-# addresses of its own: this module waits for no other, and its second controller not for its first
-HOST, PORT = "127.0.0.21", 30091
-HOST_X, PORT_X = "127.0.0.22", 30092
-# this machine, and nothing listens there
-NOBODY = "127.0.0.23"
 NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 MOVING = "def foreign():\n  movej([0.5, -1.57, 1.57, -1.57, -1.57, 0], a=1, v=0.05)\nend\n"
 
@@ -47,7 +43,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Emulator]:
     text = text.replace(forearm.format("-0.6127", "0.0"), forearm.format("-0.6131", "3e-4"))
     path = tmp_path_factory.mktemp("robot") / "calibration.yaml"
     path.write_text(text.replace("kinematics:", "kinematics:\n  hash: calib_1", 1))
-    with emulator_process(host=HOST, control_port=PORT, kinematics=path) as made:
+    with emulator_process(kinematics=path) as made:
         yield made
 
 
@@ -76,7 +72,7 @@ def states(report: Preflight) -> dict[str, str]:
 
 
 def test_a_ready_robot_is_ready_and_its_own_kinematics_are_read(robot: Emulator) -> None:
-    report = preflight(HOST)
+    report = preflight(robot.host)
     assert report.ok, report.checks
     assert report.first_problem is None
     assert tuple(check.name for check in report.checks) == CHECKS
@@ -99,7 +95,7 @@ def test_looking_touches_nothing(robot: Emulator) -> None:
     names = [f"input_{kind}_register_{i}" for kind in ("int", "double") for i in range(48)]
 
     def everything() -> dict[str, Any]:
-        with RtdeProbe(HOST) as rtde:
+        with RtdeProbe(robot.host) as rtde:
             registers = rtde.read(names[:48]) | rtde.read(names[48:])
         state = robot.state()
         kept = ("q", "qd", "tcp_offset", "payload_mass", "program", "programs_started", "runtime_state", "speed_slider")
@@ -107,12 +103,12 @@ def test_looking_touches_nothing(robot: Emulator) -> None:
 
     before = everything()
     said = robot.log()
-    assert preflight(HOST).ok
+    assert preflight(robot.host).ok
     assert everything() == before
     assert robot.log() == said
     # what was asked for is given back: another client gets all of it, and the first asking leaves no connection behind
     assert robot.ask(ask="connections")["connections"] == []
-    with RtdeProbe(HOST) as other:
+    with RtdeProbe(robot.host) as other:
         assert set(other.claim(names).values()) == {"INT32", "DOUBLE"}
 
 
@@ -141,7 +137,7 @@ def test_each_fault_is_named_with_what_to_press(
     robot: Emulator, fault: str, values: dict[str, Any], check: str, found: str, press: str
 ) -> None:
     robot.fault(fault, **values)
-    report = preflight(HOST)
+    report = preflight(robot.host)
     problem = report.first_problem
     assert problem is not None
     assert problem.name == check
@@ -156,7 +152,7 @@ def test_each_fault_is_named_with_what_to_press(
 
 def test_reduced_mode_is_a_remark(robot: Emulator) -> None:
     robot.fault("reduced")
-    report = preflight(HOST)
+    report = preflight(robot.host)
     assert report.ok
     assert "limits speed" in report.checks[CHECKS.index("safety")].found
 
@@ -165,33 +161,33 @@ def test_a_paused_program_is_a_program(robot: Emulator) -> None:
     robot.fault("foreign_program")
     robot.fault("pause_program")
     robot.wait("runtime_state", "PAUSED")
-    problem = preflight(HOST).first_problem
+    problem = preflight(robot.host).first_problem
     assert problem is not None
     assert (problem.name, problem.found) == ("program", "PAUSED foreign")
     assert "the program foreign (PAUSED)" in problem.operator_action
-    assert stop_program(HOST) == "Stopped"
+    assert stop_program(robot.host) == "Stopped"
     robot.wait("runtime_state", "STOPPED")
-    assert preflight(HOST).ok
+    assert preflight(robot.host).ok
 
 
 def test_an_arm_that_moves_is_seen_beside_the_program_that_moves_it(robot: Emulator) -> None:
     robot.fault("foreign_program", script=MOVING)
     time.sleep(0.2)
-    found = states(preflight(HOST))
+    found = states(preflight(robot.host))
     assert [name for name, state in found.items() if state != "ok"] == ["program", "standstill"]
 
 
 def test_registers_of_the_lower_range_are_asked_for_where_the_driver_uses_them(robot: Emulator) -> None:
     robot.fault("registers_in_use", names=["input_int_register_0", "input_int_register_1", "input_double_register_3"])
-    assert preflight(HOST).ok
-    problem = preflight(HOST, upper_registers=False).first_problem
+    assert preflight(robot.host).ok
+    problem = preflight(robot.host, upper_registers=False).first_problem
     assert problem is not None
     assert problem.found == "int 0-1, double 3 in use"
 
 
 def test_a_command_that_an_earlier_client_left_behind_is_told_and_left_alone(robot: Emulator) -> None:
     def write(value: int) -> None:
-        with socket.create_connection((HOST, 30004)) as client:
+        with socket.create_connection((robot.host, 30004)) as client:
             for kind, payload in (
                 (b"V", b"\0\2"),
                 (b"I", b"input_int_register_24"),
@@ -204,10 +200,10 @@ def test_a_command_that_an_earlier_client_left_behind_is_told_and_left_alone(rob
 
     write(10)
     try:
-        report = preflight(HOST)
+        report = preflight(robot.host)
         assert report.ok
         assert "command 10 is left over" in report.checks[CHECKS.index("registers")].found
-        with RtdeProbe(HOST) as rtde:
+        with RtdeProbe(robot.host) as rtde:
             assert rtde.read(["input_int_register_24"]) == {"input_int_register_24": 10}
     finally:
         write(0)
@@ -215,7 +211,7 @@ def test_a_command_that_an_earlier_client_left_behind_is_told_and_left_alone(rob
 
 def test_what_could_not_be_checked_is_not_called_ok(robot: Emulator) -> None:
     robot.fault("robot_mode", value=3)
-    report = preflight(HOST)
+    report = preflight(robot.host)
     left = [check for check in report.checks if not check.checked]
     assert [check.name for check in left] == ["standstill", "joint limits", "kinematics", "flange pose"]
     assert {check.found for check in left} == {"needs power"}
@@ -226,7 +222,7 @@ def test_what_could_not_be_checked_is_not_called_ok(robot: Emulator) -> None:
 def test_several_faults_come_in_the_order_in_which_they_are_mended(robot: Emulator) -> None:
     for fault, values in (("local_mode", {}), ("speed_scaling", {"value": 0.5}), ("estop", {}), ("wrong_tcp", {})):
         robot.fault(fault, **values)
-    wrong = [name for name, state in states(preflight(HOST)).items() if state == "to change"]
+    wrong = [name for name, state in states(preflight(robot.host)).items() if state == "to change"]
     assert wrong == ["safety", "power", "TCP", "speed slider", "remote control"]
 
 
@@ -236,7 +232,7 @@ def test_kinematics_that_are_not_the_controllers_are_refused(robot: Emulator, mo
         return dataclasses.replace(info, a=info.a + np.array([0, 0, 6e-5, 0, 0, 0]))
 
     monkeypatch.setattr(module, "read_kinematics", of_another_ur10e)
-    problem = preflight(HOST).first_problem
+    problem = preflight(robot.host).first_problem
     assert problem is not None
     assert problem.name == "flange pose"
     assert problem.found.startswith("0.060 mm")
@@ -245,7 +241,7 @@ def test_kinematics_that_are_not_the_controllers_are_refused(robot: Emulator, mo
 def test_an_old_or_another_controller_is_refused(robot: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
     for version in ((3, 15, 0, 0), (5, 11, 9, 0), (6, 0, 0, 0), (11, 0, 0, 0)):
         monkeypatch.setattr(module, "RtdeProbe", lambda host, timeout_s, version=version: Old(host, timeout_s, version))
-        report = preflight(HOST)
+        report = preflight(robot.host)
         assert report.first_problem is not None
         assert report.first_problem.name == "version"
         assert set(states(report).values()) == {"ok", "to change", "?"}
@@ -261,7 +257,7 @@ class Old(RtdeProbe):
 
 
 def test_a_line_that_delivers_a_few_bytes_at_a_time_is_good_enough(robot: Emulator) -> None:
-    with RtdeProbe(HOST) as rtde:
+    with RtdeProbe(robot.host) as rtde:
         robot.fault("partial_writes", kind="rtde", bytes=5, latch=False)
         values = rtde.read(["timestamp", "no_such_output", "actual_q", "robot_mode"])
     assert list(values) == ["timestamp", "actual_q", "robot_mode"]
@@ -271,7 +267,7 @@ def test_a_line_that_delivers_a_few_bytes_at_a_time_is_good_enough(robot: Emulat
 
 def test_names_that_the_controller_lacks_are_told_apart_from_those_in_use(robot: Emulator) -> None:
     robot.fault("registers_in_use", names=["input_int_register_30"])
-    with RtdeProbe(HOST) as rtde:
+    with RtdeProbe(robot.host) as rtde:
         assert rtde.claim(["input_int_register_30", "input_int_register_99", "input_int_register_31"]) == {
             "input_int_register_30": "IN_USE",
             "input_int_register_99": "NOT_FOUND",
@@ -283,7 +279,7 @@ def test_names_that_the_controller_lacks_are_told_apart_from_those_in_use(robot:
 def test_a_controller_that_stands_still_is_left_in_time(robot: Emulator) -> None:
     robot.fault("freeze", seconds=1.5, latch=False)
     start = time.monotonic()
-    problem = preflight(HOST, timeout_s=0.3).first_problem
+    problem = preflight(robot.host, timeout_s=0.3).first_problem
     assert time.monotonic() - start < 1.4
     assert problem is not None
     assert "sends no data" in problem.operator_action
@@ -296,21 +292,21 @@ def test_a_dashboard_that_refuses_in_local_control_is_understood(
     # the words of e-Series controllers, as users quote them
     words = "Command is not allowed due to safety reasons, please switch robot to Remote Control mode and reconnect"
     monkeypatch.setattr(module, "ask", lambda *_: words)
-    found = preflight(HOST)
+    found = preflight(robot.host)
     assert [name for name, state in states(found).items() if state != "ok"] == ["remote control"]
     assert "Local icon" in found.checks[-1].operator_action
 
 
 def test_a_dashboard_that_talks_nonsense_is_quoted(robot: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ask", lambda *_: "could not understand: 'this'")
-    found = [check for check in preflight(HOST).checks if not check.ok]
+    found = [check for check in preflight(robot.host).checks if not check.ok]
     assert [check.name for check in found] == ["program", "remote control"]
     assert all("could not understand: 'this'" in check.found for check in found)
 
 
 def test_without_a_dashboard_the_service_to_enable_is_named(robot: Emulator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "ask", lambda host, command, timeout_s: ask(host, command, timeout_s, port=29998))
-    report = preflight(HOST)
+    report = preflight(robot.host)
     assert report.first_problem is not None
     assert report.first_problem.name == "program"
     assert (
@@ -321,7 +317,7 @@ def test_without_a_dashboard_the_service_to_enable_is_named(robot: Emulator, mon
 
 
 def test_the_dashboard_answers_one_question_a_connection(robot: Emulator) -> None:
-    assert ask(HOST, "robotmode") == "Robotmode: RUNNING"
+    assert ask(robot.host, "robotmode") == "Robotmode: RUNNING"
     assert robot.ask(ask="connections")["connections"] == []
 
 
@@ -331,9 +327,8 @@ def test_the_dashboard_answers_one_question_a_connection(robot: Emulator) -> Non
 @pytest.fixture
 def mute() -> Iterator[str]:
     """A host that accepts and sends no data."""
-    host = "127.0.0.24"
     stop = threading.Event()
-    with socket.create_server((host, 30004)) as server:
+    with free_address(PORTS) as host, socket.create_server((host, 30004)) as server:
         server.settimeout(0.05)
         visitors = []
 
@@ -353,6 +348,13 @@ def mute() -> Iterator[str]:
             visitor.close()
 
 
+@pytest.fixture
+def nobody() -> Iterator[str]:
+    """An address of this machine at which nothing listens."""
+    with free_address(PORTS) as host:
+        yield host
+
+
 def refused(host: str, **limits: float) -> str:
     """The sentence about a host that is no robot, which must come within 3 s."""
     start = time.monotonic()
@@ -369,8 +371,8 @@ def test_a_host_that_says_nothing(mute: str) -> None:
     assert "accepts a connection on its RTDE port 30004 but sends no data" in refused(mute)
 
 
-def test_an_address_where_nothing_listens() -> None:
-    assert f"{NOBODY} is there but its RTDE port 30004 is closed" in refused(NOBODY)
+def test_an_address_where_nothing_listens(nobody: str) -> None:
+    assert f"{nobody} is there but its RTDE port 30004 is closed" in refused(nobody)
 
 
 def test_an_address_that_leads_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -406,14 +408,14 @@ def test_an_empty_name_is_a_mistake() -> None:
 
 
 def test_polyscope_x_is_checked_without_a_dashboard() -> None:
-    with emulator_process(host=HOST_X, control_port=PORT_X, polyscope="10.12") as new:
-        report = preflight(HOST_X)
+    with emulator_process(polyscope="10.12") as new:
+        report = preflight(new.host)
         assert report.ok, report.checks
         assert report.version is not None
         assert report.version[0] == 10
         assert "not readable" in report.checks[CHECKS.index("remote control")].found
         new.fault("foreign_program")
-        problem = preflight(HOST_X).first_problem
+        problem = preflight(new.host).first_problem
         assert problem is not None
         assert problem.found == "PLAYING"
 
@@ -422,10 +424,10 @@ def test_polyscope_x_is_checked_without_a_dashboard() -> None:
 
 
 def test_the_command_prints_a_table_that_fits_a_terminal(robot: Emulator, capsys: pytest.CaptureFixture[str]) -> None:
-    finished = weldcal(HOST)
+    finished = weldcal(robot.host)
     assert finished.returncode == 0, finished.stderr
     lines = finished.stdout.splitlines()
-    assert lines[0] == f"{HOST}: ready"
+    assert lines[0] == f"{robot.host}: ready"
     assert [line.split()[0] for line in lines[1:]] == ["ok"] * len(CHECKS)
     assert finished.stderr == ""
     for fault, values in (
@@ -434,9 +436,9 @@ def test_the_command_prints_a_table_that_fits_a_terminal(robot: Emulator, capsys
         ("registers_in_use", {"names": ["input_int_register_24"]}),
     ):
         robot.fault(fault, **values)
-    emit_table(preflight(HOST))
+    emit_table(preflight(robot.host))
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == f"{HOST}: not ready, 4 to change"
+    assert lines[0] == f"{robot.host}: not ready, 4 to change"
     assert max(map(len, lines)) <= 80
     assert sum(line.startswith("  to change ") for line in lines) == 4
     assert sum(line.startswith("  not checked ") for line in lines) == 4
@@ -444,7 +446,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(robot: Emulator, capsys
 
 def test_the_command_ends_with_1_and_the_first_sentence(robot: Emulator) -> None:
     robot.fault("local_mode")
-    finished = weldcal(HOST, "--json")
+    finished = weldcal(robot.host, "--json")
     assert finished.returncode == 1
     assert finished.stderr.startswith("weldcal: The robot is in local control: ")
     assert len(finished.stderr.splitlines()) == 1
@@ -460,9 +462,9 @@ def test_the_command_ends_with_1_and_the_first_sentence(robot: Emulator) -> None
     assert result["pose_error_deg"] < 1e-4
 
 
-def test_the_command_needs_no_project_and_no_robot() -> None:
+def test_the_command_needs_no_project_and_no_robot(nobody: str) -> None:
     start = time.monotonic()
-    finished = weldcal(NOBODY)
+    finished = weldcal(nobody)
     assert time.monotonic() - start < 20.0
     assert finished.returncode == 1
     assert "port 30004 is closed" in finished.stderr

@@ -15,7 +15,7 @@ import pytest
 from pydrake.math import RigidTransform
 
 from tests.hardware.bare_rtde import Rtde
-from tests.hardware.emulator_process import HOST, Emulator, emulator, emulator_process, run_client, start_client
+from tests.hardware.emulator_process import Emulator, emulator, emulator_process, run_client, start_client
 from tests.hardware.test_emulator_wire import calibrated, chain, kinematics_of, packages
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian, load_arm
 from weldcal.models.errors import InputError
@@ -28,7 +28,7 @@ SPEED_M_S = 0.02
 CONNECT = """
 import json, sys, time
 import rtde_control, rtde_receive, rtde_io, dashboard_client
-HOST = "127.0.0.1"
+HOST = sys.argv[1]
 """
 STREAM = (
     CONNECT
@@ -46,7 +46,7 @@ while True:
 
 def moving_client(emulator: Emulator, watchdog: float = 0.0) -> subprocess.Popen[str]:
     """A client that streams 20 mm/s, at full speed."""
-    client = start_client(STREAM.format(watchdog=watchdog))
+    client = start_client(emulator.host, STREAM.format(watchdog=watchdog))
     assert client.stdout is not None
     assert client.stdout.readline() == "moving\n"
     until = time.monotonic() + 5.0
@@ -59,6 +59,7 @@ def moving_client(emulator: Emulator, watchdog: float = 0.0) -> subprocess.Popen
 def test_all_four_classes_connect_and_the_arm_goes_where_it_is_told(emulator: Emulator) -> None:
     goal = [0.1, -1.5, 1.5, -1.5, -1.5, 0.1]
     done = run_client(
+        emulator.host,
         CONNECT
         + f"""
 receive = rtde_receive.RTDEReceiveInterface(HOST)
@@ -101,7 +102,7 @@ out["seen"] = (receive.getDigitalOutState(3), receive.getTargetSpeedFraction())
 control.stopScript()
 out["stopped"] = dashboard.programState()
 print(json.dumps(out), flush=True)
-"""
+""",
     )
     assert done.returncode == 0, done.stderr + emulator.log()
     out = json.loads(done.stdout.splitlines()[-1])
@@ -234,7 +235,7 @@ def test_older_and_newer_controllers_take_the_stock_client(version: str) -> None
     goal = [0.1, -1.5, 1.5, -1.5, -1.5, 0.1]
     newer = version != "5.12"
     with emulator_process(polyscope=version) as other:
-        done = run_client(MECHANICS.format(goal=goal, newer=newer))
+        done = run_client(other.host, MECHANICS.format(goal=goal, newer=newer))
         assert done.returncode == 0, done.stderr + other.log()
         assert other.state()["q"] == pytest.approx(goal, abs=1e-12)
     out = json.loads(done.stdout.splitlines()[-1])
@@ -256,19 +257,28 @@ EXTERNAL = (
     CONNECT
     + """
 Control = rtde_control.RTDEControlInterface
-control = Control(HOST, 500.0, Control.FLAG_USE_EXT_UR_CAP)
+control = Control(HOST, 500.0, Control.FLAG_USE_EXT_UR_CAP, int(sys.argv[2]))
 print(control.moveJ([0.05, -1.57, 1.57, -1.57, -1.57, 0.0], 1.0, 3.0), flush=True)
 control.stopScript()
 """
 )
 
 
-def press_play(emulator: Emulator) -> None:
+def external_client(emulator: Emulator) -> subprocess.Popen[str]:
+    """A client for External Control whose script sender listens on a port of its own, and a person who presses play."""
+    with socket.create_server(("", 0)) as free:
+        port = free.getsockname()[1]
+    client = start_client(emulator.host, EXTERNAL, str(port))
+    press_play(emulator, port)
+    return client
+
+
+def press_play(emulator: Emulator, port: int) -> None:
     """What a person does at the pendant, as soon as the client's script sender listens."""
-    until = time.monotonic() + 5.0
+    until = time.monotonic() + 20.0
     while True:
         try:
-            emulator.do("external_control")
+            emulator.do("external_control", port=port)
             return
         except InputError:
             assert time.monotonic() < until, "the client's script sender does not listen"
@@ -277,11 +287,12 @@ def press_play(emulator: Emulator) -> None:
 
 def test_polyscope_x_before_10_10_takes_the_client_through_external_control_only() -> None:
     with emulator_process(polyscope="10.9") as new:
-        with socket.create_connection((HOST, 30003), timeout=5.0) as script:
+        with socket.create_connection((new.host, 30003), timeout=5.0) as script:
             script.sendall(b"movej([0.05, -1.57, 1.57, -1.57, -1.57, 0.0], a=3, v=1)\n")
             time.sleep(0.05)
         assert "use External Control" in new.log()
         refused = run_client(
+            new.host,
             CONNECT
             + """
 control = rtde_control.RTDEControlInterface(HOST)
@@ -290,13 +301,12 @@ try:
     dashboard_client.DashboardClient(HOST).connect()
 except RuntimeError:
     print("no dashboard", flush=True)
-"""
+""",
         )
         # it connects, uploads nothing and says so by False
         assert refused.stdout == "True False\nno dashboard\n"
         assert new.state()["programs_started"] == 0
-        client = start_client(EXTERNAL)
-        press_play(new)
+        client = external_client(new)
         # the client's script sender does not end by itself
         assert client.stdout is not None
         said = [client.stdout.readline() for _ in range(2)]
@@ -309,8 +319,7 @@ except RuntimeError:
 
 def test_the_clients_script_asks_polyscope_10_7_for_more_than_it_has() -> None:
     with emulator_process(polyscope="10.7") as new:
-        client = start_client(EXTERNAL)
-        press_play(new)
+        client = external_client(new)
         until = time.monotonic() + 5.0
         while "get_mass_matrix is not defined" not in new.log():
             assert time.monotonic() < until, new.log()
@@ -333,9 +342,9 @@ def test_on_polyscope_x_the_client_dies_of_a_lost_connection() -> None:
 def test_a_calibrated_robot_publishes_the_numbers_of_its_own_pose(tmp_path: Path) -> None:
     with (
         emulator_process(kinematics=calibrated(tmp_path)) as robot,
-        Rtde().watch("actual_q", "actual_TCP_pose") as rtde,
+        Rtde(robot.host).watch("actual_q", "actual_TCP_pose") as rtde,
     ):
-        numbers, status = kinematics_of(packages(30001, 2)[1])
+        numbers, status = kinematics_of(packages(robot.host, 30001, 2)[1])
         assert status == 2  # calibrated
         assert np.abs(numbers[2, 1:4]).max() > 100.0  # axes that are nearly parallel meet far away
         for q in np.random.default_rng(1).uniform(-2.0, 2.0, (5, 6)):
@@ -351,7 +360,7 @@ def test_a_calibrated_robot_publishes_the_numbers_of_its_own_pose(tmp_path: Path
 def test_at_a_fifth_of_the_pace_everything_takes_five_times_as_long() -> None:
     with emulator_process(pace=0.2) as slow:
         begin = slow.state()
-        with socket.create_connection((HOST, 30002), timeout=5.0) as script:
+        with socket.create_connection((slow.host, 30002), timeout=5.0) as script:
             script.sendall(b"movej([0.05, -1.5707963, 1.5707963, -1.5707963, -1.5707963, 0.0], a=40, v=0.5)\n")
             slow.wait("runtime_state", "PLAYING")
             slow.wait("runtime_state", "STOPPED")

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.hardware.bare_rtde import Rtde
-from tests.hardware.emulator_process import HOST, Emulator, emulator_process
+from tests.hardware.emulator_process import Emulator, emulator_process
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.main import HOME
 
@@ -40,13 +40,13 @@ def robot(process: Emulator) -> Iterator[Emulator]:
     process.do("recover")
 
 
-def connect(kind: str) -> socket.socket:
-    return socket.create_connection((HOST, PORTS[kind]), timeout=2.0)
+def connect(robot: Emulator, kind: str) -> socket.socket:
+    return socket.create_connection((robot.host, PORTS[kind]), timeout=2.0)
 
 
-def run(script: str) -> None:
+def run(robot: Emulator, script: str) -> None:
     """One program to the secondary port."""
-    with connect("secondary") as port:
+    with connect(robot, "secondary") as port:
         port.sendall(script.encode() + b"\n")
         time.sleep(0.01)
 
@@ -70,7 +70,7 @@ def least_lag(robot: Emulator, client: Rtde) -> float:
 
 def move(robot: Emulator) -> None:
     """The base turns at a constant speed until somebody stops it."""
-    run(f"speedj([{SPEED_RAD_S}, 0, 0, 0, 0, 0], a=10, t=1000)")
+    run(robot, f"speedj([{SPEED_RAD_S}, 0, 0, 0, 0, 0], a=10, t=1000)")
     until = time.monotonic() + 2.0
     while robot.state()["qd"][0] < 0.999 * SPEED_RAD_S:
         assert time.monotonic() < until, robot.log()
@@ -88,7 +88,7 @@ def at_rest(robot: Emulator, fault_time: float, within: float = 0.1) -> None:
 
 
 def test_half_open_says_nothing_hears_nothing_and_does_not_close(robot: Emulator) -> None:
-    with Rtde() as dead, Rtde().watch("input_int_register_20") as alive:
+    with Rtde(robot.host) as dead, Rtde(robot.host).watch("input_int_register_20") as alive:
         dead.watch("timestamp")
         assert dead.send(b"I", b"input_int_register_20") == b"\x01INT32"
         robot.fault("half_open", index=0)
@@ -100,7 +100,7 @@ def test_half_open_says_nothing_hears_nothing_and_does_not_close(robot: Emulator
 
 
 def test_partial_writes_tear_packages_and_lose_nothing(robot: Emulator) -> None:
-    with Rtde() as client:
+    with Rtde(robot.host) as client:
         client.watch("timestamp", "target_q")
         robot.fault("partial_writes", bytes=7)
         sizes = [len(client.socket.recv(4096)) for _ in range(20)]
@@ -113,7 +113,7 @@ def test_partial_writes_tear_packages_and_lose_nothing(robot: Emulator) -> None:
 
 
 def test_dropped_packages_leave_a_gap_and_the_connection_stays(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         first = client.next()
         robot.fault("drop", seconds=0.1)
         gaps = np.diff([row["timestamp"] for row in [first, *client.during(0.2)]])
@@ -124,7 +124,7 @@ def test_dropped_packages_leave_a_gap_and_the_connection_stays(robot: Emulator) 
 
 
 def test_a_share_of_the_packages_is_lost(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         robot.fault("drop_p", p=0.5)
         client.during(0.02)
         stamps = [client.next()["timestamp"] for _ in range(150)]
@@ -133,7 +133,7 @@ def test_a_share_of_the_packages_is_lost(robot: Emulator) -> None:
 
 
 def test_delay_makes_packages_late_and_keeps_their_order(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         robot.fault("delay", seconds=0.05, jitter=0.02)
         stamps = [row["timestamp"] for row in client.during(0.15)]
         lag = least_lag(robot, client)
@@ -142,14 +142,14 @@ def test_delay_makes_packages_late_and_keeps_their_order(robot: Emulator) -> Non
 
 
 def test_a_delay_may_end(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         fault = robot.fault("delay", seconds=0.02, **{"for": 0.05})
         client.during(fault + 0.15 - time.monotonic())
         assert least_lag(robot, client) < 0.015
 
 
 def test_a_frozen_connection_delivers_everything_afterwards(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         client.next()
         begin = robot.fault("freeze", kind="rtde", seconds=0.1)
         rows, longest, before = [], 0.0, time.monotonic()
@@ -162,7 +162,7 @@ def test_a_frozen_connection_delivers_everything_afterwards(robot: Emulator) -> 
 
 
 def test_a_frozen_controller_stands_still_with_its_clock(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         first = client.next()["timestamp"]
         begin = time.monotonic()
         robot.fault("freeze", seconds=0.15)
@@ -173,7 +173,7 @@ def test_a_frozen_controller_stands_still_with_its_clock(robot: Emulator) -> Non
 
 
 def test_muted_inputs_are_lost(robot: Emulator) -> None:
-    with Rtde().watch("input_int_register_21") as client:
+    with Rtde(robot.host).watch("input_int_register_21") as client:
         client.send(b"I", b"input_int_register_21")
         robot.fault("mute_input", seconds=0.15)
         client.put(b"U", struct.pack(">Bi", 1, 5))
@@ -183,7 +183,7 @@ def test_muted_inputs_are_lost(robot: Emulator) -> None:
 
 
 def test_corrupt_spoils_that_many_packages_and_wrong_size_one_header(robot: Emulator) -> None:
-    with Rtde() as client:
+    with Rtde(robot.host) as client:
         client.watch("actual_q")
         good = client.receive(b"U")
         robot.fault("corrupt", n=3)
@@ -201,7 +201,7 @@ def test_corrupt_spoils_that_many_packages_and_wrong_size_one_header(robot: Emul
 @pytest.mark.parametrize("kind", PORTS)
 @pytest.mark.parametrize(("fault", "reset"), [("reset_tcp", True), ("close_tcp", False)])
 def test_each_connection_can_be_reset_or_closed(robot: Emulator, kind: str, fault: str, reset: bool) -> None:
-    with connect(kind) as port, connect("dashboard" if kind != "dashboard" else "primary") as other:
+    with connect(robot, kind) as port, connect(robot, "dashboard" if kind != "dashboard" else "primary") as other:
         while kind not in robot.ask(ask="connections")["connections"]:
             time.sleep(0.005)
         robot.fault(fault, kind=kind)
@@ -213,7 +213,7 @@ def test_each_connection_can_be_reset_or_closed(robot: Emulator, kind: str, faul
 
 
 def test_all_connections_at_once_but_the_control_channel(robot: Emulator) -> None:
-    with connect("rtde"), connect("script"), connect("primary"):
+    with connect(robot, "rtde"), connect(robot, "script"), connect(robot, "primary"):
         while len(robot.ask(ask="connections")["connections"]) < 3:
             time.sleep(0.005)
         robot.fault("reset_tcp", kind="all")
@@ -239,7 +239,7 @@ def test_a_safety_stop_halts_the_arm_and_pauses_its_program(
     robot: Emulator, fault: dict[str, Any], mode: int, bits: set[int], power: bool
 ) -> None:
     move(robot)
-    with Rtde().watch("safety_mode", "safety_status_bits", "robot_mode", "runtime_state") as client:
+    with Rtde(robot.host).watch("safety_mode", "safety_status_bits", "robot_mode", "runtime_state") as client:
         injected = robot.fault(**fault)
         seen = client.until("safety_mode", mode)
         assert seen["safety_status_bits"] == sum(1 << bit for bit in bits)
@@ -250,7 +250,7 @@ def test_a_safety_stop_halts_the_arm_and_pauses_its_program(
 
 def test_reduced_mode_goes_on_moving(robot: Emulator) -> None:
     move(robot)
-    with Rtde().watch("safety_mode", "safety_status_bits", "actual_qd") as client:
+    with Rtde(robot.host).watch("safety_mode", "safety_status_bits", "actual_qd") as client:
         robot.fault("reduced", latch=False)
         assert client.until("safety_mode", 2)["safety_status_bits"] == 1 << 1
         assert client.next()["actual_qd"][0] == pytest.approx(SPEED_RAD_S)
@@ -260,11 +260,11 @@ def test_reduced_mode_goes_on_moving(robot: Emulator) -> None:
 def test_a_robot_that_is_not_running_has_no_program(robot: Emulator, mode: int) -> None:
     move(robot)
     injected = robot.fault("robot_mode", value=mode)
-    with Rtde().watch("robot_mode", "runtime_state") as client:
+    with Rtde(robot.host).watch("robot_mode", "runtime_state") as client:
         client.until("robot_mode", mode)
         client.until("runtime_state", 1)
     at_rest(robot, injected)
-    run("movej([0, 0, 0, 0, 0, 0])")
+    run(robot, "movej([0, 0, 0, 0, 0, 0])")
     assert logged(robot, "the robot is not running")
 
 
@@ -272,7 +272,7 @@ def test_a_robot_that_is_not_running_has_no_program(robot: Emulator, mode: int) 
 def test_a_program_that_is_stopped_or_paused_leaves_the_arm_at_rest(robot: Emulator, fault: str, state: int) -> None:
     move(robot)
     injected = robot.fault(fault)
-    with Rtde().watch("runtime_state") as client:
+    with Rtde(robot.host).watch("runtime_state") as client:
         client.until("runtime_state", state)
     at_rest(robot, injected)
 
@@ -288,14 +288,14 @@ def test_a_replaced_program_leaves_the_arm_to_one_that_does_not_move_it(robot: E
 def test_a_foreign_program_may_hold_the_answer_register(robot: Emulator) -> None:
     script = "def theirs():\nwrite_output_integer_register(0, 1)\nwhile True:\nsync()\nend\nend\n"
     robot.fault("foreign_program", script=script)
-    with Rtde().watch("runtime_state", "output_int_register_0") as client:
+    with Rtde(robot.host).watch("runtime_state", "output_int_register_0") as client:
         assert client.until("output_int_register_0", 1)["runtime_state"] == 2
 
 
 def test_local_mode_ignores_scripts_and_refuses_the_dashboard(robot: Emulator) -> None:
     robot.fault("local_mode")
-    run("movej([0, 0, 0, 0, 0, 0])")
-    with connect("dashboard") as port, port.makefile("rw") as file:
+    run(robot, "movej([0, 0, 0, 0, 0, 0])")
+    with connect(robot, "dashboard") as port, port.makefile("rw") as file:
         file.write("is in remote control\nstop\npower off\n")
         file.flush()
         _, remote, stop, power = (file.readline().strip() for _ in range(4))
@@ -308,7 +308,7 @@ def test_local_mode_ignores_scripts_and_refuses_the_dashboard(robot: Emulator) -
 
 def test_the_speed_slider_ramps_and_scales_the_motion(robot: Emulator) -> None:
     move(robot)
-    with Rtde().watch("timestamp", "speed_scaling", "target_speed_fraction", "actual_qd") as client:
+    with Rtde(robot.host).watch("timestamp", "speed_scaling", "target_speed_fraction", "actual_qd") as client:
         client.next()
         robot.fault("speed_scaling", value=0.25, ramp=0.1, latch=False)
         rows = client.during(0.2)
@@ -343,7 +343,7 @@ def test_another_client_writes_an_output_in_every_frame_for_a_while(robot: Emula
 
 
 def test_the_clock_may_jump_and_run_fast(robot: Emulator) -> None:
-    with Rtde().watch("timestamp", "control_step") as client:
+    with Rtde(robot.host).watch("timestamp", "control_step") as client:
         first = client.next()
         robot.fault("timestamp_jump", seconds=-50.0)
         jumps = np.diff([row["timestamp"] for row in [first, *client.during(0.05)]])
@@ -356,7 +356,7 @@ def test_the_clock_may_jump_and_run_fast(robot: Emulator) -> None:
 
 
 def test_jitter_makes_frames_late_and_the_count_catches_up(robot: Emulator) -> None:
-    with Rtde().watch("timestamp") as client:
+    with Rtde(robot.host).watch("timestamp") as client:
         robot.fault("jitter", seconds=0.02)
         client.next()
         rows = []
@@ -370,7 +370,7 @@ def test_jitter_makes_frames_late_and_the_count_catches_up(robot: Emulator) -> N
 
 
 def test_a_reboot_takes_the_ports_away_and_forgets(robot: Emulator) -> None:
-    with Rtde() as client:
+    with Rtde(robot.host) as client:
         client.watch("timestamp")
         client.send(b"I", b"input_int_register_22")
         client.put(b"U", struct.pack(">Bi", 1, 9))
@@ -378,13 +378,13 @@ def test_a_reboot_takes_the_ports_away_and_forgets(robot: Emulator) -> None:
         with pytest.raises(ConnectionError):
             client.during(2.0)
     with pytest.raises(ConnectionRefusedError):
-        connect("rtde")
+        connect(robot, "rtde")
     until = time.monotonic() + 5.0
     while time.monotonic() < until:
-        with contextlib.suppress(ConnectionError), connect("rtde"):
+        with contextlib.suppress(ConnectionError), connect(robot, "rtde"):
             break
         time.sleep(0.01)
-    with Rtde().watch("timestamp", "input_int_register_22", "robot_mode", "runtime_state") as client:
+    with Rtde(robot.host).watch("timestamp", "input_int_register_22", "robot_mode", "runtime_state") as client:
         found = client.next()
     assert found["timestamp"] < 1.0
     assert (found["input_int_register_22"], found["robot_mode"], found["runtime_state"]) == (0, 3, 1)
@@ -393,12 +393,12 @@ def test_a_reboot_takes_the_ports_away_and_forgets(robot: Emulator) -> None:
 def test_a_refused_upload_is_dropped_and_a_slow_one_starts_late(robot: Emulator) -> None:
     before = robot.state()["programs_started"]
     robot.fault("refuse_upload")
-    run("def one():\nsync()\nend")
+    run(robot, "def one():\nsync()\nend")
     assert logged(robot, "uploads are refused")
     robot.fault("refuse_upload", on=False)
     robot.fault("slow_start", seconds=0.1)
     begin = robot.state()
-    run("def two():\nwhile True:\nsync()\nend\nend")
+    run(robot, "def two():\nwhile True:\nsync()\nend\nend")
     started = robot.wait("runtime_state", "PLAYING")
     assert started["programs_started"] == before + 1
     assert started["timestamp"] - begin["timestamp"] >= 0.1
@@ -410,13 +410,13 @@ def test_tracking_lag_trails_the_target_by_speed_times_lag(robot: Emulator) -> N
     begin = robot.state()["timestamp"]
     while robot.state()["timestamp"] < begin + 0.3:  # six time constants, of the robot's time
         time.sleep(0.01)
-    with Rtde().watch("target_q", "actual_q") as client:
+    with Rtde(robot.host).watch("target_q", "actual_q") as client:
         row = client.next()
     assert row["target_q"][0] - row["actual_q"][0] == pytest.approx(0.05 * SPEED_RAD_S, rel=0.02)
 
 
 def test_a_wrong_tcp_is_in_the_pose_and_in_the_offset(robot: Emulator) -> None:
-    with Rtde().watch("actual_TCP_pose", "tcp_offset") as client:
+    with Rtde(robot.host).watch("actual_TCP_pose", "tcp_offset") as client:
         before = client.next()["actual_TCP_pose"]
         robot.fault("wrong_tcp", pose=[0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
         after = client.until("tcp_offset", [0.0, 0.0, 0.01, 0.0, 0.0, 0.0])["actual_TCP_pose"]
@@ -427,14 +427,14 @@ def test_a_wrong_tcp_is_in_the_pose_and_in_the_offset(robot: Emulator) -> None:
 def test_the_arm_may_be_somewhere_else(robot: Emulator) -> None:
     q = [0.1, -1.0, 1.0, -1.0, -1.0, 0.2]
     robot.fault("set_q", q=q)
-    with Rtde().watch("actual_q", "actual_qd") as client:
+    with Rtde(robot.host).watch("actual_q", "actual_qd") as client:
         assert client.until("actual_q", q)["actual_qd"] == [0.0] * 6
 
 
 def test_tool_contact_is_what_a_script_sees(robot: Emulator) -> None:
     robot.fault("tool_contact", n=7)
-    run("def touch():\nwrite_output_integer_register(3, tool_contact())\nend")
-    with Rtde().watch("output_int_register_3") as client:
+    run(robot, "def touch():\nwrite_output_integer_register(3, tool_contact())\nend")
+    with Rtde(robot.host).watch("output_int_register_3") as client:
         client.until("output_int_register_3", 7)
 
 
@@ -448,8 +448,8 @@ def test_tool_contact_is_what_a_script_sees(robot: Emulator) -> None:
 )
 def test_limits_and_singular_poses_are_protective_stops(robot: Emulator, q: list[float], script: str, why: str) -> None:
     robot.fault("set_q", q=q, latch=False)
-    with Rtde().watch("safety_mode") as client:
-        run(script)
+    with Rtde(robot.host).watch("safety_mode") as client:
+        run(robot, script)
         client.until("safety_mode", 3)
     assert why in robot.log()
     robot.wait("runtime_state", "PAUSED")

@@ -8,38 +8,91 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import nullcontext
 
 import pytest
 
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
-from weldcal.tools.emulators.ur.process import emulator_process, lock_path
-
-# not the address of the other tests: these want to find it free, and taken by themselves
-ALONE = "127.0.0.9"
-
-
-def test_an_address_has_one_owner_and_the_next_is_told_so() -> None:
-    with emulator_process(host=ALONE) as first:
-        assert first.state()["runtime_state"] == "STOPPED"
-        with (
-            pytest.raises(InputError, match=r"has held the ports of 127\.0\.0\.9"),
-            emulator_process(host=ALONE, wait_for_lock_s=0.1),
-        ):
-            pass
-    with pytest.raises(InputError, match="has ended"):
-        first.state()
-    assert lock_path(ALONE) != lock_path("127.0.0.1")
+from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.link import UrLink
+from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.emulators.ur import addresses
+from weldcal.tools.emulators.ur.addresses import PORTS, first_taken, free_address, lock_path
+from weldcal.tools.emulators.ur.process import Emulator, emulator_process
 
 
-def test_a_taken_port_and_wrong_arguments_are_one_sentence() -> None:
+@pytest.fixture
+def mine(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The address that the next emulator of this process would take, away from those that other tests take."""
+    monkeypatch.setattr(addresses, "OWN", f"127.{128 + os.getpid() % 100}.{{}}.{{}}")
+    return addresses.OWN.format(0, 1)
+
+
+@pytest.fixture(scope="module")
+def emulator() -> Iterator[Emulator]:
+    with emulator_process() as made:
+        yield made
+
+
+def test_an_address_has_one_owner_and_the_next_is_told_so(emulator: Emulator) -> None:
     with (
-        socket.create_server((ALONE, 30003)),
+        pytest.raises(InputError, match=f"has held the ports of {emulator.host} for"),
+        emulator_process(host=emulator.host, wait_for_lock_s=0.1),
+    ):
+        pass
+    assert emulator.state()["runtime_state"] == "STOPPED"
+    assert lock_path(emulator.host) != lock_path("127.0.0.1")
+
+
+def test_without_an_address_every_emulator_gets_one_of_its_own(emulator: Emulator) -> None:
+    with emulator_process() as second:
+        assert second.host != emulator.host
+        second.close()
+        with pytest.raises(InputError, match="has ended"):
+            second.state()
+    assert emulator.state()["runtime_state"] == "STOPPED"
+
+
+def test_an_address_on_which_something_listens_is_passed_over(mine: str) -> None:
+    with free_address(PORTS) as first:
+        assert first == mine
+    with socket.create_server((mine, 30004)), emulator_process() as made:
+        assert made.host not in (mine, "127.0.0.1")
+        assert made.state()["runtime_state"] == "STOPPED"
+
+
+def test_a_port_that_is_taken_on_every_address_is_one_sentence() -> None:
+    with socket.create_server(("0.0.0.0", 0)) as everywhere:
+        port = everywhere.getsockname()[1]
+        with pytest.raises(InputError, match=f"Port {port} is taken on every loopback address"), free_address((port,)):
+            pass
+
+
+def test_a_listener_on_the_usual_address_is_in_nobodys_way() -> None:
+    usual = socket.create_server(("127.0.0.1", 30004)) if not first_taken("127.0.0.1", (30004,)) else nullcontext()
+    with usual, emulator_process() as made:
+        assert first_taken("127.0.0.1", (30004,)) == 30004
+        scenario = load_scenario("straight_groove")
+        with chosen_robot("emulated", scenario, dry_run=True) as robot:
+            assert robot.prepared is not None
+        link = UrLink.start(made.host, load_arm(), UrRtde(host=made.host).limits(load_arm()))
+        assert link.state().fault is Fault.NONE
+        link.close()
+
+
+def test_a_taken_port_and_wrong_arguments_are_one_sentence(mine: str) -> None:
+    with (
+        socket.create_server((mine, 30003)),
         pytest.raises(InputError, match=r"Port 30003 .* is taken"),
-        emulator_process(host=ALONE),
+        emulator_process(host=mine),
     ):
         pass
     for wrong, why in (({"pace": 3.0}, "Give a pace"), ({"polyscope": "7"}, "not a PolyScope version")):
-        with pytest.raises(InputError, match=why), emulator_process(host=ALONE, **wrong):  # type: ignore[arg-type]
+        with pytest.raises(InputError, match=why), emulator_process(**wrong):  # type: ignore[arg-type]
             pass
 
 
@@ -47,7 +100,7 @@ def test_the_emulator_ends_with_a_parent_that_is_killed() -> None:
     script = (
         "import os, time\n"
         "from weldcal.tools.emulators.ur.process import emulator_process\n"
-        f"with emulator_process(host={ALONE!r}) as made:\n"
+        "with emulator_process() as made:\n"
         "    print(made.process.pid, flush=True)\n"
         "    time.sleep(60)\n"
     )

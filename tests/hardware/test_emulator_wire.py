@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.hardware.bare_rtde import Rtde
-from tests.hardware.emulator_process import HOST, Emulator, emulator_process
+from tests.hardware.emulator_process import Emulator, emulator_process
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
@@ -27,7 +27,7 @@ def shared() -> Iterator[Emulator]:
 
 
 def test_the_first_words_are_those_of_the_guide(shared: Emulator) -> None:
-    with socket.create_connection((HOST, 30004), timeout=5.0) as raw:
+    with socket.create_connection((shared.host, 30004), timeout=5.0) as raw:
         raw.sendall(bytes.fromhex("0005560002"))
         assert raw.recv(16) == bytes.fromhex("00045601")
         raw.sendall(bytes.fromhex("000376"))
@@ -95,7 +95,7 @@ def test_the_whole_public_table_is_served(shared: Emulator) -> None:
     assert (len(out), len(into)) == (82 + 2 * 162, 162 + 13)
     assert {name: field.type for name, field in outputs().items()} == out
     assert {name: field.type for name, field in inputs().items()} == into
-    with Rtde() as client:
+    with Rtde(shared.host) as client:
         # 5.23 brought one more
         assert answered(client, b"O", list(out), struct.pack(">d", 125.0)) == out | {
             "actual_current_as_torque": "NOT_FOUND"
@@ -104,7 +104,7 @@ def test_the_whole_public_table_is_served(shared: Emulator) -> None:
 
 
 def test_recipes_take_a_trailing_comma_and_refuse_unknown_names(shared: Emulator) -> None:
-    with Rtde() as client:
+    with Rtde(shared.host) as client:
         assert client.send(b"S") == b"\x00"  # there is nothing to send yet
         good = client.send(b"O", struct.pack(">d", 500.0) + b"timestamp,actual_q,")
         assert good == b"\x01DOUBLE,VECTOR6D"
@@ -116,7 +116,7 @@ def test_recipes_take_a_trailing_comma_and_refuse_unknown_names(shared: Emulator
 
 
 def test_protocol_1_has_neither_frequency_nor_recipe_number(shared: Emulator) -> None:
-    with Rtde(version=1) as client:
+    with Rtde(shared.host, version=1) as client:
         assert client.send(b"O", b"timestamp,robot_mode") == b"DOUBLE,INT32"
         assert client.send(b"S") == b"\x01"
         assert struct.unpack(">di", client.receive(b"U"))[1] == 7
@@ -124,7 +124,7 @@ def test_protocol_1_has_neither_frequency_nor_recipe_number(shared: Emulator) ->
 
 @pytest.mark.parametrize("every", [1, 4, 50])
 def test_packages_come_at_an_integer_share_of_500_hz(shared: Emulator, every: int) -> None:
-    with Rtde() as client:
+    with Rtde(shared.host) as client:
         client.send(b"O", struct.pack(">d", 500.0 / every) + b"timestamp")
         client.send(b"S")
         stamps = [struct.unpack(">Bd", client.receive(b"U"))[1] for _ in range(5)]
@@ -133,12 +133,12 @@ def test_packages_come_at_an_integer_share_of_500_hz(shared: Emulator, every: in
 
 
 def test_an_input_has_one_owner_and_keeps_its_value_when_the_owner_leaves(shared: Emulator) -> None:
-    with Rtde() as first, Rtde() as second:
+    with Rtde(shared.host) as first, Rtde(shared.host) as second:
         assert first.send(b"I", b"input_int_register_7") == b"\x01INT32"
         assert second.send(b"I", b"input_int_register_7,input_int_register_8") == b"\x00IN_USE,INT32"
         assert second.send(b"I", b"input_int_register_8") == b"\x01INT32"
         first.put(b"U", struct.pack(">Bi", 1, -42))
-    with Rtde() as third:
+    with Rtde(shared.host) as third:
         until = time.monotonic() + 5.0  # the controller hears in its own time that the owner has gone
         while (answer := third.send(b"I", b"input_int_register_7")) != b"\x01INT32" and time.monotonic() < until:
             time.sleep(0.01)
@@ -150,14 +150,14 @@ def test_an_input_has_one_owner_and_keeps_its_value_when_the_owner_leaves(shared
 
 def test_a_register_that_a_fieldbus_holds_is_in_use(shared: Emulator) -> None:
     shared.fault("registers_in_use", names=["input_int_register_11"], latch=False)
-    with Rtde() as client:
+    with Rtde(shared.host) as client:
         assert client.send(b"I", b"input_int_register_11") == b"\x00IN_USE"
         shared.ask(do="registers_free")
         assert client.send(b"I", b"input_int_register_11") == b"\x01INT32"
 
 
-def dashboard(*commands: str) -> list[str]:
-    with socket.create_connection((HOST, 29999), timeout=5.0) as raw, raw.makefile("rw") as file:
+def dashboard(robot: Emulator, *commands: str) -> list[str]:
+    with socket.create_connection((robot.host, 29999), timeout=5.0) as raw, raw.makefile("rw") as file:
         greeting = file.readline()
         assert greeting == "Connected: Universal Robots Dashboard Server\n"
         answers = []
@@ -170,6 +170,7 @@ def dashboard(*commands: str) -> list[str]:
 
 def test_the_dashboard_speaks_as_the_manual_says(shared: Emulator) -> None:
     version, model, mode, safety, running, remote, missing, loaded = dashboard(
+        shared,
         *("PolyscopeVersion", "get robot model", "robotmode", "safetymode", "running", "is in remote control"),
         *("load missing.urp", "load cell.urp"),
     )
@@ -178,25 +179,32 @@ def test_the_dashboard_speaks_as_the_manual_says(shared: Emulator) -> None:
     assert (running, remote) == ("Program running: false", "true")
     assert missing == "File not found: missing.urp"
     assert loaded.startswith("Loading program: /programs/cell.urp")
-    assert dashboard("play", "programState", "pause") == ["Starting program", "PLAYING cell.urp", "Pausing program"]
+    assert dashboard(shared, "play", "programState", "pause") == [
+        "Starting program",
+        "PLAYING cell.urp",
+        "Pausing program",
+    ]
     shared.wait("runtime_state", "PAUSED")
-    assert dashboard("programState", "stop", "quit") == ["PAUSED cell.urp", "Stopped", "Disconnected"]
+    assert dashboard(shared, "programState", "stop", "quit") == ["PAUSED cell.urp", "Stopped", "Disconnected"]
     shared.wait("runtime_state", "STOPPED")
 
 
 def test_a_protective_stop_unlocks_only_after_five_seconds(shared: Emulator) -> None:
     shared.fault("protective_stop", latch=False)
-    assert dashboard("unlock protective stop", "safetymode") == [
+    assert dashboard(shared, "unlock protective stop", "safetymode") == [
         "Cannot unlock protective stop until 5s after occurrence. "
         "Always inspect cause of protective stop before unlocking",
         "Safetymode: PROTECTIVE_STOP",
     ]
     shared.ask(do="clear_pstop_timer")
-    assert dashboard("unlock protective stop", "safetymode") == ["Protective stop releasing", "Safetymode: NORMAL"]
+    assert dashboard(shared, "unlock protective stop", "safetymode") == [
+        "Protective stop releasing",
+        "Safetymode: NORMAL",
+    ]
 
 
-def packages(port: int, count: int) -> list[bytes]:
-    with socket.create_connection((HOST, port), timeout=5.0) as raw, raw.makefile("rb") as file:
+def packages(host: str, port: int, count: int) -> list[bytes]:
+    with socket.create_connection((host, port), timeout=5.0) as raw, raw.makefile("rb") as file:
         found = []
         for _ in range(count):
             (size,) = struct.unpack(">i", file.read(4))
@@ -227,7 +235,7 @@ def chain(dh: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def test_the_primary_port_says_version_and_kinematics(shared: Emulator) -> None:
-    version, state = packages(30001, 2)
+    version, state = packages(shared.host, 30001, 2)
     assert (version[0], version[10]) == (20, 3)
     assert version[12:21] == b"URControl"
     assert version[21:23] == bytes([5, 21])
@@ -240,7 +248,7 @@ def test_the_primary_port_says_version_and_kinematics(shared: Emulator) -> None:
 
 
 def test_the_real_time_port_streams_1220_bytes(shared: Emulator) -> None:
-    first, second = packages(30003, 2)
+    first, second = packages(shared.host, 30003, 2)
     assert len(first) == 1216
     assert struct.unpack_from(">d", second)[0] - struct.unpack_from(">d", first)[0] == pytest.approx(0.002)
     assert struct.unpack_from(">6d", first, 8) == tuple(shared.state()["q_target"])

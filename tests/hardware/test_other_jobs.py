@@ -9,8 +9,7 @@ from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.outcomes.options import RunOptions
 
-# An address of its own: this module waits for no other.
-ROBOT = "emulated@127.0.0.43"
+ROBOT = "emulated"
 PACE = 1.0
 FEW_LOOKS = """
 mounting: {travel_deg: 40.0}

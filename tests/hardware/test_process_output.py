@@ -25,13 +25,12 @@ from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.main import HOME
-from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.studies.robot.bench import Bench
 from weldcal.tools.studies.robot.faults import recover
 
 OUTPUT = 3
-HOST = "127.0.0.47"  # an address of its own: this module waits for no other
 TURNING = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
 BASE = 24
 SILENT = 3
@@ -175,7 +174,7 @@ def test_the_output_is_written_in_every_frame() -> None:
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
     """One controller for all that happens over the wire, and a link whose torch is wired."""
-    with emulator_process(host=HOST) as emulator:
+    with emulator_process(lockstep=LOCKSTEP_S) as emulator:
         yield Bench(emulator, OUTPUT)
 
 
@@ -237,10 +236,10 @@ def test_numbers_30_ms_late_leave_the_torch_on_and_the_arm_at_its_speed(burning:
 
 
 def test_the_stock_clients_output_reaches_the_terminals_and_the_state_stream(bench: Bench) -> None:
-    script = f"""
-import time, rtde_io, rtde_receive
-io = rtde_io.RTDEIOInterface({HOST!r})
-receive = rtde_receive.RTDEReceiveInterface({HOST!r})
+    script = """
+import sys, time, rtde_io, rtde_receive
+io = rtde_io.RTDEIOInterface(sys.argv[1])
+receive = rtde_receive.RTDEReceiveInterface(sys.argv[1])
 seen = []
 for on in (True, False):
     assert io.setStandardDigitalOut(5, on)
@@ -250,12 +249,12 @@ for on in (True, False):
     seen.append(receive.getActualDigitalOutputBits() >> 5 & 1)
 print(seen)
 """
-    done = run_client(script)
+    done = run_client(bench.host, script)
     assert done.stdout.strip() == "[1, 0]", done.stderr
 
 
 def test_outputs_that_somebody_else_writes_are_a_refusal(bench: Bench) -> None:
-    with RtdeProbe(HOST) as other:
+    with RtdeProbe(bench.host) as other:
         assert other.grant((MASK, VALUE)) is not None
         with pytest.raises(RobotRefused, match="process_output"):
             bench.start()
@@ -266,7 +265,7 @@ def test_outputs_that_somebody_else_writes_are_a_refusal(bench: Bench) -> None:
 def test_the_cells_process_output_reaches_the_terminal_where_one_is_wired(bench: Bench, output: int | None) -> None:
     bench.emulator.do("set_q", q=np.deg2rad(scenario().home_deg).tolist())
     described = scenario(SMALL_IDEAL_SCANNER, EXACT_PLATE)
-    described.robot = UrRtde(host=HOST, process_output=output)
+    described.robot = UrRtde(host=bench.host, process_output=output)
     station = make_station(described, 0)
     with closing(station):
         wired = station.diagram.HasInputPort("ur10e.process_on")
@@ -285,4 +284,4 @@ def test_the_cells_process_output_reaches_the_terminal_where_one_is_wired(bench:
 
 def test_an_output_that_does_not_exist_is_told_before_anything_is_asked_of_the_robot() -> None:
     with pytest.raises(InputError, match="from 0 to 7, not 8"):
-        PrepareRobot(UrRtde(host=HOST, process_output=8), load_arm())
+        PrepareRobot(UrRtde(host="127.0.0.1", process_output=8), load_arm())

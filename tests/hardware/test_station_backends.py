@@ -21,10 +21,8 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.station import make_station
 from weldcal.systems.wall_clock import WallClock
-from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
-# An address of its own: this module waits for no other.
-HOST = "127.0.0.42"
 SPEEDS = "ur10e.velocity_command"
 PACE = 0.5
 SLOWLY = np.array([0.02, -0.03, 0.04, 0.05, -0.05, 0.06])  # rad/s
@@ -93,10 +91,10 @@ def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
         yield Backend("simulated", simulated, latches_silence=False)
         return
     home = np.deg2rad(scenario().home_deg).tolist()
-    with emulator_process(host=HOST, q=home, pace=PACE) as emulator:
+    with emulator_process(q=home, pace=PACE, lockstep=LOCKSTEP_S) as emulator:
 
         def emulated() -> PacedDrive:
-            drive = build(UrRtde(host=HOST, pace=PACE))
+            drive = build(UrRtde(host=emulator.host, pace=PACE))
             drive.true_arm = lambda: np.array(emulator.state()["q"])
             return drive
 

@@ -53,7 +53,7 @@ COMMON: dict[str, tuple[Any, object]] = {
     "dry_run": (Annotated[bool, switch("--dry-run", "Only read the robot, then run on a simulated arm.")], False),
     "pace": (Annotated[float | None, option("--pace", "P", _PACE)], None),
     "speed_factor": (Annotated[float | None, option("--speed-factor", "X", _SLOWER)], None),
-    "address": (Annotated[str, option("--address", "ADDRESS", _ADDRESS)], "127.0.0.1"),
+    "address": (Annotated[str | None, option("--address", "ADDRESS", _ADDRESS, show_default="a free one")], None),
     "out": (Annotated[Path | None, option("--out", "FOLDER", _OUT)], None),
     "seed": (Annotated[int, option("--seed", "N", "Seed of all random numbers; the first of several.", min=0)], 0),
     "json": (Annotated[bool, switch("--json", "Print the result as one JSON object, the last line of stdout.")], False),

@@ -55,6 +55,7 @@ def emulate_ur(
         int, option("--control-port", "PORT", "Port that takes injected faults, as JSON lines.")
     ] = 30090,
     pace: Annotated[float, option("--pace", "P", "Speed relative to real time, 0.05 to 1.")] = 1.0,
+    lockstep: Annotated[float, option("--lockstep", "S", "Seconds for which time waits for a late client.")] = 0.0,
 ) -> None:
     """Run a UR controller on loopback that executes the URScript it is sent, until it is interrupted."""
     from weldcal.tools.emulators.ur.main import run_emulator
@@ -65,6 +66,7 @@ def emulate_ur(
         polyscope=polyscope,
         kinematics=kinematics,
         pace=pace,
+        lockstep=lockstep,
         seed=call.seed,
         ready=typer.echo,
     )

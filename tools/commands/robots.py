@@ -17,8 +17,7 @@ from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.tools.emulators.ur.process import HOST as EMULATOR_HOST
-from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
@@ -40,8 +39,8 @@ def chosen_robot(
     """Set `scenario.robot` by the option's value for the duration of the block.
 
     Args:
-        word: `simulated`; `emulated`, or `emulated@ADDRESS` for another loopback address; the address of a controller; None:
-            the scenario's own.
+        word: `simulated`; `emulated`, on a loopback address of its own, or `emulated@ADDRESS`; the address of a controller;
+            None: the scenario's own.
         scenario: its `robot` is replaced.
         dry_run: read the robot's state, then run with a simulated arm that has its kinematics and configuration.
         pace: controller seconds per second of the wall clock; other than 1 only for an emulated controller.
@@ -67,22 +66,29 @@ def chosen_robot(
         yield ChosenRobot("simulated")
         return
     kind, _, address = word.partition("@")
-    emulated = kind == EMULATED
-    host = loopback_address(address or EMULATOR_HOST) if emulated else controller_address(word)
-    if pace is not None and not emulated and not is_loopback(host):
-        raise InputError("A real controller runs in real time: --pace is for an emulated one, at a loopback address.")
-    if pace is None:
-        pace = EMULATED_PACE if emulated else 1.0
+    if kind != EMULATED:
+        host = controller_address(word)
+        if pace is not None and not is_loopback(host):
+            raise InputError(
+                "A real controller runs in real time: --pace is for an emulated one, at a loopback address."
+            )
+        pace = 1.0 if pace is None else pace
+        _check_pace(pace)
+        if not dry_run:
+            require_ur_rtde()
+        yield _at(host, f"the controller at {host}", scenario, dry_run=dry_run, pace=pace)
+        return
+    wanted = loopback_address(address) if address else None
+    pace = EMULATED_PACE if pace is None else pace
     _check_pace(pace)
     if not dry_run:
         require_ur_rtde()
-    if not emulated:
-        yield _at(host, f"the controller at {host}", scenario, dry_run=dry_run, pace=pace)
-        return
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
-    with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace):
-        yield _at(host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
+    with emulator_process(
+        host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
+    ) as emulator:
+        yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
 
 
 def _check_pace(pace: float) -> None:

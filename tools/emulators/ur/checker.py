@@ -17,11 +17,10 @@ TIME, SPEED, TOOL, SILENCE, STREAMED, OUTPUTS = range(6)
 
 class Checker:
     """Points in time are on the host's monotonic clock, which processes on one machine share; durations are the
-    controller's own (host seconds times the pace)."""
+    controller's own: its frames, 2 ms each, whatever the host made of them."""
 
-    def __init__(self, controller: Controller, pace: float = 1.0) -> None:
+    def __init__(self, controller: Controller) -> None:
         self._controller = controller
-        self._pace = pace
         self._record = np.zeros((RECORD_FRAMES, 6))
         self._count = 0
         self._heard: float = float("-inf")  # frame of the newest input package or script
@@ -97,15 +96,15 @@ class Checker:
             }
         first = int(np.argmax(still))
         again = ~still[first:]
-        moved = float(rows[first + int(np.argmax(again)), TIME] - fault_time) * self._pace if again.any() else None
-        rest = float(rows[first, TIME] - fault_time) * self._pace
+        moved = (first + int(np.argmax(again)) + 1) * STEP_S if again.any() else None
+        rest = (first + 1) * STEP_S
         return {
             "ok": rest <= within and moved is None,
             "rest_after_s": rest,
             "moved_again_s": moved,
             "travel_m": float(rows[:first, TOOL].sum() * STEP_S),
             "peak_tool_speed_after_m_s": float(rows[first:, TOOL].max()),
-            "recorded_s": float(rows[-1, TIME] - fault_time) * self._pace,
+            "recorded_s": rows.shape[0] * STEP_S,
         }
 
     def output_after(self, fault_time: float, output: int) -> dict[str, Any]:
@@ -126,7 +125,7 @@ class Checker:
         again = None if off is None or not on[off:].any() else off + int(np.argmax(on[off:]))
 
         def seconds(row: int | None) -> float | None:
-            return None if row is None else float(rows[row, TIME] - fault_time) * self._pace
+            return None if row is None else row * STEP_S
 
         return {
             "ok": off is not None and again is None,

@@ -15,36 +15,47 @@ import numpy as np
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.systems.addresses import loopback_address
+from weldcal.tools.emulators.ur.addresses import (
+    DASHBOARD_PORT,
+    DEFAULT,
+    PRIMARY_PORT,
+    REAL_TIME_PORT,
+    RTDE_PORT,
+    SECONDARY_PORT,
+)
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, World
 from weldcal.tools.emulators.ur.wire.dashboard import DashboardServer
 from weldcal.tools.emulators.ur.wire.external_control import ExternalControl
-from weldcal.tools.emulators.ur.wire.net import Network
+from weldcal.tools.emulators.ur.wire.net import Connection, Network
 from weldcal.tools.emulators.ur.wire.rtde_server import RtdeServer
 from weldcal.tools.emulators.ur.wire.script_ports import PrimaryServer, RealTimeServer
 
-PRIMARY_PORT, SECONDARY_PORT, REAL_TIME_PORT, RTDE_PORT, DASHBOARD_PORT = 30001, 30002, 30003, 30004, 29999
 # the elbow up, the tool down, away from every singularity
 HOME = (0.0, -1.5707963267948966, 1.5707963267948966, -1.5707963267948966, -1.5707963267948966, 0.0)
 # beyond this (of the controller's time) the loop gives up on catching up and skips frames, and says so in its state
 LATE_S = 0.05
 SLOWEST, FASTEST = 0.05, 1.0
 PARENT_CHECK_S = 0.2
+WAIT_S = 0.01
+LONGEST_WAIT_S = 60.0
 
 
 def run_emulator(
     *,
-    host: str = "127.0.0.1",
+    host: str = DEFAULT,
     control_port: int = CONTROL_PORT,
     polyscope: str = "5.21",
     robot: str = "ur10e",
     kinematics: Path | None = None,
     q: tuple[float, ...] = HOME,
     pace: float = 1.0,
+    lockstep: float = 0.0,
     seed: int = 0,
     parent: int | None = None,
     ready: Callable[[str], None] | None = None,
@@ -59,37 +70,45 @@ def run_emulator(
         kinematics: a robot's factory calibration; nominal where None.
         q: joint angles at the start (rad).
         pace: controller seconds per host second, 0.05 to 1; below 1 every frame of 2 ms takes longer.
+        lockstep: for so long (s of the host) time waits for a client that streams and is late; 0: never.
         seed: everything random follows from it.
         parent: process whose end ends the emulator.
         ready: called once with a sentence when every port listens.
 
     Raises:
-        InputError: unknown arm or version, a pace or address that is not allowed, or a port that is taken.
+        InputError: unknown arm or version, a pace, bound or address that is not allowed, or a port that is taken.
     """
     host = loopback_address(host)
     if len(q) != 6:
         raise InputError("Give six joint angles, in radians.")
     if not SLOWEST <= pace <= FASTEST:
         raise InputError(f"Give a pace from {SLOWEST} to {FASTEST:.0f}, not {pace}.")
+    if not 0.0 <= lockstep <= LONGEST_WAIT_S:
+        raise InputError(f"Give a lockstep bound from 0 to {LONGEST_WAIT_S:.0f} s, not {lockstep}.")
     controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
-    _Emulator(controller, host, control_port, pace, seed).run(parent, ready)
+    _Emulator(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
 
 
 class _Emulator:
-    def __init__(self, controller: Controller, host: str, control_port: int, pace: float, seed: int) -> None:
+    def __init__(
+        self, controller: Controller, host: str, control_port: int, pace: float, lockstep: float, seed: int
+    ) -> None:
         self._controller = controller
         self._pace = pace
-        self._checker = Checker(controller, pace)
+        self._checker = Checker(controller)
+        self._lockstep = Lockstep(controller, lockstep)
         self._world = World()
         self._network = Network(host, seed)
         self._rng = np.random.default_rng([seed, 1])
         heard = self._checker.heard
-        self._rtde = RtdeServer(controller, heard)
+        self._rtde = RtdeServer(controller, self._input)
         self._primary = PrimaryServer(controller, heard, primary=True)
         secondary = PrimaryServer(controller, heard, primary=False)
         real_time = RealTimeServer(controller, heard)
         external = ExternalControl(controller)
-        control = ControlServer(controller, self._network, self._rtde, external, self._checker, self._world)
+        control = ControlServer(
+            controller, self._network, self._rtde, external, self._checker, self._lockstep, self._world
+        )
         self._servers = (self._rtde, self._primary, secondary, real_time, external)
         ports = [(self._rtde, RTDE_PORT), (self._primary, PRIMARY_PORT), (secondary, SECONDARY_PORT)]
         ports += [(real_time, REAL_TIME_PORT), (control, control_port)]
@@ -104,6 +123,10 @@ class _Emulator:
                     f"Port {port} on {host} is taken ({error.strerror}); stop the other emulator or robot program."
                 ) from error
         self._sentence = f"A UR controller answers on {host}; its control channel is port {control_port}."
+
+    def _input(self, connection: Connection, recipe: int, now: float) -> None:
+        self._checker.heard()
+        self._lockstep.heard(connection, recipe, now)
 
     def run(self, parent: int | None, ready: Callable[[str], None] | None) -> None:
         def stop(*_: object) -> None:
@@ -138,6 +161,11 @@ class _Emulator:
             if now < world.frozen_until:
                 time.sleep(min(world.frozen_until - now, 0.01))
                 deadline = clock()
+                continue
+            if self._lockstep.waits(now):
+                network.flush(now)
+                network.poll(WAIT_S, clock)
+                deadline = max(deadline, clock())  # what was waited is not made up for
                 continue
             if now - deadline > late:
                 world.overruns += 1
@@ -178,12 +206,13 @@ def _alive(process: int) -> bool:
 def main() -> None:
     """Entry point of `python -m weldcal.tools.emulators.ur`."""
     parser = argparse.ArgumentParser(prog="python -m weldcal.tools.emulators.ur", description=__doc__)
-    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
+    parser.add_argument("--host", default=DEFAULT, help="loopback address to listen on")
     parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
     parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
     parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
     parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
     parser.add_argument("--pace", type=float, default=1.0, help="controller seconds per host second, 0.05 to 1")
+    parser.add_argument("--lockstep", type=float, default=0.0, help="seconds for which time waits for a late client")
     parser.add_argument("--seed", type=int, default=0, help="everything random follows from this number")
     parser.add_argument("--parent", type=int, help="end when this process ends")
     options = parser.parse_args()

@@ -1,24 +1,23 @@
-"""Starts an emulated controller as a child process, one at a time per loopback address, and always ends it."""
+"""Starts an emulated controller as a child process on a loopback address of its own, and always ends it."""
 
-import fcntl
 import json
 import os
 import select
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from weldcal.models.errors import InputError
+from weldcal.tools.emulators.ur.addresses import PORTS, free_address, take_address
 
-HOST = "127.0.0.1"
 CONTROL_PORT = 30090
 READY = "ready"
+LOCKSTEP_S = 2.0  # where nobody measures real time
 START_LIMIT_S = 30.0
 ANSWER_LIMIT_S = 10.0
 
@@ -96,67 +95,49 @@ class Emulator:
 @contextmanager
 def emulator_process(
     *,
-    host: str = HOST,
+    host: str | None = None,
     control_port: int = CONTROL_PORT,
     polyscope: str = "5.21",
     q: Sequence[float] | None = None,
     kinematics: Path | None = None,
     pace: float = 1.0,
+    lockstep: float = 0.0,
     seed: int = 0,
     wait_for_lock_s: float = 120.0,
 ) -> Iterator[Emulator]:
-    """An emulator that listens, under the lock that keeps this address's ports for one owner at a time.
+    """An emulator that listens, under the lock that keeps its address's ports for one owner at a time.
 
     The child ends with the block, and with this process (`--parent`) where that is killed; it has a session of its own,
     so that Ctrl-C reaches its user and not the controller.
 
     Args:
-        host: the loopback address; each has its own lock.
+        host: the loopback address, each with its own lock; None: one that nobody uses.
         control_port: port of the control channel.
         polyscope: controller version, such as 5.12, 5.21 or 10.7.
         q: joint angles at the start (6,) (rad); the emulator's home where None.
         kinematics: a robot's factory calibration; nominal where None.
         pace: controller seconds per host second, 0.05 to 1.
+        lockstep: for so long (s of the host) its time waits for a client that streams and is late; 0: never.
         seed: everything random follows from it.
-        wait_for_lock_s: how long to wait for another owner to finish (s).
+        wait_for_lock_s: how long to wait for another owner of `host` to finish (s).
 
     Raises:
         InputError: the lock or a port is taken, or an argument is not one.
     """
-    command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", host]
-    command += ["--control-port", str(control_port), "--polyscope", polyscope, "--pace", str(pace), "--seed", str(seed)]
-    if q is not None:
-        command += ["--q", *(repr(float(angle)) for angle in q)]
-    if kinematics is not None:
-        command += ["--kinematics", str(kinematics)]
-    with lock_path(host).open("w") as handle:
-        _take(handle, host, wait_for_lock_s)
-        emulator = _started(command, host, control_port)
+    ports = (*PORTS, control_port)
+    with take_address(host, wait_for_lock_s) if host is not None else free_address(ports) as address:
+        command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", address]
+        command += ["--control-port", str(control_port), "--polyscope", polyscope]
+        command += ["--pace", str(pace), "--lockstep", str(lockstep), "--seed", str(seed)]
+        if q is not None:
+            command += ["--q", *(repr(float(angle)) for angle in q)]
+        if kinematics is not None:
+            command += ["--kinematics", str(kinematics)]
+        emulator = _started(command, address, control_port)
         try:
             yield emulator
         finally:
             emulator.close()
-
-
-def lock_path(host: str) -> Path:
-    """The file whose lock keeps the ports of one address for one owner."""
-    name = f"weldcal-ur-emulator-{os.getuid()}" + ("" if host == HOST else f"-{host}")
-    return Path(tempfile.gettempdir()) / f"{name}.lock"
-
-
-def _take(handle: IO[str], host: str, limit_s: float) -> None:
-    until = time.monotonic() + limit_s
-    while True:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            if time.monotonic() > until:
-                raise InputError(
-                    f"Another emulated controller has held the ports of {host} for {limit_s:.0f} s; "
-                    "wait for it, stop it, or use another loopback address."
-                ) from None
-            time.sleep(0.05)
 
 
 def _started(command: list[str], host: str, control_port: int) -> Emulator:

@@ -175,6 +175,8 @@ class Bench:
     def signal_worker(self, number: signal.Signals) -> float:
         """To the link's worker, if it lives; when the signal was sent (s, monotonic)."""
         assert self.link is not None
+        if number is signal.SIGSTOP:
+            self.emulator.do("expect_silence")  # lockstep would wait for it
         now = time.monotonic()
         self.link._process.send_signal(number)
         return now

@@ -15,6 +15,8 @@ STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3
 
 LINK = frozenset({Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF})
+# ur_rtde connects anew by itself while it sends, and may take the worker with it
+LOST = LINK | {Fault.WORKER_DIED}
 DEAF = LINK | {Fault.GUARD_LATCHED}
 ALL = frozenset(Fault) - {Fault.NONE}
 
@@ -136,13 +138,13 @@ RUNNING: tuple[Case, ...] = (
         rest_s=1.0,
         short=False,
     ),
-    _stops("RTDE connections reset", _fault("reset_tcp"), LINK),
-    _stops("RTDE connections closed", _fault("close_tcp"), LINK, short=False),
+    _stops("RTDE connections reset", _fault("reset_tcp"), LOST),
+    _stops("RTDE connections closed", _fault("close_tcp"), LOST, short=False),
     _stops("receiving connection reset", _fault("reset_tcp", index=0), LINK),
-    _stops("commanding connection reset", _fault("reset_tcp", index=1), LINK),
+    _stops("commanding connection reset", _fault("reset_tcp", index=1), LOST),
     _stops("receiving connection closed", _fault("close_tcp", index=0), LINK, short=False),
-    _stops("commanding connection closed", _fault("close_tcp", index=1), LINK, short=False),
-    _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
+    _stops("commanding connection closed", _fault("close_tcp", index=1), LOST, short=False),
+    _stops("every connection reset", _fault("reset_tcp", kind="all"), LOST),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
     # the guard slows the arm, and the next number gives it its speed back
     Case("numbers 15 ms late", _fault("mute_input", seconds=0.015), GO, may_rest=True),

@@ -15,7 +15,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.pacing import no_long_garbage_collections
 from weldcal.systems.runner import Progress, no_progress
-from weldcal.tools.emulators.ur.process import HOST, emulator_process
+from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.robot.bench import OUTPUT, SPEED_M_S, Bench, StoppedUnasked
@@ -70,17 +70,18 @@ class Outcome:
         return ", ".join(parts) + (f": {self.sentence}" if self.sentence else "")
 
 
-def run_case(bench: Bench, case: Case, *, hasty: bool = False) -> Outcome:
+def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = STARTS) -> Outcome:
     """Injects one fault and observes; leaves the controller in order, without a link.
 
-    `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long.
+    `hasty`: after a stop the worker is killed instead of asked to end, and it is watched for less long. `attempts`: how
+    often a case may be tried where the load of this computer spoils it.
     """
-    for retries in range(STARTS):
+    for retries in range(attempts):
         overruns = bench.emulator.state()["overruns"]
         try:
             outcome = _at_start(bench, case) if case.must == REFUSE else _running(bench, case, hasty)
             busy = outcome.fault in LOADED or bench.emulator.state()["overruns"] > overruns
-            if not outcome.ok and busy and retries < STARTS - 1:
+            if not outcome.ok and busy and retries < attempts - 1:
                 continue
             return replace(outcome, retries=retries)
         except StoppedUnasked as error:
@@ -257,7 +258,7 @@ class FaultReport:
 def run_fault_benchmark(
     out: Path,
     *,
-    address: str = HOST,
+    address: str | None = None,
     sequences: int = 20,
     seconds: float = 60.0,
     seed: int = 0,

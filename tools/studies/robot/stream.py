@@ -22,7 +22,7 @@ from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde, UrRtdeArm
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.systems.wall_clock import WallClock
-from weldcal.tools.emulators.ur.process import HOST, emulator_process
+from weldcal.tools.emulators.ur.process import emulator_process
 from weldcal.tools.report.files import csv_text, write_json
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.robot.faults import LOADED
@@ -197,7 +197,13 @@ def run_stream(tap: Tap, arm: ArmModel, seconds: float, progress: Progress = no_
 
 
 def run_robot_benchmark(
-    out: Path, *, address: str = HOST, minutes: float = 10.0, seed: int = 0, progress: Progress = no_progress
+    out: Path,
+    *,
+    address: str | None = None,
+    minutes: float = 10.0,
+    seed: int = 0,
+    lockstep: float = 0.0,
+    progress: Progress = no_progress,
 ) -> StreamReport:
     """On an emulated controller of its own; robot.json and missed.csv are written into `out`.
 
@@ -205,9 +211,9 @@ def run_robot_benchmark(
     goes on over a new link.
     """
     left, stops, tap = 60.0 * minutes, list[Stopped](), None
-    with emulator_process(host=address, seed=seed):
+    with emulator_process(host=address, seed=seed, lockstep=lockstep) as emulator:
         while True:
-            prepared = PrepareRobot(UrRtde(host=address), load_arm())
+            prepared = PrepareRobot(UrRtde(host=emulator.host), load_arm())
             link = cast(UrLink, prepared.handle)
             if tap is None:
                 tap = Tap(link)

@@ -12,6 +12,7 @@ from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
+from weldcal.tools.emulators.ur.lockstep import Lockstep
 from weldcal.tools.emulators.ur.wire.dashboard import IDLE_PROGRAM
 from weldcal.tools.emulators.ur.wire.external_control import CLIENT_PORT, ExternalControl
 from weldcal.tools.emulators.ur.wire.net import Connection, LinkFaults, Network, Server
@@ -43,10 +44,11 @@ class ControlServer(Server):
         rtde: RtdeServer,
         external: ExternalControl,
         checker: Checker,
+        lockstep: Lockstep,
         world: World,
     ) -> None:
         self._controller, self._network, self._external = controller, network, external
-        self._rtde, self._checker, self._world = rtde, checker, world
+        self._rtde, self._checker, self._lockstep, self._world = rtde, checker, lockstep, world
         c = controller
         self._faults: dict[str, Callable[[Request, float], None]] = {
             "drop": lambda r, now: self._each(r, drop_until=now + _number(r, "seconds")),
@@ -103,6 +105,7 @@ class ControlServer(Server):
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
             "clear_links": self._clear_links,
             "recover": self._recover,
+            "expect_silence": lambda r, now: lockstep.expect_silence(),
             "reset_checker": lambda r, now: checker.reset(),
             "quit": lambda r, now: setattr(self._world, "quit", True),
         }
@@ -148,7 +151,10 @@ class ControlServer(Server):
         if request.get("check") == "summary":
             return self._checker.summary()
         if request.get("ask") == "state":
-            return self._controller.state() | {"overruns": self._world.overruns}
+            return self._controller.state() | {
+                "overruns": self._world.overruns,
+                "lockstep": self._lockstep.state(),
+            }
         if request.get("ask") == "log":
             return {"log": list(self._controller.log)}
         if request.get("ask") == "program":

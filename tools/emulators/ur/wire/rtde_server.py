@@ -56,11 +56,11 @@ class Session:
 
 
 class RtdeServer(Server):
-    """The protocol; `on_input` hears of every input package (for the checker)."""
+    """The protocol; `on_input` hears of every input package: its connection, its recipe, when."""
 
     kind = "rtde"
 
-    def __init__(self, controller: Controller, on_input: Callable[[tuple[str, ...], float], None]) -> None:
+    def __init__(self, controller: Controller, on_input: Callable[[Connection, int, float], None]) -> None:
         self._controller = controller
         self._on_input = on_input
         self._sessions: dict[Connection, Session] = {}
@@ -195,7 +195,7 @@ class RtdeServer(Server):
         if masked:
             apply_masked(self._controller, masked)
         self._controller.written(recipe.names)
-        self._on_input(recipe.names, now)
+        self._on_input(connection, payload[0], now)
 
     def frame(self, now: float) -> None:
         for connection, session in self._sessions.items():

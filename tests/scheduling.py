@@ -1,0 +1,37 @@
+"""How the tests are dealt to the processes of pytest-xdist: file by file, what streams to an emulated robot one by one."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+from xdist.scheduler.loadfile import LoadFileScheduling
+
+# They stream in time with a clock, and a Diagram that does takes a core: two at once would only slow each other down.
+STREAMING = (
+    *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
+    *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py"),
+)
+# A core that is left with one of these at the end keeps the other waiting.
+SLOWEST = ("test_readme.py", "test_cell.py")
+MOST_PROCESSES = 4
+
+
+def processes() -> int:
+    """One for each core, and one for the streaming tests, which sleep most of their time."""
+    return min(len(os.sched_getaffinity(0)), MOST_PROCESSES) + 1
+
+
+def order(item: pytest.Item) -> tuple[object, ...]:
+    """Streams first, for they take their time whatever the others do; then what takes longest."""
+    name = item.path.name
+    streams = STREAMING.index(name) if name in STREAMING else len(STREAMING)
+    return streams, name not in SLOWEST, item.path.parent.name != "scenario"
+
+
+class Scheduling(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
+    """File by file, but all that stream are one file."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        path = nodeid.split("::", 1)[0]
+        return "streaming" if path.rsplit("/", 1)[-1] in STREAMING else path

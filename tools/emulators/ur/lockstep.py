@@ -1,0 +1,83 @@
+"""Lockstep: the controller's time waits, up to a bound of the host's time, for a client that streams and is late."""
+
+from typing import Any
+
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import RuntimeState
+from weldcal.tools.emulators.ur.wire.net import Connection
+
+AHEAD_FRAMES = 5  # so far the controller goes past a stream's newest package
+STREAM_PACKAGES = 5  # of one recipe and never further apart: from then on it is a stream
+
+
+class Lockstep:
+    """Says before every frame whether it has to wait.
+
+    A stream is a run of input packages of one recipe. It ends with a package of another recipe, with its connection, with
+    the program, and where the client stays silent for `bound_s`. A connection that a fault keeps from being heard is not
+    waited for.
+    """
+
+    def __init__(self, controller: Controller, bound_s: float) -> None:
+        self._controller = controller
+        self._bound_s = bound_s
+        self._client: Connection | None = None
+        self._silenced: Connection | None = None
+        self._recipe = 0
+        self._run = 0
+        self._frame = 0
+        self._since: float | None = None
+        self._waits = self._given_up = 0
+        self._longest_s = self._waited_s = 0.0
+
+    def heard(self, connection: Connection, recipe: int, now: float) -> None:
+        """An input package has come."""
+        self._end_wait(now)
+        frame = self._controller.frame
+        again = connection is self._client and recipe == self._recipe and frame - self._frame <= AHEAD_FRAMES
+        self._client, self._recipe, self._frame = connection, recipe, frame
+        self._run = self._run + 1 if again else 1
+
+    def expect_silence(self) -> None:
+        """The client that streams now will be silenced on purpose: it is not waited for any more."""
+        self._silenced = self._client
+
+    def waits(self, now: float) -> bool:
+        """Whether the next frame has to wait for the client's next package."""
+        if not (self._bound_s and self._streams(now) and self._controller.frame - self._frame >= AHEAD_FRAMES):
+            self._end_wait(now)
+            return False
+        if self._since is None:
+            self._since = now
+            self._waits += 1
+        if now - self._since < self._bound_s:
+            return True
+        self._given_up += 1
+        self._end_wait(now)
+        self._run = 0
+        return False
+
+    def state(self) -> dict[str, Any]:
+        """What it has waited for since the start (s of the host)."""
+        return {
+            "bound_s": self._bound_s,
+            "waits": self._waits,
+            "given_up": self._given_up,
+            "longest_s": round(self._longest_s, 6),
+            "waited_s": round(self._waited_s, 6),
+        }
+
+    def _streams(self, now: float) -> bool:
+        client = self._client
+        if client is None or self._run < STREAM_PACKAGES or client is self._silenced:
+            return False
+        if self._controller.runtime_state != RuntimeState.PLAYING:
+            self._run = 0
+            return False
+        return client.readable(now) and now >= client.faults.deaf_until
+
+    def _end_wait(self, now: float) -> None:
+        if self._since is not None:
+            self._longest_s = max(self._longest_s, now - self._since)
+            self._waited_s += now - self._since
+            self._since = None
