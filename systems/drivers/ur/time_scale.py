@@ -2,7 +2,7 @@
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
 ZERO_S = 0.050
-RISE_PER_S = 5.0
+RISE_PER_S = 10.0
 
 
 class TimeScale:

@@ -126,8 +126,9 @@ class Worker:
         return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
 
     def _scaled(self, command: Command, now: float) -> Command:
-        """The command with the factor that slows the arm while it is late."""
-        return replace(command, scale=self._scale.step(now, now - command.given_at))
+        """The command with the factor that slows the arm while it is late, but not under a burning torch, which goes out first."""
+        factor = self._scale.step(now, now - command.given_at)
+        return command if command.process else replace(command, scale=factor)
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:

@@ -140,7 +140,7 @@ class Checker:
         rows = self._rows()
         rows = rows[rows[:, TIME] >= fault_time]
         on = (rows[:, OUTPUTS].astype(np.int64) >> output & 1).astype(bool)
-        last = float(rows[np.flatnonzero(on)[-1], TIME] - fault_time) * self._pace if on.any() else None
+        last = float(np.flatnonzero(on)[-1] * STEP_S) if on.any() else None
         return {"ok": True, "on_s": float(on.sum() * STEP_S), "last_on_s": last}
 
     def summary(self) -> dict[str, Any]:

@@ -220,8 +220,11 @@ RUNNING: tuple[Case, ...] = (
         random=False,
     ),
     # this computer
-    _stops("cell silent for 0.3 s", lambda b: b.send(lambda qd: None, 0.3), Fault.COMMAND_LATE),
-    _stops("cell silent for ever", lambda b: b.send(lambda qd: None, 1e9), Fault.COMMAND_LATE, short=False),
+    Case("cell silent for 0.2 s", lambda b: b.send(lambda qd: None, 0.2), GO, may_rest=True),
+    _stops("cell silent for 0.7 s", lambda b: b.send(lambda qd: None, 0.7), Fault.COMMAND_LATE, watch_s=1.0),
+    _stops(
+        "cell silent for ever", lambda b: b.send(lambda qd: None, 1e9), Fault.COMMAND_LATE, short=False, watch_s=1.0
+    ),
     _stops("a velocity that is no number", _sends(lambda qd: np.full(6, np.nan)), Fault.COMMAND_NOT_FINITE),
     _stops("a velocity of 5 rad/s", _sends(lambda qd: _joint(0, 5.0)), Fault.COMMAND_TOO_FAST),
     _stops("a velocity that jumps by 0.9 rad/s", _sends(lambda qd: qd + _joint(0, 0.9)), Fault.COMMAND_JUMPED),
