@@ -18,6 +18,7 @@ from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.systems.motion.spine import FIRST
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
+from weldcal.systems.person import KEYS, Person
 from weldcal.systems.wall_clock import WallClock
 
 Progress = Callable[[str, float], None]
@@ -28,6 +29,7 @@ LOOKS = {
 }  # seconds between checks; shorter than the sequencer's period
 AT_REST_RAD_S = 1e-3
 COMMANDED_RAD_S = 1e-6
+PERSON_CHECK_S = 0.02
 COMES_TO_REST_S = 1.0  # longest time that a run continues after the end of its job until the arm is at rest
 OVERTIME_S = 5.0  # added to the time limit at which the job holds itself
 
@@ -41,6 +43,7 @@ class Run(Generic[JobOf]):
     """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
 
     `interrupted`: the reason where a person ended the run before its job. `clock`: the clock of a paced run, else None.
+    `held_by_person`: how often a person held the run and let it go on.
     """
 
     cell: Cell[JobOf]
@@ -50,6 +53,7 @@ class Run(Generic[JobOf]):
     scans: dict[str, tuple[Scan, str]] = field(default_factory=dict)
     interrupted: str | None = None
     clock: WallClock | None = None
+    held_by_person: int = 0
 
     @property
     def root(self) -> Context:
@@ -92,16 +96,26 @@ class Run(Generic[JobOf]):
         }
         if self.clock is not None:
             found |= self.clock.summary()
+        if self.held_by_person:
+            found["held_by_person"] = self.held_by_person
         return found
 
 
 def run_cell(
-    cell: Cell[JobOf], progress: Progress = no_progress, meshcat: Meshcat | None = None, realtime: bool = False
+    cell: Cell[JobOf],
+    progress: Progress = no_progress,
+    meshcat: Meshcat | None = None,
+    realtime: bool = False,
+    person: Person | None = None,
 ) -> Run[JobOf]:
     """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
     Records into `meshcat` where one is given. A station with a pace runs at that pace of the wall clock. The station is
     always closed, also on Ctrl-C, which stops its arm.
+
+    A `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so that the job goes on
+    along the same path when the person says so. Under a burning process holding ends the run as Ctrl-C does: the process is
+    turned off first, and a seam cannot be taken up again where it was left.
     """
     simulator, station = Simulator(cell.diagram), cell.station
     run = Run(cell, simulator, clock=station.robot.clock)
@@ -123,6 +137,14 @@ def run_cell(
 
     def watch(root: Context) -> EventStatus:
         nonlocal finished_at
+        if person is not None and person.holds:
+            if _process_on(cell, root):
+                run.interrupted = f"A person held the job while the process was on, in the phase '{run.command.phase}'."
+                return EventStatus.ReachedTermination(cell.diagram, "held")
+            if run.clock is None or run.clock.stands or not _commanded(cell, root):
+                _stand(run, person, progress)
+            else:
+                run.clock.held = True
         if run.clock is not None:
             run.clock.wait_for(root.get_time(), _commanded(cell, root))
         if not due("job", root.get_time()):
@@ -167,6 +189,24 @@ def run_cell(
         meshcat.StopRecording()
         meshcat.PublishRecording()
     return run
+
+
+def _stand(run: Run[JobOf], person: Person, progress: Progress) -> None:
+    """Keep the arm at rest and the Diagram's time where it is until the person lets the job go on."""
+    phase, share = run.cell.job.stage(run.root, run.phases)
+    progress(f"held by a person ({phase}). {KEYS}", share)
+    run.held_by_person += 1
+    while person.holds:
+        run.cell.station.robot.rest()
+        time.sleep(PERSON_CHECK_S)
+    progress(phase, share)
+    if run.clock is not None:
+        run.clock.go_on()
+
+
+def _process_on(cell: Cell[JobOf], root: Context) -> bool:
+    """Whether the process (the torch) is enabled."""
+    return bool(cell.diagram.GetOutputPort("process_on").Eval(root)[0] > 0.5)
 
 
 def _commanded(cell: Cell[JobOf], root: Context) -> bool:

@@ -12,6 +12,7 @@ ON_TIME_MS = 4.0
 SLOW_FROM_S, SLOW_SPAN_S = 0.0015, 0.005
 FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 rad/s^2 to them, and the link allows 40
 SLOWEST = 0.1
+STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops within a step of the slew limit
 
 
 @dataclass
@@ -50,7 +51,7 @@ class WallClock:
     slider. A single delay of more than LATE_S is never made up for, because a robot executes commands when they arrive: the
     Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the arm was commanded to move,
     `thinking_s` the maximum while it was at rest, where computing time is not limited. `reanchored` counts the delays of more
-    than LATE_S during motion, and `lost_s` is their sum.
+    than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants the path to stand still.
     """
 
     def __init__(
@@ -66,6 +67,16 @@ class WallClock:
         self.reanchored = 0
         self.lost_s = 0.0
         self.lateness = Lateness()
+        self.held = False
+
+    @property
+    def stands(self) -> bool:
+        """Whether a held path has come to rest."""
+        return self.held and self.rate <= STOPPED
+
+    def go_on(self) -> None:
+        """Let a held path go on: the time that it stood is no lateness."""
+        self.held, self._due = False, self._clock()
 
     def wait_for(self, diagram_time: float, moving: bool) -> None:
         """Wait until the wall clock reaches this time of the Diagram. `moving`: the arm is commanded to move."""
@@ -100,10 +111,13 @@ class WallClock:
         # a single long delay says nothing about the rate that the computer can keep
         if not moving or late > LATE_S:
             wanted = 1.0
+        if self.held:
+            wanted = STOPPED
         robot_step = step / self.rate
         self.slowed_s += robot_step - step
         self.rate = min(max(wanted, self.rate - FALL_PER_S * robot_step), self.rate + RISE_PER_S * robot_step)
-        self.slowest_rate = min(self.slowest_rate, self.rate)
+        if not self.held:
+            self.slowest_rate = min(self.slowest_rate, self.rate)
 
     def summary(self) -> dict[str, object]:
         """The JSON values of a paced run."""

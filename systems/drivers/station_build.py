@@ -39,6 +39,11 @@ class PreparedRobot:
         """Seconds of the robot per second of the wall clock; None without a clock."""
         return None if self.clock is None else self.clock.pace
 
+    def rest(self) -> None:
+        """Keep the arm at rest while the Diagram stands, with the handle's `rest` where it has one."""
+        if (rest := getattr(self.handle, "rest", None)) is not None:
+            rest()
+
     def close(self) -> None:
         """Close the resource that the driver holds open."""
         if self.handle is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -104,6 +105,29 @@ def test_lateness_is_counted_in_bins_of_robot_time_while_the_arm_moves() -> None
     assert clock.lateness.counts == [1, 1, 0, 1, 1, 0, 0, 0, 1]
     assert clock.lateness.on_time_percent == pytest.approx(60.0)
     assert clock.lateness.worst_ms == pytest.approx(300.0)
+
+
+def test_a_held_path_slows_to_rest_and_goes_on_without_a_jerk_and_without_being_late() -> None:
+    wall, clock = clock_at(1.0)
+    clock.held = True
+    k = 0
+    while not clock.stands:
+        k += 1
+        wall.now += 1e-4
+        clock.wait_for(TICK_S * k, moving=True)
+    assert wall.now - 100.0 < 0.2
+    wall.now += 30.0  # a person looks at the arm
+    clock.go_on()
+    rates = [clock.rate]
+    while clock.rate < 1.0:
+        k += 1
+        wall.now += 1e-4
+        clock.wait_for(TICK_S * k, moving=True)
+        rates.append(clock.rate)
+    assert rates[0] <= 0.02
+    assert max(b - a for a, b in pairwise(rates)) < 0.25
+    assert (clock.reanchored, clock.late_s) == (0, 0.0)
+    assert clock.slowest_rate > 0.0
 
 
 def test_without_a_velocity_nothing_was_late() -> None:

@@ -13,6 +13,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.person import person_at
 from weldcal.systems.runner import Progress, Run, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
@@ -66,7 +67,8 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                 if options.browser:
                     webbrowser.open(meshcat.web_url())
                     time.sleep(2.0 if options.realtime else 0.5)  # the page needs a moment to load
-            run = run_cell(cell, progress, meshcat, options.realtime)
+            with person_at() as person:
+                run = run_cell(cell, progress, meshcat, options.realtime, person)
     return JobRun(run, meshcat, robot.title)
 
 

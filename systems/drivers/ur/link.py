@@ -160,6 +160,10 @@ class UrLink:
         self._memory.command.write([float(self._number), time.monotonic(), 0.0, float(process), *map(float, qd)])
         return self._number
 
+    def rest(self) -> None:
+        """Command zero velocity, with the process off, until the next command."""
+        self.command(np.zeros(6))
+
     def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
         """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no sample."""
         return self._memory.ring.at(host_time)
