@@ -69,6 +69,9 @@ NAMES = {
     "thinking_ms": "longest computation at rest (ms)",
     "reanchored": "times behind real time",
     "fell_behind": "note",
+    "slowed_to_percent": "slowest rate of the path (%)",
+    "slowed_s": "time added by slowing (s)",
+    "held_by_person": "times held by a person",
 }
 """Printed names of the numbers of the JSON object whose keys are too short."""
 

@@ -9,6 +9,7 @@ from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.weld import heat_input_kJ_mm
 from weldcal.tools.report import plots_demo, plots_weld
 from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.robot_timing import robot_timing
 
 STORY = {
     "start": "get ready",
@@ -73,6 +74,7 @@ def demo_report(result: DemoResult, pictures: dict[str, bytes], *, recording: bo
         observations=_observations(result),
         timing=_timing(result),
         recording=recording,
+        **robot_timing(result.run),
     )
 
 

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from weldcal.tools.outcomes.mounting import MountingReport
 from weldcal.tools.report.pictures import OURS, error_bars, svg
 from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.robot_timing import robot_timing
 
 
 def mounting_report(report: MountingReport, picture: bytes | None) -> str:
@@ -36,6 +37,7 @@ def mounting_report(report: MountingReport, picture: bytes | None) -> str:
     ]
     return render(
         "mounting.html.j2",
+        **robot_timing(report.run),
         name=mounting.name,
         words=mounting.words,
         equation=mounting.equation,

@@ -1,19 +1,24 @@
 """The report pages of a live profiler run and of many: what was found, how far from the truth, in pictures and a table."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.profiler.state import ProfilerState
+from weldcal.systems.runner import Run
 from weldcal.tools.outcomes.profiler import LiveOutcome, PoseOutcome
 from weldcal.tools.report.plots_profiler_live import path_picture, profiles_picture, sigmas_picture, torch_bars
 from weldcal.tools.report.render import fixed, render
+from weldcal.tools.report.robot_timing import robot_timing
 
 LIMIT_MM = 0.3
 
 
-def live_report(summary: Mapping[str, object], outcome: LiveOutcome, state: ProfilerState, *, recording: bool) -> str:
+def live_report(
+    summary: Mapping[str, object], outcome: LiveOutcome, state: ProfilerState, run: Run[Any], *, recording: bool
+) -> str:
     """One run's page as one self-contained HTML text."""
     poses = {name: [p] for name, p in _poses(outcome).items()}
     paths = {n: p for n in ("points", "curve", "torch") if (p := getattr(outcome, n)) is not None}
@@ -35,6 +40,7 @@ def live_report(summary: Mapping[str, object], outcome: LiveOutcome, state: Prof
         header=(),
         tip_mm=outcome.tip_mm,
         recording=recording,
+        **robot_timing(run),
     )
 
 

@@ -16,6 +16,7 @@ from weldcal.systems.jobs.tablet.job import AddedVisit
 from weldcal.systems.runner import Run
 from weldcal.tools.report.pictures import OURS, svg
 from weldcal.tools.report.render import fixed, fixed_row, render
+from weldcal.tools.report.robot_timing import robot_timing
 
 Card = tuple[str, str, str, str, str]
 _MARK = (40, 60, 220)  # BGR
@@ -164,7 +165,11 @@ def visit_report(
     touched = ("Landmarks touched", str(found["n_touches"]), f"of {len(job.plan.q_above)}", "plain", "by contact")
     if result is None or shown is None:
         verdict = ("bad", "The run was held", str(found.get("reason", "")))
-        return render("tablet.html.j2", page=Page(verdict=verdict, cards=[touched], provenance=provenance, **common))
+        return render(
+            "tablet.html.j2",
+            page=Page(verdict=verdict, cards=[touched], provenance=provenance, **common),
+            **robot_timing(run),
+        )
     unseen = found["unseen_touch_mm"]
     header, rows = landmark_rows(result, shown.names)
     cards: list[Card] = [
@@ -176,6 +181,7 @@ def visit_report(
     ]  # fmt: skip
     return render(
         "tablet.html.j2",
+        **robot_timing(run),
         page=Page(
             verdict=_verdict(result, f"Error at untouched points: at most {fixed(unseen['max'], 2)} mm."),
             cards=cards,

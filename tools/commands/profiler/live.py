@@ -60,7 +60,8 @@ def write_live(live: ProfilerLive, finished: JobRun) -> None:
         write_atomic(folder / "seam.csv", mappings_csv(rows))
     finished.write_recording(folder)
     write_atomic(
-        folder / "report.html", live_report(live.summary(), live.outcome, s, recording=finished.meshcat is not None)
+        folder / "report.html",
+        live_report(live.summary(), live.outcome, s, finished.run, recording=finished.meshcat is not None),
     )
 
 

@@ -1,0 +1,55 @@
+"""The section of a run with a robot: how late each velocity left the Diagram, as a histogram and in words."""
+
+from itertools import pairwise
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from weldcal.systems.runner import Run
+from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
+from weldcal.tools.report.pictures import GREY, OURS, THEIRS, plain, svg
+from weldcal.tools.report.render import fixed
+
+
+def robot_timing(run: Run[Any]) -> dict[str, object]:
+    """What `base.html.j2` shows of the run's timing, as the context `robot_timing`; empty without a robot's clock."""
+    clock = run.clock
+    if clock is None or not sum(clock.lateness.counts):
+        return {}
+    late = clock.lateness
+    slowed = (
+        f"The path was slowed to {fixed(100.0 * clock.slowest_rate, 0)} % at the slowest, and took {fixed(clock.slowed_s, 2)} s longer."
+        if clock.slowest_rate < 1.0
+        else "The path was never slowed."
+    )
+    return {
+        "robot_timing": {
+            "picture": histogram(late),
+            "sentence": (
+                f"{fixed(late.on_time_percent, 2)} % of {sum(late.counts)} velocities left less than {ON_TIME_MS:.0f} ms late "
+                f"while the arm moved; the latest {fixed(late.worst_ms, 1)} ms. {slowed}"
+            ),
+            "behind": clock.sentence(),
+        }
+    }
+
+
+def histogram(late: Lateness) -> bytes:
+    """The counts of each bin as bars on a logarithmic axis, as SVG."""
+    names = [f"< {LIMITS_MS[0]:g}"]
+    names += [f"{low:g} – {high:g}" for low, high in pairwise(LIMITS_MS)]
+    names.append(f"≥ {LIMITS_MS[-1]:g}")
+    on_time = LIMITS_MS.index(ON_TIME_MS) + 1
+    figure = Figure(figsize=(7.2, 2.6), layout="constrained")
+    axes = figure.subplots()
+    colours = [OURS if k < on_time else THEIRS for k in range(len(names))]
+    axes.bar(range(len(names)), late.counts, color=colours, width=0.8)
+    for k, count in enumerate(late.counts):
+        axes.annotate(
+            str(count), (k, max(count, 0.8)), ha="center", va="bottom", fontsize=8, color="black" if count else GREY
+        )
+    axes.set_yscale("log")
+    axes.set_ylim(0.5, 5.0 * max(late.counts))
+    axes.set_xticks(range(len(names)), names)
+    plain(axes, "late by, ms of robot time", "velocities")
+    return svg(figure, axes)
