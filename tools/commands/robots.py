@@ -81,7 +81,9 @@ def chosen_robot(
         return
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
-    with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace):
+    with emulator_process(host=host, q=q_home.tolist(), kinematics=kinematics, pace=pace) as emulator:
+        load = (scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)).load()
+        emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
         yield _at(host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
 
 
@@ -119,7 +121,9 @@ def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
     Raises:
         RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
     """
-    report = preflight(config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm))
+    report = preflight(
+        config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm), load=config.load()
+    )
     require_ready(report)
     assert report.arm is not None
     assert report.arm_q is not None
