@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,10 @@ from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import SENTENCES
 from weldcal.systems.drivers.ur.readiness import preflight as module
 from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo, read_kinematics
+from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
-from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
+from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
 from weldcal.tools.commands.check_robot import emit_table
 from weldcal.tools.emulators.ur.addresses import PORTS, free_address
 from weldcal.tools.emulators.ur.main import HOME
@@ -148,6 +150,81 @@ def test_each_fault_is_named_with_what_to_press(
     with pytest.raises(RobotRefused) as refused:
         require_ready(report)
     assert str(refused.value) == problem.operator_action
+
+
+TORCH = UrRtde(host=HOST).load("the welding tool")
+
+
+@pytest.mark.parametrize(
+    ("mass", "cog", "ok"),
+    [
+        (1.4, [0.03, 0.0, 0.05], True),
+        (1.44, [0.033, 0.004, 0.046], True),  # as well as a tool is weighed
+        (1.5, [0.03, 0.0, 0.05], False),
+        (0.0, [0.0, 0.0, 0.0], False),
+        (1.4, [0.03, 0.0, 0.06], False),
+    ],
+)
+def test_the_payload_is_compared_with_the_jobs(robot: Emulator, mass: float, cog: list[float], ok: bool) -> None:
+    robot.do("set_payload", mass=mass, cog=cog)
+    try:
+        report = preflight(HOST, load=TORCH)
+        shown = preflight(HOST)
+    finally:
+        robot.do("set_payload", mass=1.4, cog=[0.03, 0.0, 0.05])
+    assert report.ok == ok, report.checks
+    assert shown.ok
+    assert shown.checks[CHECKS.index("payload")].found.endswith("(not compared)")
+    found = report.checks[CHECKS.index("payload")]
+    assert f"{mass:.2f} kg" in found.found
+    if not ok:
+        with pytest.raises(
+            RobotRefused, match=r"of the welding tool: set 1\.40 kg at \(30, 0, 50\) mm under Installation"
+        ):
+            require_ready(report)
+
+
+def test_a_bare_flange_has_no_centre_of_gravity(robot: Emulator) -> None:
+    robot.do("set_payload", mass=0.0, cog=[0.0, 0.0, 0.07])
+    try:
+        assert preflight(HOST, load=ExpectedLoad(0.0, (0.0, 0.0, 0.0), "nothing")).ok
+        named = weldcal(HOST, "--json", "--scenario", "calibrate_only")
+        default = weldcal(HOST, "--json")
+    finally:
+        robot.do("set_payload", mass=1.4, cog=[0.03, 0.0, 0.05])
+    assert named.returncode == 0, named.stderr
+    (found,) = [check["found"] for check in json.loads(named.stdout)["checks"] if check["name"] == "payload"]
+    assert found == "0.00 kg at (0, 0, 70) mm (scenario calibrate_only)"
+    assert default.returncode == 1
+    assert "The payload is not that of the welding tool" in default.stderr
+
+
+def test_a_controller_without_its_payload_is_told_in_a_sentence(
+    robot: Emulator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Without(RtdeProbe):
+        def read(self, names: Sequence[str]) -> dict[str, Value]:
+            return super().read([name for name in names if "payload" not in name])
+
+    monkeypatch.setattr(module, "RtdeProbe", Without)
+    problem = preflight(HOST, load=TORCH).first_problem
+    assert problem is not None
+    assert (problem.name, problem.found) == ("payload", "not readable")
+    assert "update PolyScope" in problem.operator_action
+
+
+@pytest.mark.parametrize(("mode", "ok", "found"), [("manual", False, "Manual"), ("automatic", True, "Automatic")])
+def test_a_robot_in_manual_mode_is_refused(robot: Emulator, mode: str, ok: bool, found: str) -> None:
+    assert preflight(HOST).checks[CHECKS.index("operational mode")].found == "no operational mode is set up"
+    assert ask(HOST, f"set operational mode {mode}") == f"Setting operational mode: {mode.upper()}"
+    try:
+        report = preflight(HOST)
+    finally:
+        ask(HOST, "clear operational mode")
+    check = report.checks[CHECKS.index("operational mode")]
+    assert (check.ok, check.found) == (ok, found)
+    assert report.ok == ok
+    assert ok or "three-position enabling device" in check.operator_action
 
 
 def test_reduced_mode_is_a_remark(robot: Emulator) -> None:
@@ -301,6 +378,8 @@ def test_a_dashboard_that_talks_nonsense_is_quoted(robot: Emulator, monkeypatch:
     monkeypatch.setattr(module, "ask", lambda *_: "could not understand: 'this'")
     found = [check for check in preflight(robot.host).checks if not check.ok]
     assert [check.name for check in found] == ["program", "remote control"]
+    mode = preflight(HOST).checks[CHECKS.index("operational mode")]
+    assert (mode.ok, mode.found) == (True, "not readable; look at the pendant")
     assert all("could not understand: 'this'" in check.found for check in found)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from weldcal.models.arms.kinematics import load_arm
-from weldcal.systems.drivers.ur.robot import guard_script
+from weldcal.systems.drivers.ur.robot import guard_script, same_payload
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.main import HOME
@@ -208,6 +208,22 @@ def test_the_tcp_is_zero_after_the_start_and_the_payload_can_be_set() -> None:
     guarded = Guarded()
     guarded.once(PAYLOAD, [1.7, 0.03, 0.0, 0.05])
     assert guarded.controller.payload.mass == pytest.approx(1.7)
+
+
+@pytest.mark.parametrize(
+    ("mass", "cog", "same"),
+    [
+        (1.4, (0.03, 0.0, 0.05), True),
+        (1.395, (0.0305, 0.0, 0.05), True),
+        (1.2, (0.03, 0.0, 0.05), False),
+        (1.4, (0.03, 0.0, 0.053), False),
+    ],
+)
+def test_the_payload_that_is_read_back_must_be_the_one_that_was_set(
+    mass: float, cog: tuple[float, ...], same: bool
+) -> None:
+    assert same_payload({"payload": mass, "payload_cog": cog}, 1.4, [0.03, 0.0, 0.05]) == same
+    assert not same_payload({"payload": mass}, 1.4, [0.03, 0.0, 0.05])
 
 
 FAST = [0.5, 0.3, 0.0, 0.0, 0.0, -0.4]

@@ -34,13 +34,18 @@ def robots(
 
 @command("check-robot", common=LOOK, short_help="Check whether a robot is ready. Nothing moves.")
 def check_robot(
-    call: Call, host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")]
+    call: Call,
+    host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
+    scenario: Annotated[
+        str | None,
+        option("--scenario", "NAME", "Compare the payload with this scenario's; without it, the welding tool's."),
+    ] = None,
 ) -> Outcome:
     """Check whether a robot is ready: a table of what is right and what to change. Nothing moves or is written."""
     from weldcal.systems.drivers.ur.readiness.preflight import preflight
-    from weldcal.tools.commands.check_robot import as_json, emit_table
+    from weldcal.tools.commands.check_robot import as_json, emit_table, expected_load
 
-    report = preflight(host)
+    report = preflight(host, load=expected_load(host, scenario))
     problem = "" if report.first_problem is None else report.first_problem.operator_action
     return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
 

@@ -3,14 +3,32 @@
 import shutil
 import textwrap
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import typer
 
+from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight
+from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.commands.robots import robot_at
 
 WIDEST = 100
 MARKS = {"ok": typer.colors.GREEN, "to change": typer.colors.RED, "not checked": typer.colors.YELLOW}
+
+
+def expected_load(host: str, name: str | None) -> ExpectedLoad:
+    """The payload of a scenario; that of the welding tool, which most scenarios have, where none is named.
+
+    Raises:
+        InputError: there is no such scenario.
+    """
+    if name is None:
+        return UrRtde(host=host).load("the welding tool")
+    scenario = load_scenario(name)
+    config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
+    return config.load(f"the scenario {Path(name).stem}")
 
 
 def state_of(check: Check) -> str:

@@ -88,6 +88,8 @@ def chosen_robot(
     with emulator_process(
         host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
     ) as emulator:
+        load = (scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(emulator.host, scenario)).load()
+        emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
         yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
 
 
@@ -125,7 +127,9 @@ def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
     Raises:
         RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
     """
-    report = preflight(config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm))
+    report = preflight(
+        config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm), load=config.load()
+    )
     require_ready(report)
     assert report.arm is not None
     assert report.arm_q is not None

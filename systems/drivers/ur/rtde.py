@@ -15,6 +15,7 @@ from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import UrLink, status_of
+from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import Limits
@@ -45,6 +46,10 @@ class UrRtde(DriverConfig):
         return Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
+
+    def load(self, owner: str = "the scenario") -> ExpectedLoad:
+        """The payload with which the pre-flight compares the controller's."""
+        return ExpectedLoad(self.payload_kg, tuple(self.payload_cog_m), owner)
 
 
 class UrRtdeArm(LeafSystem):
@@ -150,7 +155,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise InputError(
             f"robot.process_output must be a standard digital output from 0 to 7, not {config.process_output}."
         )
-    report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal)
+    report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
     if arm is None:

@@ -135,7 +135,10 @@ class Bench:
         config = UrRtde(host=self.host)
         limits = config.limits(self.arm)
         output = OUTPUT if wired or process else self.output
-        self.link = UrLink.start(self.host, self.arm, limits, payload_kg=config.payload_kg, process_output=output)
+        x, y, z = config.payload_cog_m
+        self.link = UrLink.start(
+            self.host, self.arm, limits, payload_kg=config.payload_kg, payload_cog_m=(x, y, z), process_output=output
+        )
         self._stream = Stream(self.link, self.arm, self.home)
         self._stream.process = process
         self._stream.start()
@@ -234,7 +237,8 @@ def main() -> None:
     """Moves the arm at argv[1] until stdin closes or the process is killed; answers each line when it cruises."""
     host = sys.argv[1]
     arm, config = load_arm(), UrRtde(host=host)
-    link = UrLink.start(host, arm, config.limits(arm), payload_kg=config.payload_kg)
+    x, y, z = config.payload_cog_m
+    link = UrLink.start(host, arm, config.limits(arm), payload_kg=config.payload_kg, payload_cog_m=(x, y, z))
     stream = Stream(link, arm, np.array(HOME))
     stream.start()
     for _ in sys.stdin:

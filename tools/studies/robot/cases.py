@@ -254,5 +254,6 @@ AT_START: tuple[Case, ...] = (
     _refused("in recovery mode", _fault("safety_mode", value=4), "recovery", short=False),
     _refused("without power", _fault("robot_mode", value=3), "no power", short=False),
     _refused("with another TCP", _fault("wrong_tcp"), "TCP"),
+    _refused("with another payload", lambda b: b.emulator.do("set_payload", mass=0.0), "payload"),
     _refused("with the speed slider at 50 %", _fault("speed_scaling", value=0.5), "slider"),
 )

@@ -98,6 +98,8 @@ def run_case(bench: Bench, case: Case, *, hasty: bool = False, attempts: int = S
 def recover(bench: Bench) -> None:
     emulator = bench.emulator
     emulator.do("recover")
+    load = UrRtde().load()
+    emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
     emulator.wait("runtime_state", "STOPPED")
     emulator.do("set_q", q=bench.home.tolist())
 

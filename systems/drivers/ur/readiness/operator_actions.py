@@ -38,6 +38,11 @@ TCP = (
     "The TCP is not zero: open Installation > General > TCP on the pendant, set X, Y, Z, RX, RY and RZ of the default "
     "TCP to 0, and save the installation."
 )
+NO_PAYLOAD = "The controller does not report its payload: update PolyScope to 5.12 or newer."
+MANUAL = (
+    "The robot is in Manual mode, in which the arm moves only while the three-position enabling device is held: tap the mode at "
+    "the upper right of the pendant and choose Automatic."
+)
 SLIDER = (
     "The speed slider is not at 100 %: drag the slider at the bottom of the pendant's screen all the way to the right."
 )
@@ -98,6 +103,14 @@ def safety(safety_mode: int) -> str:
     return (
         f"The safety system reports {SAFETY_MODES.get(safety_mode, safety_mode)}: read the Log tab of the pendant, correct "
         "the error that it shows, and press Restart Safety in the pop-up."
+    )
+
+
+def payload(owner: str, text: str) -> str:
+    """The operator action where the payload is not the expected one."""
+    return (
+        f"The payload is not that of {owner}: set {text} under Installation > General > Payload on the pendant and save the "
+        "installation, or give what hangs on the flange as payload_kg and payload_cog_m in the scenario."
     )
 
 

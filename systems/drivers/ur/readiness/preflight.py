@@ -24,6 +24,13 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     cross_check,
     read_kinematics,
 )
+from weldcal.systems.drivers.ur.readiness.load import (
+    PAYLOAD_OUTPUTS,
+    ExpectedLoad,
+    mode_finding,
+    payload_finding,
+)
+from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET, ranges, register_names
 from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported, upper_range_works
 from weldcal.systems.drivers.ur.rtde_wire import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
 
@@ -33,8 +40,6 @@ TCP_ZERO = 1e-6
 LOCAL = "LOCAL"
 LIMIT_MARGIN_RAD = float(np.deg2rad(5.0))
 REST_RAD_S = 0.005
-# What ur_rtde's RTDEControlInterface claims: 8 integers and 18 doubles, from 0 or (upper registers) from 24.
-INTEGERS, DOUBLES, UPPER_OFFSET = 8, 18, 24
 
 OUTPUTS = (
     "runtime_state",
@@ -56,10 +61,12 @@ CHECKS = (
     "standstill",
     "joint limits",
     "TCP",
+    "payload",
     "speed slider",
     "registers",
     "kinematics",
     "flange pose",
+    "operational mode",
     "remote control",
 )
 
@@ -69,6 +76,7 @@ WAITS_FOR = {
     "joint limits": ("power",),
     "kinematics": ("power",),
     "flange pose": ("power", "kinematics"),
+    "operational mode": ("program",),
     "remote control": ("program",),
 }
 
@@ -118,7 +126,12 @@ class Preflight:
 
 
 def preflight(
-    host: str, *, upper_registers: bool | None = None, timeout_s: float = 2.0, nominal: ArmModel | None = None
+    host: str,
+    *,
+    upper_registers: bool | None = None,
+    timeout_s: float = 2.0,
+    nominal: ArmModel | None = None,
+    load: ExpectedLoad | None = None,
 ) -> Preflight:
     """Check the robot at `host` without changing anything on it.
 
@@ -128,11 +141,12 @@ def preflight(
             the client supports them.
         timeout_s: longest time of each request to the controller.
         nominal: the expected arm; a UR10e where None.
+        load: the payload that the job needs; shown and not compared where None.
 
     Raises:
         InputError: the host is empty or not an address. All other problems are failed checks.
     """
-    look = _Look(host, timeout_s, nominal or load_arm("ur10e"))
+    look = _Look(host, timeout_s, nominal or load_arm("ur10e"), load)
     look.run(upper_registers)
     return look.report()
 
@@ -152,7 +166,8 @@ def require_ready(report: Preflight) -> None:
 class _Look:
     """Performs the checks, one method each; each stores its result in `_done`."""
 
-    def __init__(self, host: str, timeout_s: float, nominal: ArmModel) -> None:
+    def __init__(self, host: str, timeout_s: float, nominal: ArmModel, load: ExpectedLoad | None) -> None:
+        self._load = load
         self._host, self._timeout_s, self._nominal = host, timeout_s, nominal
         self._done: dict[str, Check] = {}
         self._seen: Mapping[str, Value] = {}
@@ -205,6 +220,7 @@ class _Look:
         self._check_power()
         self._check_program()
         self._check_tcp()
+        self._state("payload", *payload_finding(self._seen, self._load))
         self._check_speed()
         if self._done["power"].ok:
             self._check_standstill()
@@ -224,8 +240,8 @@ class _Look:
                 return {}
             if self._upper is None:
                 self._upper = upper_range_works(rtde.version)
-            claims = rtde.claim(_registers(self._offset))
-            self._seen = rtde.read((*OUTPUTS, f"input_int_register_{self._offset}"))
+            claims = rtde.claim(register_names(self._offset))
+            self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
             self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
         return claims
@@ -285,8 +301,7 @@ class _Look:
                 self._bad("program", f"the dashboard says {told} {name}".strip(), actions.DASHBOARD)
                 return
         ready = found == "STOPPED"
-        label = f"{found} {name}".strip() if not ready else "none runs"
-        self._state("program", ready, label, actions.program(found, name))
+        self._state("program", ready, "none runs" if ready else f"{found} {name}".strip(), actions.program(found, name))
 
     def _check_standstill(self) -> None:
         speed = float(np.abs(self._vector("actual_qd")).max())
@@ -320,12 +335,12 @@ class _Look:
             (NOT_FOUND, "unknown", actions.NO_REGISTERS),
         ):
             if names := [name for name, kind in claims.items() if kind == answer]:
-                self._bad("registers", f"{_ranges(names)} {word}", action)
+                self._bad("registers", f"{ranges(names)} {word}", action)
                 return
         # An old command in the command register does not fail the check: it cannot be cleared at the pendant, the
         # driver clears it, and the guard script ignores all commands until it has read zero there.
         stale = f"; command {command} is left over, the driver clears it" if command else ""
-        self._ok("registers", f"{_ranges(list(claims))} free{stale}")
+        self._ok("registers", f"{ranges(list(claims))} free{stale}")
 
     def _check_kinematics(self) -> None:
         try:
@@ -348,6 +363,7 @@ class _Look:
 
     def _check_remote(self) -> None:
         if self._is_x():
+            self._ok("operational mode", "not readable on PolyScope X; look at the pendant")
             # PolyScope X has no dashboard; in local control it ignores scripts, and the driver refuses a guard script
             # that does not start
             self._ok("remote control", "not readable on PolyScope X; checked when the guard script starts")
@@ -355,10 +371,12 @@ class _Look:
         if not self._dashboard:
             return
         try:
-            told = self._ask("is in remote control")
+            told, mode = self._ask("is in remote control"), self._ask("get operational mode")
         except RobotUnreachable as problem:
-            self._bad("remote control", "the dashboard does not answer", str(problem))
+            for name in ("operational mode", "remote control"):
+                self._bad(name, "the dashboard does not answer", str(problem))
             return
+        self._state("operational mode", *mode_finding(mode))
         if told not in ("true", "false", LOCAL):
             self._bad("remote control", f"the dashboard says {told}", actions.DASHBOARD)
             return
@@ -371,26 +389,6 @@ class _Look:
 
     def _vector(self, name: str) -> Array:
         return np.array(self._seen[name], dtype=np.float64)
-
-
-def _registers(offset: int) -> list[str]:
-    integers = [f"input_int_register_{i}" for i in range(offset, offset + INTEGERS)]
-    return integers + [f"input_double_register_{i}" for i in range(offset, offset + DOUBLES)]
-
-
-def _ranges(names: list[str]) -> str:
-    """Register names as ranges, such as: int 24-31, double 24-41."""
-    parts = []
-    for kind in ("int", "double"):
-        numbers = sorted(int(name.rpartition("_")[2]) for name in names if name.startswith(f"input_{kind}_"))
-        runs: list[list[int]] = []
-        for number in numbers:
-            if runs and number == runs[-1][-1] + 1:
-                runs[-1].append(number)
-            else:
-                runs.append([number])
-        parts += [f"{kind} {run[0]}" + (f"-{run[-1]}" if len(run) > 1 else "") for run in runs]
-    return ", ".join(parts)
 
 
 def _triple(values: Array) -> str:

@@ -27,7 +27,8 @@ class ControllerState:
         self.inputs, self.outputs, self.terminals = Registers(), Registers(), Terminals()
         self.external_wrench = [0.0] * 6
         self.tcp_offset = [0.0] * 6
-        self.payload = Payload(0.0, [0.0] * 3, [0.0] * 6)
+        self.payload = Payload(1.4, [0.03, 0.0, 0.05], [0.0] * 6)  # [M] of the installation: the welding tool's
+        self.operational_mode = "NONE"
         self.tool_contact_steps = 0
         self.frame = 0
         self.timestamp = START_TIMESTAMP_S

@@ -103,6 +103,7 @@ class ControlServer(Server):
             "external_control": self._external_control,
             "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
+            "set_payload": self._payload,
             "clear_links": self._clear_links,
             "recover": self._recover,
             "expect_silence": lambda r, now: lockstep.expect_silence(),
@@ -238,6 +239,12 @@ class ControlServer(Server):
                 self._controller.later(STEP_S, lambda: step(i + 1))
 
         self._controller.later(STEP_S, lambda: step(1))
+
+    def _payload(self, request: Request, now: float) -> None:
+        """As the installation has it."""
+        payload = self._controller.payload
+        payload.mass = _number(request, "mass")
+        payload.center = [float(value) for value in request.get("cog", (0.0, 0.0, 0.0))]
 
     def _foreign_output(self, request: Request, now: float) -> None:
         frames = max(1, round(_number(request, "seconds", 0.0) / STEP_S))

@@ -37,7 +37,7 @@ class DashboardServer(Server):
             "programstate": self._program_state,
             "isprogramsaved": lambda: f"true {self._name()}",
             "get loaded program": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
-            "get operational mode": lambda: "NONE",
+            "get operational mode": lambda: c.operational_mode,
             "getloadedprogram": lambda: f"Loaded program: {self._loaded}" if self._loaded else "No program loaded",
             "stop": self._stop,
             "play": self._play,
@@ -51,7 +51,7 @@ class DashboardServer(Server):
             "close popup": lambda: "closing popup",
             "savelog": lambda: "Log saved to disk",
             "shutdown": lambda: "Shutting down",
-            "clear operational mode": lambda: "operational mode is no longer controlled by Dashboard Server",
+            "clear operational mode": self._clear_mode,
         }
 
     def opened(self, connection: Connection, now: float) -> None:
@@ -83,7 +83,8 @@ class DashboardServer(Server):
                 self._controller.note(f"dashboard: {argument}")
                 return "Added log message"
             case "set":
-                return f"Setting operational mode: {argument.rpartition(' ')[2].upper()}"
+                self._controller.operational_mode = argument.rpartition(" ")[2].upper()
+                return f"Setting operational mode: {self._controller.operational_mode}"
         return f"could not understand: '{command}'"
 
     def _running(self) -> bool:
@@ -128,6 +129,10 @@ class DashboardServer(Server):
             return "Failed to execute: pause"
         self._controller.pause_program()
         return "Pausing program"
+
+    def _clear_mode(self) -> str:
+        self._controller.operational_mode = "NONE"
+        return "operational mode is no longer controlled by Dashboard Server"
 
     def _load(self, name: str) -> str:
         if not name.endswith(".urp") or "missing" in name:
