@@ -54,6 +54,7 @@ class Terminals:
         self.runstate: dict[int, int] = {}
         self.analog_outputs = [0.0, 0.0]
         self.analog_output_types = 0
+        self.tool_voltage = 0
         self.speed_slider = 1.0
 
     def set_digital(self, first: int, mask: int, value: int) -> None:
