@@ -152,7 +152,7 @@ def test_each_fault_is_named_with_what_to_press(
     assert str(refused.value) == problem.operator_action
 
 
-TORCH = UrRtde(host=HOST).load("the welding tool")
+TORCH = UrRtde(host="127.0.0.1").load("the welding tool")
 
 
 @pytest.mark.parametrize(
@@ -168,8 +168,8 @@ TORCH = UrRtde(host=HOST).load("the welding tool")
 def test_the_payload_is_compared_with_the_jobs(robot: Emulator, mass: float, cog: list[float], ok: bool) -> None:
     robot.do("set_payload", mass=mass, cog=cog)
     try:
-        report = preflight(HOST, load=TORCH)
-        shown = preflight(HOST)
+        report = preflight(robot.host, load=TORCH)
+        shown = preflight(robot.host)
     finally:
         robot.do("set_payload", mass=1.4, cog=[0.03, 0.0, 0.05])
     assert report.ok == ok, report.checks
@@ -187,9 +187,9 @@ def test_the_payload_is_compared_with_the_jobs(robot: Emulator, mass: float, cog
 def test_a_bare_flange_has_no_centre_of_gravity(robot: Emulator) -> None:
     robot.do("set_payload", mass=0.0, cog=[0.0, 0.0, 0.07])
     try:
-        assert preflight(HOST, load=ExpectedLoad(0.0, (0.0, 0.0, 0.0), "nothing")).ok
-        named = weldcal(HOST, "--json", "--scenario", "calibrate_only")
-        default = weldcal(HOST, "--json")
+        assert preflight(robot.host, load=ExpectedLoad(0.0, (0.0, 0.0, 0.0), "nothing")).ok
+        named = weldcal(robot.host, "--json", "--scenario", "calibrate_only")
+        default = weldcal(robot.host, "--json")
     finally:
         robot.do("set_payload", mass=1.4, cog=[0.03, 0.0, 0.05])
     assert named.returncode == 0, named.stderr
@@ -207,7 +207,7 @@ def test_a_controller_without_its_payload_is_told_in_a_sentence(
             return super().read([name for name in names if "payload" not in name])
 
     monkeypatch.setattr(module, "RtdeProbe", Without)
-    problem = preflight(HOST, load=TORCH).first_problem
+    problem = preflight(robot.host, load=TORCH).first_problem
     assert problem is not None
     assert (problem.name, problem.found) == ("payload", "not readable")
     assert "update PolyScope" in problem.operator_action
@@ -215,12 +215,12 @@ def test_a_controller_without_its_payload_is_told_in_a_sentence(
 
 @pytest.mark.parametrize(("mode", "ok", "found"), [("manual", False, "Manual"), ("automatic", True, "Automatic")])
 def test_a_robot_in_manual_mode_is_refused(robot: Emulator, mode: str, ok: bool, found: str) -> None:
-    assert preflight(HOST).checks[CHECKS.index("operational mode")].found == "no operational mode is set up"
-    assert ask(HOST, f"set operational mode {mode}") == f"Setting operational mode: {mode.upper()}"
+    assert preflight(robot.host).checks[CHECKS.index("operational mode")].found == "no operational mode is set up"
+    assert ask(robot.host, f"set operational mode {mode}") == f"Setting operational mode: {mode.upper()}"
     try:
-        report = preflight(HOST)
+        report = preflight(robot.host)
     finally:
-        ask(HOST, "clear operational mode")
+        ask(robot.host, "clear operational mode")
     check = report.checks[CHECKS.index("operational mode")]
     assert (check.ok, check.found) == (ok, found)
     assert report.ok == ok
@@ -378,7 +378,7 @@ def test_a_dashboard_that_talks_nonsense_is_quoted(robot: Emulator, monkeypatch:
     monkeypatch.setattr(module, "ask", lambda *_: "could not understand: 'this'")
     found = [check for check in preflight(robot.host).checks if not check.ok]
     assert [check.name for check in found] == ["program", "remote control"]
-    mode = preflight(HOST).checks[CHECKS.index("operational mode")]
+    mode = preflight(robot.host).checks[CHECKS.index("operational mode")]
     assert (mode.ok, mode.found) == (True, "not readable; look at the pendant")
     assert all("could not understand: 'this'" in check.found for check in found)
 

@@ -321,7 +321,7 @@ def test_the_clients_script_asks_polyscope_10_7_for_more_than_it_has() -> None:
     with emulator_process(polyscope="10.7") as new:
         client = external_client(new)
         until = time.monotonic() + 5.0
-        while "get_mass_matrix is not defined" not in new.log():
+        while "compile_error_name_not_found" not in new.log():
             assert time.monotonic() < until, new.log()
             time.sleep(0.02)
         client.kill()

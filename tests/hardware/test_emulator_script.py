@@ -119,7 +119,8 @@ def test_a_thread_runs_beside_the_program_until_it_is_joined_or_killed() -> None
     assert said_by(body) == [3, 3]
 
 
-def test_a_critical_section_keeps_the_others_still() -> None:
+def test_a_critical_section_protects_no_longer_than_its_slice() -> None:
+    # UR's control script holds one over a whole trajectory, which its other threads cancel meanwhile
     body = """
     global n = 0
     thread counter():
@@ -128,18 +129,14 @@ def test_a_critical_section_keeps_the_others_still() -> None:
         sync()
       end
     end
-    run counter()
     enter_critical
+    run counter()
+    say(n)
     sync()
     sync()
     say(n)
-    exit_critical
-    sync()
-    sync()
-    say(n)"""
-    before, after = said_by(body)
-    assert before == 0
-    assert after >= 1
+    exit_critical"""
+    assert said_by(body) == [0, 1]
 
 
 @pytest.mark.parametrize(
@@ -148,8 +145,9 @@ def test_a_critical_section_keeps_the_others_still() -> None:
         ("while True:\nx = 1\nend", "takes no time", 2),
         ("sync()\nsay(nowhere)", "nowhere", 3),
         ("sync()\na = [1]\nsay(a[1])", "outside", 4),
-        ("if 1:\nsay(1)\nend", "True or False", 2),
+        ("if [1]:\nsay(1)\nend", "True or False", 2),
         ("say(1 / 0)", "zero", 2),
+        ("say([1, 2] + [1])", "Lists of 2 and 1", 2),
     ],
 )
 def test_a_mistake_stops_the_program_and_names_its_line(body: str, part: str, line: int) -> None:
@@ -285,8 +283,10 @@ def test_a_script_talks_to_a_server_and_waits_no_longer_than_it_says() -> None:
             end
             """
         )
-        made.step()
+        frames(made, 10)
+        server.settimeout(5.0)
         with server.accept()[0] as peer:
+            peer.settimeout(5.0)
             assert peer.recv(64) == b"hello\n" + struct.pack(">i", -2)
             peer.sendall(b"(1.5, -2e-1)" + struct.pack(">2i", 7, -8) + b"bye\n")
             frames(made, 10)

@@ -1,11 +1,15 @@
 """Arm of the emulated controller: integrates the kinematic model in steps of 2 ms."""
 
+from __future__ import annotations
+
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.models.arrays import Array
+from weldcal.tools.emulators.ur.controller.compliance import Compliance, Nominal
 from weldcal.tools.emulators.ur.controller.motions import REST_RAD_S, STEP_S, Motion, MotionRefused, slowed
 from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
 
@@ -27,6 +31,8 @@ class EmulatedArm:
         self.X_FT = np.eye(4)
         self.p_FT = np.zeros(3)
         self.motion: Motion | None = None
+        self.compliance: Compliance | None = None
+        self.touch: Callable[[], Array] = lambda: np.zeros(6)
         self.lag_s = 0.0
         self.history: deque[Array] = deque(maxlen=HISTORY)
         self._cache: dict[str, list[float]] = {}
@@ -36,7 +42,7 @@ class EmulatedArm:
         self.q_target = np.array(q, dtype=np.float64)
         self.q = self.q_target.copy()
         self.qd_target, self.qdd_target, self.qd = np.zeros(6), np.zeros(6), np.zeros(6)
-        self.motion = None
+        self.motion = self.compliance = None
         self._cache.clear()
 
     def set_tcp(self, pose: list[float]) -> None:
@@ -50,23 +56,37 @@ class EmulatedArm:
         """No joint has a target velocity."""
         return bool(np.abs(self.qd_target).max() < REST_RAD_S)
 
-    def step(self, driven: bool, scaling: float) -> None:
-        """Moves by one step; where it is not driven it brakes.
+    @property
+    def commanded(self) -> EmulatedArm | Nominal:
+        """The arm that motions start from and continue on: without what force mode adds."""
+        return self if self.compliance is None else self.compliance.nominal
+
+    def step(self, driven: bool, scaling: float, live: bool = True) -> None:
+        """Moves by one step; where it is not driven it brakes, and where it is not live force mode stands still.
 
         Raises:
             MotionRefused: the arm cannot follow; it has begun to brake.
         """
         refusal: MotionRefused | None = None
-        before = self.qd_target
+        state = self.commanded
+        before = state.qd_target
         qd = slowed(before, STOP_RAD_S2)
         if driven and self.motion is not None:
             try:
-                qd = self._checked(self.motion.velocity(self, scaling))
+                qd = self.motion.velocity(state, scaling)
+                if self.compliance is None:
+                    qd = self._checked(qd)
             except MotionRefused as refused:
                 refusal = refused
         elif self.motion is not None:
             speed = float(np.abs(before).max())
             self.motion.braked(float(np.abs(qd).max()) / speed if speed > 0.0 else 0.0)
+        if self.compliance is not None:
+            try:
+                qd = self._checked(self.compliance.velocity(self.q_target, self.X_FT, qd, self.touch(), live))
+            except MotionRefused as refused:
+                refusal, self.compliance = refused, None
+                qd = slowed(self.qd_target, STOP_RAD_S2)
         self._integrate(qd)
         if refusal is not None:
             raise refusal
@@ -81,7 +101,7 @@ class EmulatedArm:
         outside = (ahead > self.model.position_upper - LIMIT_MARGIN_RAD) & (qd > 0.0)
         outside |= (ahead < self.model.position_lower + LIMIT_MARGIN_RAD) & (qd < 0.0)
         if outside.any():
-            raise MotionRefused(f"joint {int(np.argmax(outside))} is at its limit")
+            raise MotionRefused(f"joint {int(np.argmax(outside))} is at its limit", 150)
         return qd
 
     def _integrate(self, qd: Array) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.tools.emulators.ur.controller.events import ErrorCode, ScriptStopped, Started, Stopped
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, MotionRefused
 from weldcal.tools.emulators.ur.controller.registers import Registers
@@ -44,6 +45,8 @@ class Controller(ControllerState):
             return
         if not self.remote or self.refuse_upload:
             self.note("program ignored: " + ("uploads are refused" if self.remote else "local mode"))
+            if not self.remote:
+                self.tell(ErrorCode(210, 0, 3, "The socket is read-only while the robot is in local control."))
             return
         if self.start_delay_s > 0.0:
             self.later(self.start_delay_s, lambda: self.start(source))
@@ -58,7 +61,7 @@ class Controller(ControllerState):
         elif words == "power off":
             self.power_off()
         elif words == "set unlock protective stop":
-            self.unlock_protective_stop()
+            self.unlock_protective_stop(at_once=True)
         else:
             self.power_on()
             if words == "set robotmode run":
@@ -73,7 +76,7 @@ class Controller(ControllerState):
             program = Program(source, lambda made: script_functions(self, made))
         except ScriptError as error:
             self.note(f"compile error: {error}")
-            self.events.append(("RUNTIME_EXCEPTION", str(error), error.line))
+            self.tell(ScriptStopped(str(error), error.line, error.column))
             return False
         self.script_count += 1
         if program.kind == "sec":
@@ -83,7 +86,7 @@ class Controller(ControllerState):
         self.program, self.program_name = program, program.name
         self.runtime_state = RuntimeState.PLAYING
         self.note(f"program started: {program.name}")
-        self.events.append(("STARTED", program.name, 0))
+        self.tell(Started(program.name))
         return True
 
     def stop_program(self) -> None:
@@ -98,9 +101,9 @@ class Controller(ControllerState):
         self.program.close()
         self.terminals.program_ended()
         self.note(f"program stopped: {self.program.name}")
-        self.events.append(("STOPPED", self.program.name, 0))
+        self.tell(Stopped(self.program.name))
         self.program = None
-        self.arm.motion = None
+        self.arm.motion = self.arm.compliance = None
         self.watchdogs.clear()
 
     def resume_program(self) -> bool:
@@ -154,7 +157,7 @@ class Controller(ControllerState):
             program.step()
         except ScriptError as error:
             self.note(f"runtime error in line {error.line}: {error}")
-            self.events.append(("RUNTIME_EXCEPTION", str(error), error.line))
+            self.tell(ScriptStopped(str(error), error.line, error.column))
             program.close()
         if program.finished:
             if program is self.program:
@@ -179,9 +182,9 @@ class Controller(ControllerState):
         playing = self.runtime_state == RuntimeState.PLAYING and self.ready
         driven = playing and self.program is not None and self.program.owner is not None
         try:
-            self.arm.step(driven, self.motion_scaling)
+            self.arm.step(driven, self.motion_scaling, playing)
         except MotionRefused as refused:
-            self.protective_stop(str(refused))
+            self.protective_stop(str(refused), refused.code)
         if not driven and self.arm.at_rest:
             if self.runtime_state == RuntimeState.STOPPING:
                 self.runtime_state = RuntimeState.STOPPED

@@ -43,6 +43,8 @@ class SafetyMode(enum.IntEnum):
     FAULT = 9
 
 
+# as the dashboard names them; the order is the number that MasterboardData carries [M]
+OPERATIONAL_MODES = ("NONE", "MANUAL", "AUTOMATIC")
 MOVING = frozenset({SafetyMode.NORMAL, SafetyMode.REDUCED})
 _EMERGENCY = frozenset({SafetyMode.SYSTEM_EMERGENCY_STOP, SafetyMode.ROBOT_EMERGENCY_STOP})
 POWERLESS = _EMERGENCY | {SafetyMode.VIOLATION, SafetyMode.FAULT}

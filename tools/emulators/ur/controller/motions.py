@@ -12,7 +12,7 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.models.arrays import Array
-from weldcal.tools.emulators.ur.controller.poses import pose_error, rotation_matrix, rotation_vector
+from weldcal.tools.emulators.ur.controller.poses import pose_error
 
 STEP_S = 0.002
 # [M] where speedl gives up: smallest singular value of the tool's Jacobian (m and rad as they are)
@@ -21,7 +21,11 @@ REST_RAD_S = 1e-6
 
 
 class MotionRefused(Exception):
-    """The arm cannot follow: the controller answers with a protective stop; the text says why."""
+    """The arm cannot follow: the controller answers with a protective stop; the text says why, `code` is its report."""
+
+    def __init__(self, reason: str, code: int = 153) -> None:
+        super().__init__(reason)
+        self.code = code
 
 
 class ArmState(Protocol):
@@ -101,7 +105,7 @@ class ToolVelocity:
 
 
 class Path:
-    """movej, movel: a trapezoid in the path's own length, along q(s) or along a pose in space."""
+    """movej, movel, movec: a trapezoid in the path's own length, along q(s) or along a pose in space."""
 
     streamed = False
 
@@ -119,7 +123,8 @@ class Path:
             self._s, self._sdot = self._length, 0.0
         else:
             self._s += self._sdot * STEP_S
-        self.done = self._s >= self._length
+        # one step at the goal without speed, so that what follows has nothing to brake
+        self.done = left <= 0.0
         return np.asarray((self._joints(self._s, arm.q_target) - arm.q_target) / STEP_S, dtype=np.float64)
 
     def braked(self, factor: float) -> None:
@@ -142,6 +147,24 @@ class Servo:
         limit = arm.model.velocity_limit * scaling
         wanted = np.clip((self._goal - arm.q_target) / self._lookahead, -limit, limit)
         return limited(arm.qd_target, wanted, math.inf, arm.model)
+
+    def braked(self, factor: float) -> None:
+        return
+
+
+class JointTorque:
+    """direct_torque for one step: gravity is taken care of, friction slows as a brake would in half a second [M]."""
+
+    streamed = True
+    done = False
+    FRICTION_PER_S = 2.0
+
+    def __init__(self, acceleration: Array) -> None:
+        self._acceleration = acceleration
+
+    def velocity(self, arm: ArmState, scaling: float) -> Array:
+        free = arm.qd_target + self._acceleration * STEP_S
+        return np.asarray(free * (1.0 - self.FRICTION_PER_S * STEP_S), dtype=np.float64)
 
     def braked(self, factor: float) -> None:
         return
@@ -195,41 +218,8 @@ def joint_velocity(arm: ArmState, twist: Array) -> Array:
         return np.zeros(6)
     J = tool_jacobian(arm)
     if float(np.linalg.svd(J, compute_uv=False)[-1]) < SINGULAR:
-        raise MotionRefused("the arm is near a singularity")
+        raise MotionRefused("the arm is near a singularity", 154)
     return np.asarray(np.linalg.solve(J, twist), dtype=np.float64)
-
-
-def joint_path(q_from: Array, q_to: Array, speed: float, acceleration: float, limit: Array) -> Path | None:
-    """movej's path, its speed that of the leading joint; None where there is nothing to move."""
-    change = q_to - q_from
-    length = float(np.abs(change).max())
-    if length < 1e-9:
-        return None
-    direction = change / length
-    # [M] movej never asks a joint for more than it can do
-    speed = min(speed, float((limit / np.maximum(np.abs(direction), 1e-9)).min()))
-    return Path(lambda s, _: q_to if s >= length else q_from + direction * s, length, speed, acceleration)
-
-
-def tool_path(model: ArmModel, X_from: Array, X_to: Array, speed: float, acceleration: float) -> Path | None:
-    """movel's path of the flange poses (4, 4), its speed that of the translation, or of the turn where that is all."""
-    step = X_to[:3, 3] - X_from[:3, 3]
-    turn = rotation_vector(X_to[:3, :3] @ X_from[:3, :3].T)
-    distance, angle = float(np.linalg.norm(step)), float(np.linalg.norm(turn))
-    length = distance if distance > 1e-6 else angle
-    if length < 1e-9:
-        return None
-
-    def joints(s: float, q_near: Array) -> Array:
-        X = np.eye(4)
-        X[:3, :3] = rotation_matrix(turn * (s / length)) @ X_from[:3, :3]
-        X[:3, 3] = X_from[:3, 3] + step * (s / length)
-        q = newton(model, X, q_near)
-        if q is None:
-            raise MotionRefused("the straight line leaves the arm's reach")
-        return q
-
-    return Path(joints, length, speed, acceleration)
 
 
 def newton(model: ArmModel, X_goal: Array, q_near: Array, steps: int = 12) -> Array | None:

@@ -56,6 +56,7 @@ class Terminals:
         self.foreign: dict[int, tuple[bool, int]] = {}
         self.analog_outputs = [0.0, 0.0]
         self.analog_output_types = 0
+        self.tool_voltage = 0
         self.speed_slider = 1.0
         self.limiter = 1.0  # of the trajectory: what RTDE calls speed_scaling
 

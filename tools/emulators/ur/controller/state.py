@@ -7,7 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.arm import EmulatedArm
+from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
+from weldcal.tools.emulators.ur.controller.events import ErrorCode, Event, SafetyChanged
 from weldcal.tools.emulators.ur.controller.modes import MOVING, POWERLESS, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.controller.registers import Payload, Registers, Terminals, Watchdog
@@ -15,6 +18,8 @@ from weldcal.tools.emulators.ur.versions import Version
 
 START_TIMESTAMP_S = 100.0  # a controller has been on for a while; some clients wait for more than 40 s
 UNLOCK_AFTER_S = 5.0
+# "A protective stop was triggered", and the level of such a report
+PROTECTIVE_STOP_CODE, WARNING = 209, 2
 POWER_STEP_S = 0.5  # [M] how long power on and brake release take
 
 
@@ -24,8 +29,11 @@ class ControllerState:
     def __init__(self, model: ArmModel, q: NDArray[np.float64], version: Version) -> None:
         self.version = version
         self.arm = EmulatedArm(model, q)
+        self.arm.touch = self.touch
         self.inputs, self.outputs, self.terminals = Registers(), Registers(), Terminals()
-        self.external_wrench = [0.0] * 6
+        self.surroundings, self.sensor = Surroundings(), ForceSensor()
+        self.force_gain_scaling = 1.0
+        self.gravity = [0.0, 0.0, 9.82]
         self.tcp_offset = [0.0] * 6
         self.payload = Payload(1.4, [0.03, 0.0, 0.05], [0.0] * 6)  # [M] of the installation: the welding tool's
         self.operational_mode = "NONE"
@@ -41,7 +49,9 @@ class ControllerState:
         self.start_delay_s = 0.0
         self.watchdogs: dict[str, Watchdog] = {}
         self.log: deque[str] = deque(maxlen=200)
-        self.events: deque[tuple[str, str, int]] = deque(maxlen=200)
+        self.events: deque[Event] = deque(maxlen=200)
+        self.popup_open = False
+        self.operational_mode = "NONE"
         self.protective_since = -(10**9)
         self._later: list[tuple[int, Callable[[], object]]] = []
 
@@ -69,6 +79,10 @@ class ControllerState:
         """Writes to the log."""
         self.log.append(f"{self.time_s:.3f} {text}")
 
+    def tell(self, event: Event) -> None:
+        """Lets the clients of the primary port know."""
+        self.events.append(event)
+
     def later(self, seconds: float, action: Callable[[], object]) -> None:
         """Does something after some time."""
         self._later.append((self.frame + round(seconds / STEP_S), action))
@@ -78,14 +92,17 @@ class ControllerState:
         if self.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING):
             self.runtime_state = RuntimeState.PAUSING
 
-    def protective_stop(self, reason: str) -> None:
-        """The arm brakes and the program pauses until it is unlocked."""
+    def protective_stop(self, reason: str, code: int = PROTECTIVE_STOP_CODE) -> None:
+        """The arm brakes and the program pauses until it is unlocked; `code` is the number of the report."""
         if self.safety_mode in MOVING:
+            self.tell(ErrorCode(code, 0, WARNING, reason))
             self.set_safety_mode(SafetyMode.PROTECTIVE_STOP)
             self.note(f"protective stop: {reason}")
 
     def set_safety_mode(self, mode: SafetyMode) -> None:
         """What the safety system would do; modes that stop also pause the program."""
+        if mode != self.safety_mode:
+            self.tell(SafetyChanged(int(mode)))
         self.safety_mode = mode
         if mode == SafetyMode.PROTECTIVE_STOP:
             self.protective_since = self.frame
@@ -95,11 +112,11 @@ class ControllerState:
             self.robot_mode = RobotMode.POWER_OFF
         self.note(f"safety mode {mode.name}")
 
-    def unlock_protective_stop(self) -> bool:
-        """Only a protective stop that is at least 5 s old unlocks."""
+    def unlock_protective_stop(self, *, at_once: bool = False) -> bool:
+        """Only a protective stop that is at least 5 s old unlocks, unless it is asked for on the primary port."""
         if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
             return True
-        if (self.frame - self.protective_since) * STEP_S < UNLOCK_AFTER_S:
+        if not at_once and (self.frame - self.protective_since) * STEP_S < UNLOCK_AFTER_S:
             return False
         self.set_safety_mode(SafetyMode.NORMAL)
         return True
@@ -132,3 +149,27 @@ class ControllerState:
         """The tool centre point in the flange frame."""
         self.tcp_offset = [float(value) for value in pose]
         self.arm.set_tcp(self.tcp_offset)
+
+    def touch(self) -> Array:
+        """The wrench on the tool centre point in base axes, as the surroundings make it, or a client's sensor says it."""
+        if self.sensor.external:
+            X = self.arm.flange(self.arm.q)[:3, :3]
+            return np.concatenate([X @ self.sensor.written[:3], X @ self.sensor.written[3:]])
+        if self.surroundings.empty:
+            return np.zeros(6)
+        return self.surroundings.wrench(np.array(self.arm.tool_pose()[:3]))
+
+    def tcp_force(self) -> list[float]:
+        """What the script and RTDE read: the wrench in base axes less the sensor's offset."""
+        if not self.sensor.external and self.surroundings.empty and not self.sensor.offset.any():
+            return [0.0] * 6
+        return list((self.touch() - self.sensor.offset).tolist())
+
+    def flange_wrench(self) -> list[float]:
+        """What the sensor feels, in the flange's axes, without its offset."""
+        if self.sensor.external:
+            return self.sensor.written
+        if self.surroundings.empty:
+            return [0.0] * 6
+        R, felt = self.arm.flange(self.arm.q)[:3, :3], self.touch()
+        return [*(felt[:3] @ R).tolist(), *(felt[3:] @ R).tolist()]

@@ -11,10 +11,10 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.motions import STEP_S, newton
-from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of
+from weldcal.tools.emulators.ur.controller.poses import inverse, matrix, pose_of, rotation_matrix, rotation_vector
 from weldcal.tools.emulators.ur.controller.registers import N_BITS, N_NUMBERS, Watchdog, register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
-from weldcal.tools.emulators.ur.script.compiler import Pose
+from weldcal.tools.emulators.ur.script.arithmetic import Pose
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
@@ -39,6 +39,7 @@ def positive(value: Any, what: str) -> float:
 READS: dict[str, Callable[[ControllerState], Any]] = {
     "get_steptime": lambda c: STEP_S,
     "get_actual_joint_positions": lambda c: c.arm.q.tolist(),
+    "get_joint_positions": lambda c: c.arm.q.tolist(),
     "get_target_joint_positions": lambda c: c.arm.q_target.tolist(),
     "get_actual_joint_speeds": lambda c: c.arm.qd.tolist(),
     "get_target_joint_speeds": lambda c: c.arm.qd_target.tolist(),
@@ -48,12 +49,14 @@ READS: dict[str, Callable[[ControllerState], Any]] = {
     "get_actual_tcp_speed": lambda c: list(c.arm.tool_speed()),
     "get_target_tcp_speed": lambda c: list(c.arm.tool_speed(target=True)),
     "get_actual_tool_flange_pose": lambda c: Pose(pose_of(c.arm.flange(c.arm.q))),
-    "get_tcp_force": lambda c: [0.0] * 6,
     "get_joint_torques": lambda c: [0.0] * 6,
     "get_tcp_offset": lambda c: Pose(c.tcp_offset),
+    "get_payload": lambda c: c.payload.mass,
     "get_target_payload": lambda c: c.payload.mass,
     "get_target_payload_cog": lambda c: list(c.payload.center),
     "get_target_payload_inertia": lambda c: list(c.payload.inertia),
+    "get_controller_temp": lambda c: 30.0,
+    "get_tool_accelerometer_reading": lambda c: [0.0, 0.0, 9.81],
     "is_steady": lambda c: c.arm.at_rest,
 }
 """Functions without arguments, by their URScript name."""
@@ -63,12 +66,14 @@ CALCULATIONS: dict[str, Callable[..., Any]] = {
     "pose_dist": lambda pose_from, pose_to: math.dist(pose_from[:3], pose_to[:3]),
     "point_dist": lambda p_from, p_to: math.dist(p_from[:3], p_to[:3]),
     "norm": lambda a: math.sqrt(sum(float(v) ** 2 for v in a)) if isinstance(a, list) else abs(float(a)),
-    "length": lambda v: len(v),
     "integer_to_binary_list": lambda x, l=32: [bool(x >> i & 1) for i in range(l)],  # noqa: E741  (URScript's own name)
     "d2r": lambda d: math.radians(d),
     "r2d": lambda r: math.degrees(r),
     "pow": lambda base, exponent: float(base**exponent),
-    "to_str": lambda val: str(val),
+    "inv": lambda m: Pose(pose_of(inverse(matrix(m)))) if isinstance(m, Pose) else np.linalg.inv(m).tolist(),
+    "floor": lambda f: math.floor(f),
+    "ceil": lambda f: math.ceil(f),
+    "log": lambda b, f: math.log(f, b),
 }
 """Functions of their arguments alone, by their URScript name, with URScript's argument names."""
 REGISTERS = {
@@ -102,6 +107,7 @@ class Answers:
         self._controller.outputs.bits[register_index(index, N_BITS)] = bool(value)
 
     def rtde_set_watchdog(self, variable: str, min_frequency: float, action: str = "pause") -> None:
+        action = action.lower()  # UR's own examples write PAUSE
         if action not in ("ignore", "pause", "stop"):
             raise ScriptError(f"rtde_set_watchdog knows ignore, pause and stop, not {action!r}.")
         if action == "ignore":
@@ -116,16 +122,6 @@ class Answers:
 
     def set_tcp(self, pose: Any) -> None:
         self._controller.set_tcp(six(pose, "set_tcp").tolist())
-
-    def set_payload(self, m: float, cog: Any = None) -> None:
-        self._controller.payload.mass = float(m)
-        if cog is not None:
-            self._controller.payload.center = [float(value) for value in cog]
-
-    def set_target_payload(self, m: float, cog: Any, inertia: Any = None, transition_time: float = 0.0) -> None:
-        self.set_payload(m, cog)
-        if inertia is not None:
-            self._controller.payload.inertia = [float(value) for value in inertia]
 
     def get_forward_kin(self, q: Any = None, tcp: Any = None) -> Pose:
         arm = self._controller.arm
@@ -170,29 +166,15 @@ class Answers:
         X[:3, 3] -= Y[:3, 3]
         return Pose(pose_of(X))
 
+    def interpolate_pose(self, p_from: Any, p_to: Any, alpha: float) -> Pose:
+        X, Y = matrix(six(p_from, "interpolate_pose")), matrix(six(p_to, "interpolate_pose"))
+        turn = rotation_vector(Y[:3, :3] @ X[:3, :3].T)
+        X[:3, 3] += alpha * (Y[:3, 3] - X[:3, 3])
+        X[:3, :3] = rotation_matrix(alpha * turn) @ X[:3, :3]
+        return Pose(pose_of(X))
+
     def is_within_safety_limits(self, pose: Any) -> bool:
         if isinstance(pose, Pose):
             return self._inverse(pose, None) is not None
         q, model = six(pose, "is_within_safety_limits"), self._controller.arm.model
         return bool((q >= model.position_lower).all() and (q <= model.position_upper).all())
-
-    def tool_contact(self, direction: Any = None) -> int:
-        return self._controller.tool_contact_steps
-
-    def set_standard_digital_out(self, n: int, b: bool) -> None:
-        self._controller.terminals.set_digital(0, 1 << register_index(n, 8), (1 if b else 0) << n)
-
-    def set_digital_out(self, n: int, b: bool) -> None:
-        self.set_standard_digital_out(n, b)
-
-    def get_standard_digital_out(self, n: int) -> bool:
-        return bool(self._controller.terminals.digital_outputs >> register_index(n, 8) & 1)
-
-    def set_runstate_standard_digital_output_to_value(self, outputId: int, state: int) -> None:
-        self._controller.terminals.runstate[register_index(outputId, 8)] = register_index(state, 8)
-
-    def get_standard_digital_in(self, n: int) -> bool:
-        return bool(self._controller.terminals.digital_inputs >> register_index(n, 8) & 1)
-
-    def textmsg(self, s1: Any, s2: Any = "") -> None:
-        self._controller.note(f"script: {s1}{s2}")

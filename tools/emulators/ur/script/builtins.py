@@ -1,7 +1,7 @@
 """URScript functions of the controller, as far as the client's script and a guard script call them.
 
 Motions and the reads of sockets are generators that take frames; all other functions answer at once. What the emulator has no
-physics for (force mode, freedrive ...) is accepted and noted in the log.
+physics for (friction, conveyors) is accepted and noted in the log.
 """
 
 import math
@@ -12,14 +12,19 @@ from weldcal.tools.emulators.ur.controller.registers import register_index
 from weldcal.tools.emulators.ur.controller.state import ControllerState
 from weldcal.tools.emulators.ur.script.answers import CALCULATIONS, READS, REGISTERS, Answers
 from weldcal.tools.emulators.ur.script.dynamics import Dynamics
+from weldcal.tools.emulators.ur.script.forces import Forces
+from weldcal.tools.emulators.ur.script.messages import Messages
 from weldcal.tools.emulators.ur.script.motions import Motions
 from weldcal.tools.emulators.ur.script.program import Program
 from weldcal.tools.emulators.ur.script.sockets import Sockets
+from weldcal.tools.emulators.ur.script.terminals import TerminalFunctions
+from weldcal.tools.emulators.ur.script.texts import TEXTS
 
 BLOCKING = frozenset(
     {
-        *("movej", "movel", "movep", "speedj", "speedl", "servoj", "servoc", "stopj", "stopl"),
-        *("sync", "sleep", "protective_stop"),
+        *("movej", "movel", "movep", "movec", "optimovej", "optimovel", "speedj", "speedl", "servoj", "servoc"),
+        *("stopj", "stopl", "direct_torque", "sync", "sleep", "popup"),
+        "socket_open",
         *(f"socket_read_{what}" for what in ("line", "string", "ascii_float", "binary_integer", "byte_list")),
     }
 )
@@ -30,16 +35,11 @@ SINCE = {
         ("set_target_payload", "get_inverse_kin_has_solution", "get_target_payload_inertia"), ((5, 10), FIRST[1])
     ),
     **dict.fromkeys((name for name in vars(Dynamics) if not name.startswith("_")), ((5, 23), (10, 9))),
+    **dict.fromkeys(("optimovej", "optimovel"), ((5, 21), (10, 8))),
+    "direct_torque": ((5, 23), (10, 9)),
 }
-MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sqrt", "floor", "ceil", "log")
-NO_EFFECT: dict[str, int | None] = {
-    **dict.fromkeys(("force_mode", "end_force_mode", "force_mode_set_damping", "force_mode_set_gain_scaling")),
-    **dict.fromkeys(("freedrive_mode", "end_freedrive_mode", "teach_mode", "end_teach_mode", "direct_torque", "popup")),
-    **dict.fromkeys(("zero_ftsensor", "enable_external_ft_sensor", "ft_rtde_input_enable", "set_gravity")),
-    **dict.fromkeys(("set_friction_scales", "set_safety_mode_transition_hardness", "set_conveyor_tick_count")),
-    "set_tool_voltage": None,
-    "get_freedrive_status": 0,
-}
+MATH = ("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sqrt")
+NO_EFFECT = ("set_friction_scales", "set_safety_mode_transition_hardness", "set_conveyor_tick_count")
 
 
 def script_functions(
@@ -51,28 +51,27 @@ def script_functions(
     def known(name: str) -> bool:
         return controller.version.at_least(*SINCE.get(name, FIRST))
 
-    named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name, v) for name, v in NO_EFFECT.items()}
+    named: dict[str, Callable[..., Any]] = {name: _no_effect(controller, name) for name in NO_EFFECT}
     named |= {
         name: getattr(functions, name)
-        for kind in (Motions, Sockets, Dynamics, Answers)
+        for kind in (Motions, Sockets, Messages, Forces, Dynamics, TerminalFunctions, Answers)
         for name in vars(kind)
         if not name.startswith("_") and known(name)
     }
     named |= {name: _read(controller, name, read) for name, read in READS.items() if known(name)}
     named |= {name: _register(controller, *bank) for name, bank in REGISTERS.items()}
-    named |= {name: _real(getattr(math, name)) for name in MATH} | CALCULATIONS
+    named |= {name: _real(getattr(math, name)) for name in MATH} | CALCULATIONS | TEXTS
     return named, BLOCKING
 
 
-def _no_effect(controller: ControllerState, name: str, value: Any) -> Callable[..., Any]:
+def _no_effect(controller: ControllerState, name: str) -> Callable[..., None]:
     noted = False
 
-    def function(*arguments: Any, **keywords: Any) -> Any:
+    def function(*arguments: Any, **keywords: Any) -> None:
         nonlocal noted
         if not noted:
             noted = True
             controller.note(f"no effect here: {name}")
-        return value
 
     return function
 

@@ -4,20 +4,17 @@ Variables assigned in the main body or declared global are global, all others be
 are prefixed (v_, f_, b_), since scripts call variables `async` or `time`. Assignment copies lists.
 """
 
-import math
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from weldcal.tools.emulators.ur.script import syntax
+from weldcal.tools.emulators.ur.script import arithmetic, syntax
 from weldcal.tools.emulators.ur.script.syntax import Expression, Routine, ScriptError, Statement
 
 SOURCE_NAME = "<urscript>"
+_OPERATORS = {"+": "added", "-": "subtracted", "*": "multiplied", "/": "divided", "%": "remainder"}
+_HELPERS = ("Pose", "copied", "item", "place", "truth", "negated", "number", "method")
 Slices = Generator[None, None, Any]
-
-
-class Pose(list[float]):
-    """p[x, y, z, rx, ry, rz]: metres and a rotation vector in radians."""
 
 
 class Halted(Exception):  # the script's own `halt`, not an error
@@ -36,14 +33,12 @@ class Compiled:
 
 @dataclass(frozen=True)
 class Hooks:
-    """What compiled code calls back: one step of a loop, start, kill and join of a thread, critical sections."""
+    """What compiled code calls back: one step of a loop, start, kill and join of a thread."""
 
     loop: Callable[[], None]
     run: Callable[[Slices, str], int]
     kill: Callable[[Any], None]
     alive: Callable[[Any], bool]
-    enter: Callable[[], None]
-    leave: Callable[[], None]
 
 
 def compile_program(
@@ -53,22 +48,8 @@ def compile_program(
     emitter = _Emitter(routine, frozenset(builtins), frozenset(blocking))
     emitter.program()
     namespace: dict[str, Any] = {f"b_{name}": function for name, function in builtins.items()}
-    namespace |= {
-        "Pose": Pose,
-        "Halted": Halted,
-        "copied": _copied,
-        "item": _item,
-        "place": _place,
-        "truth": _truth,
-        "number": _number,
-        "divided": _divided,
-        "loop": hooks.loop,
-        "start": hooks.run,
-        "kill": hooks.kill,
-        "alive": hooks.alive,
-        "enter": hooks.enter,
-        "leave": hooks.leave,
-    }
+    namespace |= {name: getattr(arithmetic, name) for name in (*_OPERATORS.values(), *_HELPERS)}
+    namespace |= {"Halted": Halted, "loop": hooks.loop, "start": hooks.run, "kill": hooks.kill, "alive": hooks.alive}
     exec(compile("\n".join(emitter.text), SOURCE_NAME, "exec"), namespace)
     return Compiled(routine.name, routine.kind, namespace["main"], tuple(emitter.lines))
 
@@ -172,10 +153,9 @@ class _Emitter:
             case "join":
                 self.emit(depth, f"joined = {value}")
                 self.emit(depth, "while alive(joined): yield")
-            case "enter_critical":
-                self.emit(depth, "enter()")
-            case "exit_critical":
-                self.emit(depth, "leave()")
+            case "enter_critical" | "exit_critical":
+                # threads change places only where a slice ends, and a slice ends a critical section's protection
+                self.emit(depth, "pass")
             case word:
                 self.emit(depth, f"{word} {value}".rstrip())
 
@@ -192,6 +172,9 @@ class _Emitter:
                 return f"item({self.value(target)}, {self.value(index)})"
             case syntax.Call():
                 return self._call(expression)
+            case syntax.Method(target=target, name=name, arguments=arguments):
+                listed = ", ".join([self.value(target), repr(name), *map(self.value, arguments)])
+                return f"method({listed})"
             case syntax.Operation(operator=operator, operands=operands):
                 return self._operation(operator, [self.value(operand) for operand in operands])
 
@@ -199,16 +182,14 @@ class _Emitter:
         if operator == "not":
             return f"(not truth({values[0]}))"
         if len(values) == 1:
-            return f"({operator}number({values[0]}))"
+            return f"negated({values[0]})" if operator == "-" else values[0]
         left, right = values
         if operator == "xor":
             return f"(truth({left}) != truth({right}))"
         if operator in ("and", "or"):
             return f"(truth({left}) {operator} truth({right}))"
-        if operator in ("/", "%"):
-            return f"divided({left}, {right}, {operator!r})"
-        if operator in ("+", "-", "*"):
-            return f"(number({left}) {operator} number({right}))"
+        if operator in _OPERATORS:
+            return f"{_OPERATORS[operator]}({left}, {right})"
         return f"({left} {operator} {right})"
 
     def _call(self, call: syntax.Call) -> str:
@@ -222,7 +203,7 @@ class _Emitter:
                 return f"start({made}, {call.name!r})"
             return f"(yield from {made})"
         if call.name not in self._builtins or call.run:
-            raise ScriptError(f"Line {self._line}: {call.name} is not defined.", self._line)
+            raise ScriptError(f"compile_error_name_not_found:{call.name}:", call.line, call.column)
         arguments += [f"{key}={self.value(value)}" for key, value in call.keywords]
         made = f"b_{call.name}({', '.join(arguments)})"
         return f"(yield from {made})" if call.name in self._blocking else made
@@ -246,40 +227,3 @@ def _assigned(statements: tuple[Statement, ...]) -> set[str]:
 
 def _declared(statements: tuple[Statement, ...], scope: str = "global") -> set[str]:
     return {assign.name for assign in _walk(statements) if assign.scope == scope}
-
-
-def _copied(value: Any) -> Any:
-    if value is None:
-        raise ScriptError("A function that returns nothing is used as a value.")
-    return type(value)(value) if isinstance(value, list) else value
-
-
-def _item(values: Any, index: Any) -> Any:
-    if not isinstance(values, list) or isinstance(index, bool) or not isinstance(index, int):
-        raise ScriptError("Only a list or a pose has an index, and the index is a whole number.")
-    if not 0 <= index < len(values):
-        raise ScriptError(f"Index {index} is outside of a list of {len(values)}.")
-    return values[index]
-
-
-def _place(values: Any, index: Any, value: Any) -> None:
-    _item(values, index)
-    values[index] = value
-
-
-def _truth(value: Any) -> bool:
-    if value is not True and value is not False:
-        raise ScriptError(f"A condition must be True or False, it is {value!r}.")
-    return value
-
-
-def _number(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ScriptError(f"Arithmetic needs a number, it got {value!r}.")
-    return value
-
-
-def _divided(left: Any, right: Any, operator: str) -> float | int:
-    if _number(right) == 0:
-        raise ScriptError("Division by zero.")
-    return _number(left) / right if operator == "/" else math.fmod(_number(left), right)

@@ -7,12 +7,13 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, link_frames
 from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.poses import matrix
-from weldcal.tools.emulators.ur.script.answers import Answers, six
+from weldcal.tools.emulators.ur.script.answers import six
+from weldcal.tools.emulators.ur.script.terminals import TerminalFunctions
 
 STEP_RAD = 1e-6  # of the central differences
 
 
-class Dynamics(Answers):
+class Dynamics(TerminalFunctions):
     """Matrices are lists of rows; Jacobians are in the order [v; w]."""
 
     def get_jacobian(self, pos: Any = None, tcp: Any = None) -> list[list[float]]:

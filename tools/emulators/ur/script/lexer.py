@@ -23,11 +23,12 @@ _TOKEN = re.compile(
 
 @dataclass(frozen=True)
 class Token:
-    """kind is newline, number, text, word, keyword, sign or end; line counts from 1."""
+    """kind is newline, number, text, word, keyword, sign or end; line and column count from 1."""
 
     kind: str
     text: str
     line: int
+    column: int = 0
 
 
 def tokenize(source: str) -> list[Token]:
@@ -37,18 +38,21 @@ def tokenize(source: str) -> list[Token]:
         ScriptError: a character that no URScript word starts with.
     """
     tokens: list[Token] = []
-    position, line = 0, 1
+    position, line, line_start = 0, 1, 0
     while position < len(source):
+        column = position - line_start + 1
         match = _TOKEN.match(source, position)
         if match is None:
-            raise ScriptError(f"The script has an unexpected character {source[position]!r} in line {line}.", line)
+            raise ScriptError(
+                f"The script has an unexpected character {source[position]!r} in line {line}.", line, column
+            )
         kind, text = str(match.lastgroup), match.group()
         position = match.end()
         if kind == "newline":
-            tokens.append(Token(kind, text, line))
-            line += 1
+            tokens.append(Token(kind, text, line, column))
+            line, line_start = line + 1, position
         elif kind != "space":
-            tokens.append(Token("keyword" if text in KEYWORDS else kind, text, line))
+            tokens.append(Token("keyword" if text in KEYWORDS else kind, text, line, column))
     tokens.append(Token("end", "", line))
     return tokens
 

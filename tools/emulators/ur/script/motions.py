@@ -5,19 +5,27 @@ from typing import Any
 
 import numpy as np
 
+from weldcal.models.arrays import Array
 from weldcal.tools.emulators.ur.controller.motions import (
     STEP_S,
+    JointTorque,
     JointVelocity,
     Motion,
     Servo,
     Stop,
     ToolVelocity,
-    joint_path,
-    tool_path,
 )
+from weldcal.tools.emulators.ur.controller.paths import arc_path, joint_path, tool_path
+from weldcal.tools.emulators.ur.controller.poses import matrix
 from weldcal.tools.emulators.ur.script.answers import positive, six
-from weldcal.tools.emulators.ur.script.compiler import Pose, Slices
+from weldcal.tools.emulators.ur.script.arithmetic import Pose
+from weldcal.tools.emulators.ur.script.compiler import Slices
+from weldcal.tools.emulators.ur.script.dynamics import mass_matrix
 from weldcal.tools.emulators.ur.script.sockets import Sockets
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
+
+# [M] what optimovel's full speed and acceleration are with the tool
+OPTIMOVE_M_S, OPTIMOVE_M_S2 = 1.0, 2.0
 
 
 class Motions(Sockets):
@@ -30,30 +38,43 @@ class Motions(Sockets):
         for _ in range(max(1, round(float(t) / STEP_S))):
             yield
 
-    def protective_stop(self) -> Slices:
-        self._controller.protective_stop("the script asked for it")
-        yield
-
     def movej(self, q: Any, a: float = 1.4, v: float = 1.05, t: float = 0.0, r: float = 0.0) -> Slices:
         arm = self._controller.arm
-        goal = np.array(self.get_inverse_kin(q)) if isinstance(q, Pose) else six(q, "movej")
+        goal = self._goal_joints(q, "movej")
         a, v = positive(a, "The acceleration of movej"), positive(v, "The speed of movej")
+        q_now = arm.commanded.q_target
         if t > 0.0:
-            a, v = _timed(float(np.abs(goal - arm.q_target).max()), t, a)
-        yield from self._drive(joint_path(arm.q_target, goal, v, a, arm.model.velocity_limit))
+            a, v = _timed(float(np.abs(goal - q_now).max()), t, a)
+        yield from self._drive(joint_path(q_now, goal, v, a, arm.model.velocity_limit))
 
     def movel(self, pose: Any, a: float = 1.2, v: float = 0.25, t: float = 0.0, r: float = 0.0) -> Slices:
         arm = self._controller.arm
-        goal = six(pose, "movel")
-        X = arm.flange_goal(goal.tolist()) if isinstance(pose, Pose) else arm.flange(goal)
+        X, X_now = self._goal_pose(pose, "movel"), self._pose_now()
         a, v = positive(a, "The acceleration of movel"), positive(v, "The speed of movel")
-        X_now = arm.flange(arm.q_target)
         if t > 0.0:
             a, v = _timed(float(np.linalg.norm(X[:3, 3] - X_now[:3, 3])), t, a)
-        yield from self._drive(tool_path(arm.model, X_now, X, v, a))
+        yield from self._drive(tool_path(arm.model, arm.X_FT, X_now, X, v, a))
 
     def movep(self, pose: Any, a: float = 1.2, v: float = 0.25, r: float = 0.0) -> Slices:
         yield from self.movel(pose, a, v)
+
+    def movec(
+        self, pose_via: Any, pose_to: Any, a: float = 1.2, v: float = 0.25, r: float = 0.0, mode: float = 0
+    ) -> Slices:
+        arm = self._controller.arm
+        via, X = self._goal_pose(pose_via, "movec")[:3, 3], self._goal_pose(pose_to, "movec")
+        a, v = positive(a, "The acceleration of movec"), positive(v, "The speed of movec")
+        yield from self._drive(arc_path(arm.model, arm.X_FT, self._pose_now(), via, X, v, a, fixed=mode == 1))
+
+    def optimovej(self, goal: Any, a: float = 0.3, v: float = 0.3, r: float = 0.0) -> Slices:
+        limit = self._controller.arm.model
+        a, v = _share(a, "acceleration of optimovej"), _share(v, "speed of optimovej")
+        speed, acceleration = float(limit.velocity_limit.min()), float(limit.acceleration_limit.min())
+        yield from self.movej(self._goal_joints(goal, "optimovej").tolist(), a * acceleration, v * speed)
+
+    def optimovel(self, goal: Any, a: float = 0.3, v: float = 0.3, r: float = 0.0) -> Slices:
+        a, v = _share(a, "acceleration of optimovel"), _share(v, "speed of optimovel")
+        yield from self.movel(goal, a * OPTIMOVE_M_S2, v * OPTIMOVE_M_S)
 
     def speedj(self, qd: Any, a: float = 1.4, t: float = 0.0) -> Slices:
         target, rate = six(qd, "speedj"), positive(a, "The acceleration of speedj")
@@ -83,12 +104,31 @@ class Motions(Sockets):
     def servoc(self, pose: Any, a: float = 1.2, v: float = 0.25, r: float = 0.0) -> Slices:
         yield from self.movel(pose, a, v)
 
+    def direct_torque(
+        self, torque: Any, friction_comp: bool = True, viscous_scale: Any = None, coulomb_scale: Any = None
+    ) -> Slices:
+        arm = self._controller.arm
+        acceleration = np.linalg.solve(mass_matrix(arm.model, arm.q_target), six(torque, "direct_torque"))
+        yield from self._drive(JointTorque(np.asarray(acceleration, dtype=np.float64)), STEP_S)
+
     def stopj(self, a: float = 2.0) -> Slices:
         yield from self._drive(Stop(positive(a, "The deceleration of stopj")))
 
     def stopl(self, a: float = 2.0, aRot: float | None = None) -> Slices:
         twist = np.array(self._controller.arm.tool_speed(target=True))
         yield from self._drive(Stop(positive(a, "The deceleration of stopl"), twist))
+
+    def _goal_joints(self, goal: Any, what: str) -> Array:
+        return np.array(self.get_inverse_kin(goal)) if isinstance(goal, Pose) else six(goal, what)
+
+    def _goal_pose(self, goal: Any, what: str) -> Array:
+        """The tool's pose (4, 4) of a goal given as a pose or as joint angles."""
+        values, arm = six(goal, what), self._controller.arm
+        return matrix(values) if isinstance(goal, Pose) else np.asarray(arm.flange(values) @ arm.X_FT)
+
+    def _pose_now(self) -> Array:
+        arm = self._controller.arm
+        return np.asarray(arm.flange(arm.commanded.q_target) @ arm.X_FT, dtype=np.float64)
 
     def _drive(self, motion: Motion | None, t: float = 0.0) -> Slices:
         """Holds the arm until the motion is done, or for t seconds where that is given."""
@@ -112,3 +152,10 @@ def _timed(length: float, t: float, a: float) -> tuple[float, float]:
     """Acceleration and speed of a trapezoid of this length that takes t; a is raised where it is too small for that."""
     a = max(a, 4.0 * length / (t * t) * (1.0 + 1e-9), 1e-9)
     return a, max((a * t - math.sqrt(max(0.0, a * a * t * t - 4.0 * a * length))) / 2.0, 1e-9)
+
+
+def _share(value: Any, what: str) -> float:
+    """A share of what the arm can do."""
+    if positive(value, f"The {what}") > 1.0:
+        raise ScriptError(f"The {what} is a share of what the arm can do, from 0 to 1, not {value!r}.")
+    return float(value)

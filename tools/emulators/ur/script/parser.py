@@ -1,5 +1,6 @@
 """Parses URScript tokens into a tree; a newline is white space wherever an operand is still to come."""
 
+import dataclasses
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.script import syntax
@@ -40,7 +41,9 @@ class _Parser:
 
     def error(self, found: str | None = None) -> ScriptError:
         what = found or repr(self.token.text or "the end")
-        return ScriptError(f"Syntax error in line {self.token.line}: {what} does not belong there.", self.token.line)
+        return ScriptError(
+            f"Syntax error in line {self.token.line}: {what} does not belong there.", self.token.line, self.token.column
+        )
 
     def take(self) -> Token:
         token = self.token
@@ -185,8 +188,10 @@ class _Parser:
 
     def postfix(self) -> Expression:
         value = self.primary()
-        while self.at("["):
-            self.take()
+        while self.at("[", "."):
+            if self.take().text == ".":
+                value = self.member(value)
+                continue
             value = syntax.Index(value, self.expression())
             while self.at(","):
                 # a matrix: m[row, column]
@@ -194,6 +199,13 @@ class _Parser:
                 value = syntax.Index(value, self.expression())
             self.expect("]")
         return value
+
+    def member(self, target: Expression) -> Expression:
+        name = self.word()
+        if not self.at("("):
+            return syntax.Index(target, syntax.Literal(name))
+        self.take()
+        return syntax.Method(target, name, self.items(")"))
 
     def primary(self) -> Expression:
         token = self.take()
@@ -214,7 +226,7 @@ class _Parser:
             call = self.primary()
             if not isinstance(call, syntax.Call):
                 raise self.error("what follows run")
-            return syntax.Call(call.name, call.arguments, call.keywords, run=True)
+            return dataclasses.replace(call, run=True)
         if token.kind == "word":
             return self.named(token)
         self._position -= token.kind != "end"
@@ -222,7 +234,7 @@ class _Parser:
 
     def named(self, token: Token) -> Expression:
         if self.at("("):
-            return self.call(token.text)
+            return self.call(token)
         if token.text == "p" and self.at("["):
             # p[0] reads a variable that somebody called p; six numbers are a pose
             self.take()
@@ -234,7 +246,7 @@ class _Parser:
             return syntax.Items(items, pose=True)
         return syntax.Name(token.text)
 
-    def call(self, name: str) -> syntax.Call:
+    def call(self, name: Token) -> syntax.Call:
         self.expect("(")
         arguments: list[Expression] = []
         keywords: list[tuple[str, Expression]] = []
@@ -251,7 +263,7 @@ class _Parser:
                 arguments.append(self.expression())
 
         self.listed(")", take_one)
-        return syntax.Call(name, tuple(arguments), tuple(keywords))
+        return syntax.Call(name.text, tuple(arguments), tuple(keywords), line=name.line, column=name.column)
 
     def items(self, closing: str) -> tuple[Expression, ...]:
         found: list[Expression] = []

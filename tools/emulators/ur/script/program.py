@@ -41,11 +41,10 @@ class Program:
         self.owner: Thread | None = None
         self.sockets: dict[str, Any] = {}
         self._threads: dict[int, Thread] = {}
-        self._critical: Thread | None = None
         self._loops = 0
         self._count = 0
         functions, blocking = builtins(self)
-        hooks = Hooks(self._loop, self._run, self._kill, self._alive, self._enter, self._leave)
+        hooks = Hooks(self._loop, self._run, self._kill, self._alive)
         try:
             self._compiled = compile_program(parse_program(source), functions, blocking, hooks)
         except RecursionError:
@@ -102,7 +101,7 @@ class Program:
             self.owner = None
 
     def _slice(self, thread: Thread) -> None:
-        if thread.number not in self._threads or (self._critical is not None and self._critical is not thread):
+        if thread.number not in self._threads:
             return
         self.current, self._loops = thread, 0
         try:
@@ -123,7 +122,7 @@ class Program:
     def _located(self, error: ScriptError, cause: BaseException | None = None) -> ScriptError:
         frames = [f for f in traceback.extract_tb((cause or error).__traceback__) if f.filename == SOURCE_NAME]
         line = self._script_line(frames[-1].lineno or 0) if frames else error.line
-        return ScriptError(str(error), line)
+        return ScriptError(str(error), line, error.column)
 
     def _script_line(self, generated: int) -> int:
         lines = self._compiled.lines
@@ -131,8 +130,6 @@ class Program:
 
     def _end(self, thread: Thread) -> None:
         self._threads.pop(thread.number, None)
-        if self._critical is thread:
-            self._critical = None
         if thread is not self.current:
             thread.slices.close()
         self.release(thread)
@@ -156,12 +153,6 @@ class Program:
 
     def _alive(self, number: Any) -> bool:
         return number in self._threads
-
-    def _enter(self) -> None:
-        self._critical = self.current
-
-    def _leave(self) -> None:
-        self._critical = None
 
 
 def _plain(error: BaseException) -> str:

@@ -10,10 +10,12 @@ from typing import Any
 
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.script.compiler import Slices
-from weldcal.tools.emulators.ur.script.dynamics import Dynamics
+from weldcal.tools.emulators.ur.script.messages import Messages
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
+from weldcal.tools.emulators.ur.script.texts import text_of
 
 OPEN_LIMIT_S = 0.02
+OPEN_FRAMES = 4  # [M] how long a connection takes
 NAME = "socket_0"
 
 
@@ -43,10 +45,16 @@ class ScriptSocket:
         self._socket.close()
 
 
-class Sockets(Dynamics):
+class Sockets(Messages):
     """Sockets belong to their program and close with it; reads answer 0 values, then nan or -1, when time runs out."""
 
-    def socket_open(self, address: str, port: int, socket_name: str = NAME) -> bool:
+    def socket_open(self, address: str, port: int, socket_name: str = NAME) -> Slices:
+        # so that the other side sees the connections of a script in their order, as over a network
+        for _ in range(OPEN_FRAMES):
+            yield
+        return self._open(address, port, socket_name)
+
+    def _open(self, address: str, port: int, socket_name: str) -> bool:
         if not str(address).startswith("127."):
             self._controller.note(f"socket_open: {address} is not on loopback")
             return False
@@ -64,10 +72,10 @@ class Sockets(Dynamics):
             opened.close()
 
     def socket_send_string(self, str: Any, socket_name: str = NAME) -> bool:
-        return self._send(f"{str}".encode(), socket_name)
+        return self._send(text_of(str).encode(), socket_name)
 
     def socket_send_line(self, str: Any, socket_name: str = NAME) -> bool:
-        return self._send(f"{str}\n".encode(), socket_name)
+        return self._send(text_of(str).encode() + b"\n", socket_name)
 
     def socket_send_int(self, value: int, socket_name: str = NAME) -> bool:
         return self._send(struct.pack(">i", int(value)), socket_name)

@@ -8,11 +8,14 @@ from weldcal.models.errors import WeldcalError
 
 
 class ScriptError(WeldcalError):
-    """A URScript program that the controller refuses to start, or that stops while it runs; `line` counts from 1."""
+    """A URScript program that the controller refuses to start, or that stops while it runs.
 
-    def __init__(self, message: str, line: int = 0) -> None:
+    `line` and `column` count from 1; 0 where they are not known.
+    """
+
+    def __init__(self, message: str, line: int = 0, column: int = 0) -> None:
         super().__init__(message)
-        self.line = line
+        self.line, self.column = line, column
 
 
 @dataclass(frozen=True)
@@ -45,11 +48,22 @@ class Call:
     arguments: tuple[Expression, ...]
     keywords: tuple[tuple[str, Expression], ...]
     run: bool = False
+    line: int = 0
+    column: int = 0
+
+
+@dataclass(frozen=True)
+class Method:
+    """target.name(a, b)."""
+
+    target: Expression
+    name: str
+    arguments: tuple[Expression, ...]
 
 
 @dataclass(frozen=True)
 class Index:
-    """target[index]."""
+    """target[index], or target.member with the member's name as index."""
 
     target: Expression
     index: Expression
@@ -63,7 +77,7 @@ class Operation:
     operands: tuple[Expression, ...]
 
 
-Expression = Literal | Name | Items | Call | Index | Operation
+Expression = Literal | Name | Items | Call | Method | Index | Operation
 
 
 @dataclass(frozen=True)

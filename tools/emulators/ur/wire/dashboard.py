@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
 GREETING = "Connected: Universal Robots Dashboard Server"
@@ -22,6 +22,8 @@ class DashboardServer(Server):
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
         self._loaded: str | None = None
+        self._installation = "default.installation"
+        self._count = 0
         c = controller
         v = c.version
         self._fixed: dict[str, Callable[[], str]] = {
@@ -48,10 +50,10 @@ class DashboardServer(Server):
             "brake release": lambda: self._do(c.release_brakes, "Brake releasing"),
             "restart safety": self._restart_safety,
             "close safety popup": lambda: "closing safety popup",
-            "close popup": lambda: "closing popup",
+            "close popup": self._close_popup,
             "savelog": lambda: "Log saved to disk",
             "shutdown": lambda: "Shutting down",
-            "clear operational mode": self._clear_mode,
+            "clear operational mode": self._clear_operational_mode,
         }
 
     def opened(self, connection: Connection, now: float) -> None:
@@ -82,16 +84,17 @@ class DashboardServer(Server):
             case "addtolog":
                 self._controller.note(f"dashboard: {argument}")
                 return "Added log message"
-            case "set":
-                self._controller.operational_mode = argument.rpartition(" ")[2].upper()
-                return f"Setting operational mode: {self._controller.operational_mode}"
+            case "set" if argument.lower().startswith("operational mode "):
+                return self._set_operational_mode(argument.rpartition(" ")[2])
+            case "generate":
+                return self._generate(argument)
         return f"could not understand: '{command}'"
 
     def _running(self) -> bool:
         return self._controller.runtime_state in (RuntimeState.PLAYING, RuntimeState.RESUMING)
 
     def _name(self) -> str:
-        return self._loaded or self._controller.program_name or "<unnamed>"
+        return (self._loaded or "").rpartition("/")[2] or self._controller.program_name or "<unnamed>"
 
     def _program_state(self) -> str:
         state = self._controller.runtime_state
@@ -120,7 +123,7 @@ class DashboardServer(Server):
         if self._running():
             return "Starting program"
         ready = c.remote and self._loaded is not None
-        if ready and c.start(IDLE_PROGRAM.format(name=(self._loaded or "program").removesuffix(".urp"))):
+        if ready and c.start(IDLE_PROGRAM.format(name=self._name().removesuffix(".urp"))):
             return "Starting program"
         return "Failed to execute: play"
 
@@ -130,15 +133,14 @@ class DashboardServer(Server):
         self._controller.pause_program()
         return "Pausing program"
 
-    def _clear_mode(self) -> str:
-        self._controller.operational_mode = "NONE"
-        return "operational mode is no longer controlled by Dashboard Server"
-
     def _load(self, name: str) -> str:
+        if name.startswith("installation "):
+            return self._load_installation(name.removeprefix("installation ").strip())
         if not name.endswith(".urp") or "missing" in name:
             return f"File not found: {name}"
         self._loaded = name
-        return f"Loading program: /programs/{name}, default.installation"
+        path = name if name.startswith("/") else f"/programs/{name}"
+        return f"Loading program: {path}, {self._installation}"
 
     def _unlock(self) -> str:
         return "Protective stop releasing" if self._controller.unlock_protective_stop() else TOO_EARLY
@@ -150,3 +152,32 @@ class DashboardServer(Server):
             c.set_safety_mode(SafetyMode.NORMAL)
             c.robot_mode = RobotMode.POWER_OFF
         return "Restarting safety"
+
+    def _load_installation(self, name: str) -> str:
+        if not name.endswith(".installation") or "missing" in name:
+            return f"File not found: {name}"
+        self._installation = name
+        return f"Loading installation: {name}"
+
+    def _close_popup(self) -> str:
+        self._controller.popup_open = False
+        return "closing popup"
+
+    def _set_operational_mode(self, mode: str) -> str:
+        if mode.upper() not in OPERATIONAL_MODES[1:]:
+            return f"Failed setting operational mode: {mode}"
+        self._controller.operational_mode = mode.upper()
+        return f"Setting operational mode: {mode.upper()}"
+
+    def _clear_operational_mode(self) -> str:
+        self._controller.operational_mode = "NONE"
+        return "operational mode is no longer controlled by Dashboard Server"
+
+    def _generate(self, what: str) -> str:
+        """A report or a support file: the answers of a controller, without a file."""
+        self._count += 1
+        if what.startswith("flight report"):
+            return f"Flight Report generated with id: {self._count}"
+        if what.startswith("support file"):
+            return f"Completed successfully: ursupport_{SERIAL}_{self._count}.zip"
+        return f"could not understand: 'generate {what}'"

@@ -1,5 +1,6 @@
 """RTDE fields, their types and their values, as in Universal Robots' RTDE guide."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -113,13 +114,12 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "standard_analog_output0": lambda c: c.terminals.analog_outputs[0],
         "standard_analog_output1": lambda c: c.terminals.analog_outputs[1],
         "payload": lambda c: c.payload.mass,
+        "tcp_force_scalar": lambda c: math.hypot(*c.tcp_force()[:3]),
         "actual_execution_time": _constant(0.4),
         "target_execution_time": _constant(2.0),
         **_constants(0.0, "actual_momentum standard_analog_input0 standard_analog_input1 io_current"),
         **_constants(0.0, "actual_robot_energy_consumed actual_robot_braking_energy_dissipated euromap67_24V_voltage"),
-        **_constants(
-            0.0, "euromap67_24V_current tool_analog_input0 tool_analog_input1 tool_output_current tcp_force_scalar"
-        ),
+        **_constants(0.0, "euromap67_24V_current tool_analog_input0 tool_analog_input1 tool_output_current"),
         **_constants(0.0, "joint_position_deviation_ratio collision_detection_ratio"),
         "actual_main_voltage": _constant(48.0),
         "tool_temperature": _constant(25.0),
@@ -135,12 +135,13 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "target_TCP_pose": lambda c: c.arm.tool_pose(target=True),
         "target_TCP_speed": lambda c: c.arm.tool_speed(target=True),
         "tcp_offset": lambda c: c.tcp_offset,
-        "ft_raw_wrench": lambda c: c.external_wrench,
+        "ft_raw_wrench": lambda c: c.flange_wrench(),
+        "actual_TCP_force": lambda c: c.tcp_force(),
         "payload_inertia": lambda c: c.payload.inertia,
         **_constants(
             ZERO6, "target_current target_moment actual_current actual_current_window actual_current_as_torque"
         ),
-        **_constants(ZERO6, "joint_control_output actual_TCP_force actual_TCP_acceleration target_TCP_acceleration"),
+        **_constants(ZERO6, "joint_control_output actual_TCP_acceleration target_TCP_acceleration"),
         **_constants(ZERO6, "wrench_calc_from_currents target_base_acceleration target_base_wrench"),
         "joint_temperatures": _constant([30.0] * 6),
         "actual_joint_voltage": _constant([48.0] * 6),
@@ -150,14 +151,15 @@ _SCALARS: dict[str, dict[str, Getter]] = {
         "payload_cog": lambda c: c.payload.center,
         "actual_tool_accelerometer": _constant([0.0, 0.0, 9.81]),
         "elbow_velocity": _constant(ZERO3),
-        "target_gravity": _constant([0.0, 0.0, 9.82]),
+        "target_gravity": lambda c: c.gravity,
     },
     "VECTOR6INT32": {"joint_mode": _joint_modes},
     "INT32": {
         "robot_mode": lambda c: int(c.robot_mode),
         "safety_mode": lambda c: int(c.safety_mode),
         "safety_status": lambda c: int(c.safety_mode),
-        **_constants(0, "encoder0_raw encoder1_raw tool_output_voltage time_scale_source"),
+        "tool_output_voltage": lambda c: c.terminals.tool_voltage,
+        **_constants(0, "encoder0_raw encoder1_raw time_scale_source"),
     },
     "UINT32": {
         "runtime_state": lambda c: int(c.runtime_state),
@@ -228,7 +230,7 @@ def apply_masked(c: Controller, values: dict[str, Any]) -> None:
 
 
 def _set_wrench(c: Controller, value: Any) -> None:
-    c.external_wrench = list(value)
+    c.sensor.written = list(value)
 
 
 def _nothing(_: Controller, __: Any) -> None:

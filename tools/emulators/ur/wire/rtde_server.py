@@ -20,7 +20,6 @@ from weldcal.tools.emulators.ur.wire.rtde_fields import (
 
 PROTOCOL, VERSION, TEXT, DATA, SET_OUTPUTS, SET_INPUTS, START, PAUSE = (ord(letter) for letter in "VvMUOISP")
 FREQUENCY_HZ = 500.0
-MAX_NAMES = 2048
 WARNING = 2
 
 
@@ -136,7 +135,7 @@ class RtdeServer(Server):
         known = [self._outputs.get(name) for name in names]
         types = ",".join("NOT_FOUND" if f is None else f.type for f in known).encode()
         found = [f for f in known if f is not None]
-        good = bool(names) and len(found) == len(names) and len(payload) <= MAX_NAMES
+        good = bool(names) and len(found) == len(names)
         good &= 0.0 < frequency <= FREQUENCY_HZ
         session.output = self._output_recipe(frequency, found, session.protocol) if good else None
         number = bytes([1 if session.output is not None else 0])
@@ -150,7 +149,7 @@ class RtdeServer(Server):
     def _set_inputs(self, connection: Connection, session: Session, payload: bytes) -> bytes:
         names = _names(payload)
         types = [self._input_type(name, connection) for name in names]
-        good = bool(names) and not {"NOT_FOUND", "IN_USE"} & set(types) and len(payload) <= MAX_NAMES
+        good = bool(names) and not {"NOT_FOUND", "IN_USE"} & set(types)
         number = 0
         if good:
             session.counter += 1

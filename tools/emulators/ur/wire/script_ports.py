@@ -6,16 +6,19 @@ from collections.abc import Callable
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.dh import dh_parameters
-from weldcal.tools.emulators.ur.controller.modes import RobotMode, RuntimeState, SafetyMode
+from weldcal.tools.emulators.ur.controller.events import Event, SafetyChanged
+from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.script.lexer import split_programs
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
+from weldcal.tools.emulators.ur.wire.primary_messages import message_body
 
 STATE_PERIOD_FRAMES = 50  # 10 Hz
 STATE, MESSAGE = 16, 20
 CALIBRATED, NOMINAL = 2, 0
-KEY, EXCEPTION, VERSION = 7, 10, 3
+VERSION = 3
 SOURCE_CONTROLLER = -2
 REAL_TIME_BYTES = 1220
+ROBOT_TYPE = 2  # UR10 and UR10e
 
 
 class ScriptServer(Server):
@@ -100,16 +103,14 @@ class PrimaryServer(ScriptServer):
             for connection in self._clients:
                 connection.send(package, now, droppable=True)
 
-    def announce(self, event: tuple[str, str, int], now: float) -> None:
-        """Key messages and runtime exceptions, for the primary port."""
-        kind, text, line = event
-        if kind == "RUNTIME_EXCEPTION":
-            package = self._message(EXCEPTION, struct.pack(">ii", line, 0) + text.encode())
-        else:
-            title = f"PROGRAM_XXX_{kind}".encode()
-            package = self._message(KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text.encode())
-        for connection in self._clients if self._messages else []:
-            connection.send(package, now)
+    def announce(self, event: Event, now: float) -> None:
+        """Messages, for the primary port; the state follows a change of the safety mode at once [M]."""
+        if self._messages and self._clients:
+            package = self._message(*message_body(event))
+            if isinstance(event, SafetyChanged):
+                package += self._state()
+            for connection in self._clients:
+                connection.send(package, now)
 
     def _message(self, kind: int, body: bytes) -> bytes:
         stamp = int(self._controller.timestamp * 1e6)
@@ -132,9 +133,22 @@ class PrimaryServer(ScriptServer):
             struct.pack(">3d4fB", arm.q[i], arm.q_target[i], arm.qd[i], 0.0, 48.0, 30.0, 30.0, 253) for i in range(6)
         )
         tool = struct.pack(">12d", *arm.tool_pose(), *c.tcp_offset)
-        parts = ((0, mode), (1, joints), (4, tool), (5, self._kinematics), (6, self._configuration))
+        parts = (
+            *((0, mode), (1, joints), (3, self._masterboard()), (4, tool)),
+            *((5, self._kinematics), (6, self._configuration)),
+        )
         payload = b"".join(struct.pack(">IB", len(part) + 5, kind) + part for kind, part in parts)
         return struct.pack(">iB", len(payload) + 5, STATE) + payload
+
+    def _masterboard(self) -> bytes:
+        c, t = self._controller, self._controller.terminals
+        return struct.pack(
+            ">2I2B2d2b2d4f3BI3B",
+            *(t.digital_inputs, t.digital_outputs, 0, 0, 0.0, 0.0),
+            *(t.analog_output_types & 1, t.analog_output_types >> 1 & 1, *t.analog_outputs, 30.0, 48.0, 0.8, 0.0),
+            *(int(c.safety_mode), c.safety_mode == SafetyMode.REDUCED, 0, 0),  # no Euromap interface
+            *(OPERATIONAL_MODES.index(c.operational_mode), 0, 0),
+        )
 
 
 def kinematics_info(model: ArmModel) -> bytes:
@@ -153,4 +167,4 @@ def _configuration(model: ArmModel) -> bytes:
     speeds = [v for pair in zip(model.velocity_limit, model.acceleration_limit, strict=True) for v in pair]
     defaults = [1.05, 1.4, 0.25, 1.2, 0.35]
     body = struct.pack(">29d", *limits, *speeds, *defaults)
-    return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, 3, 0)
+    return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, ROBOT_TYPE, 0)

@@ -1,0 +1,160 @@
+"""URScript's values and motions beyond the guard's own: texts, lists, structs, arcs, as the script manual describes them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.controller.modes import SafetyMode
+from weldcal.tools.emulators.ur.controller.poses import matrix, pose_of, rotation_vector
+from weldcal.tools.emulators.ur.main import HOME
+from weldcal.tools.emulators.ur.versions import parse_version
+
+
+def controller(polyscope: str = "5.21") -> Controller:
+    return Controller(load_arm(), np.array(HOME), parse_version(polyscope))
+
+
+def said_by(body: str, *, made: Controller | None = None, frames: int = 100) -> list[str]:
+    """What a program says with textmsg in some frames."""
+    made = made or controller()
+    assert made.start(f"def asked():\n{body}\nend\n"), made.log[-1]
+    for _ in range(frames):
+        made.step()
+    assert not [line for line in made.log if "error" in line], made.log
+    return [line.split("script: ", 1)[1] for line in made.log if "script: " in line]
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ('str_cat("pose ", p[1, 0, 0.5, 0, 0, -1])', "pose p[1, 0, 0.5, 0, 0, -1]"),
+        ("str_cat(1, str_cat([1, 2.5], True))", "1[1, 2.5]True"),
+        ("to_str(2.123456123456)", "2.12346"),
+        ('str_sub("polyscope", 4, 3)', "sco"),
+        ('str_sub("polyscope", 4)', "scope"),
+        ('str_find("polyscope", "s", 5)', "-1"),
+        ('str_find("polyscope", "scope")', "4"),
+        ('str_len("four")', "4"),
+        ('str_at("four", 2)', "u"),
+        ('str_empty("")', "True"),
+        ('to_num("3") + to_num("-0.5e1 mm")', "-2"),
+        ("get_list_length([1, 2, 3])", "3"),
+        ("size([[1, 2, 3], [4, 5, 6]])", "[2, 3]"),
+        ("[1, 2] + [3, 4] * 2", "[7, 10]"),
+        ("[2, 4] / 4 - 1", "[-0.5, 0]"),
+        ("-[1, 2]", "[-1, -2]"),
+        ("[[1, 2], [3, 4]] * [1, 1]", "[3, 7]"),
+        ("transpose([[1, 2], [3, 4]])", "[[1, 3], [2, 4]]"),
+        ("7 % 4", "3"),
+        ("floor(-0.5) + ceil(1.5) + log(10, 1000)", "4"),
+        ("binary_list_to_integer([True, False, True])", "5"),
+        ("struct(name = 3, of = [1, 2]).of[1]", "2"),
+    ],
+)
+def test_a_value_is_what_the_manual_says(value: str, said: str) -> None:
+    assert said_by(f"textmsg({value})") == [said]
+
+
+def test_a_list_grows_a_struct_changes_and_a_seed_is_a_condition() -> None:
+    body = """l = make_list(1, 5)
+    l.append(7)
+    s = struct(a = 1)
+    t = s
+    t.a = l.length()
+    if 0.0:
+      textmsg("zero")
+    elif 2:
+      textmsg(l, s.a)
+    end
+    textmsg(t)"""
+    assert said_by(body) == ["[5, 7]1", "struct(a=2)"]
+
+
+def test_an_arc_keeps_its_radius_and_ends_at_its_goal() -> None:
+    made = controller()
+    made.set_tcp([0.0, 0.0, 0.1, 0.3, 0.0, 0.0])
+    start = np.array(made.arm.tool_pose())
+    x, y = np.array([0.05, 0.0, 0.0]), np.array([0.0, 0.05, 0.0])
+    centre, radius = start[:3] + y, 0.05
+    via, end = start.copy(), start.copy()
+    via[:3], end[:3] = centre + x, centre + y
+    made.start(f"def arc():\nmovec(p{via.tolist()}, p{end.tolist()}, a=1.0, v=0.1)\nend\n")
+    reached = []
+    for _ in range(2000):
+        made.step()
+        reached.append(made.arm.tool_pose()[:3])
+        if made.program is None:
+            break
+    assert np.abs(np.linalg.norm(np.array(reached) - centre, axis=1) - radius).max() < 1e-6
+    assert np.abs(np.array(reached) - via[:3]).max(axis=1).min() < 2e-4
+    assert made.arm.tool_pose() == pytest.approx(end.tolist(), abs=1e-6)
+    # half a circle of 0.05 m at 0.1 m/s with 0.1 s of ramp at each end
+    assert len(reached) * 0.002 == pytest.approx(np.pi * 0.05 / 0.1 + 0.1, abs=0.01)
+
+
+def test_the_tool_of_a_straight_move_stays_on_its_line_while_it_turns() -> None:
+    made = controller()
+    made.set_tcp([0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
+    start = matrix(made.arm.tool_pose())
+    goal = start @ matrix([0.0, 0.1, 0.0, 0.0, 0.5, 0.0])
+    made.start(f"def line():\nmovel(p{pose_of(goal)}, a=2.0, v=0.5)\nend\n")
+    line = (goal - start)[:3, 3] / np.linalg.norm((goal - start)[:3, 3])
+    for _ in range(400):
+        made.step()
+        off = np.array(made.arm.tool_pose()[:3]) - start[:3, 3]
+        assert np.linalg.norm(off - (off @ line) * line) < 1e-6
+    assert rotation_vector(matrix(made.arm.tool_pose())[:3, :3] @ goal[:3, :3].T) == pytest.approx([0.0] * 3, abs=1e-6)
+
+
+def test_optimised_motions_come_with_5_21_and_take_shares() -> None:
+    goal = [angle + 0.1 for angle in HOME]
+    old, new = controller("5.12"), controller()
+    assert not old.start(f"def go():\noptimovej({goal})\nend\n")
+    assert said_by(f'optimovej({goal}, a=1.0, v=0.5)\ntextmsg("there")', made=new, frames=300) == ["there"]
+    assert new.arm.q == pytest.approx(goal)
+    new.start(f"def go():\noptimovej({goal}, a=1.5)\nend\n")
+    new.step()
+    assert "share of what the arm can do" in new.log[-2]
+
+
+def test_a_popup_that_blocks_waits_until_it_is_closed() -> None:
+    made = controller()
+    waiting = 'popup("look", title="Seen", blocking=True)\ntextmsg("closed")'
+    assert said_by(waiting, made=made) == []
+    made.popup_open = False
+    made.step()
+    assert "closed" in made.log[-2]
+
+
+def test_a_program_that_asks_for_a_protective_stop_and_nothing_else_ends() -> None:
+    made = controller()
+    made.start("def last():\nprotective_stop()\nend\n")
+    made.step()
+    assert made.safety_mode == SafetyMode.PROTECTIVE_STOP
+    assert made.program is None
+    other = controller()
+    other.start("def more():\nprotective_stop()\nsync()\nend\n")
+    for _ in range(10):
+        other.step()
+    assert other.program is not None
+
+
+def test_the_terminals_of_the_tool_and_the_payload_are_set_by_script() -> None:
+    made = controller()
+    body = """set_tool_digital_out(1, True)
+    set_configurable_digital_out(2, True)
+    set_tool_voltage(24)
+    set_gravity([0, 9.82, 0])
+    set_payload(2.5, [0, 0, 0.1])
+    set_standard_analog_out(1, 0.25)
+    textmsg(get_tool_digital_out(1), get_payload())"""
+    assert said_by(body, made=made) == ["True2.5"]
+    terminals: Any = made.terminals
+    assert terminals.digital_outputs == 1 << 17 | 1 << 10
+    assert (terminals.tool_voltage, terminals.analog_outputs) == (24, [0.0, 0.25])
+    assert (made.gravity, made.payload.center) == ([0.0, 9.82, 0.0], [0.0, 0.0, 0.1])

@@ -1,0 +1,107 @@
+"""URScript functions of the controller's terminals: digital, analog, of the tool; and of the payload."""
+
+from typing import Any
+
+from weldcal.tools.emulators.ur.controller.registers import register_index
+from weldcal.tools.emulators.ur.script.answers import Answers
+from weldcal.tools.emulators.ur.script.syntax import ScriptError
+
+STANDARD, CONFIGURABLE, TOOL = 0, 8, 16  # first bit of each group of digital terminals
+TOOL_VOLTAGES = (0, 12, 24)
+
+
+class TerminalFunctions(Answers):
+    """Outputs keep their level when the program ends, unless they follow its state."""
+
+    def set_standard_digital_out(self, n: int, b: bool) -> None:
+        self._set(STANDARD, register_index(n, 8), b)
+
+    def set_digital_out(self, n: int, b: bool) -> None:
+        self.set_standard_digital_out(n, b)
+
+    def get_standard_digital_out(self, n: int) -> bool:
+        return self._get(self._controller.terminals.digital_outputs, STANDARD, register_index(n, 8))
+
+    def get_digital_out(self, n: int) -> bool:
+        return self.get_standard_digital_out(n)
+
+    def set_configurable_digital_out(self, n: int, b: bool) -> None:
+        self._set(CONFIGURABLE, register_index(n, 8), b)
+
+    def get_configurable_digital_out(self, n: int) -> bool:
+        return self._get(self._controller.terminals.digital_outputs, CONFIGURABLE, register_index(n, 8))
+
+    def set_tool_digital_out(self, n: int, b: bool) -> None:
+        self._set(TOOL, register_index(n, 2), b)
+
+    def get_tool_digital_out(self, n: int) -> bool:
+        return self._get(self._controller.terminals.digital_outputs, TOOL, register_index(n, 2))
+
+    def set_runstate_standard_digital_output_to_value(self, outputId: int, state: int) -> None:
+        self._controller.terminals.runstate[register_index(outputId, 8)] = register_index(state, 8)
+
+    def get_standard_digital_in(self, n: int) -> bool:
+        return self._get(self._controller.terminals.digital_inputs, STANDARD, register_index(n, 8))
+
+    def get_digital_in(self, n: int) -> bool:
+        return self.get_standard_digital_in(n)
+
+    def get_configurable_digital_in(self, n: int) -> bool:
+        return self._get(self._controller.terminals.digital_inputs, CONFIGURABLE, register_index(n, 8))
+
+    def get_tool_digital_in(self, n: int) -> bool:
+        return self._get(self._controller.terminals.digital_inputs, TOOL, register_index(n, 2))
+
+    def set_standard_analog_out(self, n: int, f: float) -> None:
+        self._controller.terminals.analog_outputs[register_index(n, 2)] = min(1.0, max(0.0, float(f)))
+
+    def set_analog_out(self, n: int, f: float) -> None:
+        self.set_standard_analog_out(n, f)
+
+    def get_standard_analog_out(self, n: int) -> float:
+        return self._controller.terminals.analog_outputs[register_index(n, 2)]
+
+    def get_standard_analog_in(self, n: int) -> float:
+        register_index(n, 2)
+        return 0.0
+
+    def set_analog_outputdomain(self, port: int, domain: int) -> None:
+        bit = 1 << register_index(port, 2)
+        types = self._controller.terminals.analog_output_types
+        self._controller.terminals.analog_output_types = types | bit if domain else types & ~bit
+
+    def set_tool_voltage(self, voltage: float) -> None:
+        if voltage not in TOOL_VOLTAGES:
+            raise ScriptError(f"The tool's voltage is 0, 12 or 24, not {voltage!r}.")
+        self._controller.terminals.tool_voltage = int(voltage)
+
+    def set_payload(self, m: float, cog: Any = None) -> None:
+        self._controller.payload.mass = float(m)
+        if cog is not None:
+            self.set_payload_cog(cog)
+
+    def set_payload_mass(self, m: float) -> None:
+        self.set_payload(m)
+
+    def set_payload_cog(self, CoG: Any) -> None:
+        self._controller.payload.center = _numbers(CoG, 3, "The centre of gravity")
+
+    def set_target_payload(self, m: float, cog: Any, inertia: Any = None, transition_time: float = 0.0) -> None:
+        self.set_payload(m, cog)
+        if inertia is not None:
+            self._controller.payload.inertia = _numbers(inertia, 6, "The inertia")
+
+    def set_gravity(self, d: Any) -> None:
+        self._controller.gravity = _numbers(d, 3, "Gravity")
+
+    def _set(self, first: int, n: int, b: bool) -> None:
+        self._controller.terminals.set_digital(first, 1 << n, (1 if b else 0) << n)
+
+    def _get(self, bits: int, first: int, n: int) -> bool:
+        return bool(bits >> (first + n) & 1)
+
+
+def _numbers(values: Any, count: int, what: str) -> list[float]:
+    if not isinstance(values, list) or len(values) != count:
+        raise ScriptError(f"{what} needs {count} numbers, it got {values!r}.")
+    return [float(value) for value in values]
