@@ -51,7 +51,6 @@ class ControllerState:
         self.log: deque[str] = deque(maxlen=200)
         self.events: deque[Event] = deque(maxlen=200)
         self.popup_open = False
-        self.operational_mode = "NONE"
         self.protective_since = -(10**9)
         self._later: list[tuple[int, Callable[[], object]]] = []
 
