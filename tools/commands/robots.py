@@ -88,7 +88,7 @@ def chosen_robot(
     with emulator_process(
         host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
     ) as emulator:
-        yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
+        yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace, lockstep=True)
 
 
 def _check_pace(pace: float) -> None:
@@ -96,9 +96,9 @@ def _check_pace(pace: float) -> None:
         raise InputError(f"--pace must be from {SLOWEST_PACE:g} to 1, and it is {pace:g}.")
 
 
-def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float) -> ChosenRobot:
+def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float, lockstep: bool = False) -> ChosenRobot:
     config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
-    config = dc.replace(config, host=host, pace=pace)
+    config = dc.replace(config, host=host, pace=pace, lockstep=lockstep)
     if not dry_run:
         scenario.robot = config
         draw_in_this_thread()

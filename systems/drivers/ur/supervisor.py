@@ -17,6 +17,7 @@ PLAYING, PAUSING, PAUSED = 2, 3, 4
 # states that the guard script writes into its output register
 OBEYING, STALE_REGISTER = 1, 2
 MADE_UP_FOR_S = 0.03  # of the cell's time
+PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
 
 
 class Action(IntEnum):
@@ -52,11 +53,24 @@ class Limits:
     tracking_rad: float = 0.01
     pace: float = 1.0
     position_margin: float = 0.02
+    hold_s: float = (
+        np.inf
+    )  # a moving command that is older is not sent again; in lockstep the controller waits for the next
 
     def slowed(self, pace: float) -> Limits:
         """The same limits where the controller runs at `pace` seconds per host second."""
         return replace(
             self, stale_s=self.stale_s / pace, late_s=self.late_s / pace, deaf_s=self.deaf_s / pace, pace=pace
+        )
+
+    def in_lockstep(self) -> Limits:
+        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no stop."""
+        return replace(
+            self,
+            stale_s=max(self.stale_s, PATIENCE_S),
+            late_s=max(self.late_s, PATIENCE_S),
+            deaf_s=max(self.deaf_s, PATIENCE_S),
+            hold_s=HELD_S / self.pace,
         )
 
 
@@ -212,9 +226,10 @@ class Supervisor:
         """Check the arm's position against the integral of the recent commands, which decays in half a second."""
         limits = self._limits
         if self._reference is None:
-            self._reference, self._referred_at = robot.q.copy(), now
-        dt = limits.pace * min(now - self._referred_at, 0.1)
-        self._referred_at = now
+            self._reference, self._referred_at = robot.q.copy(), robot.robot_time
+        # of the robot's time: an arm moves in its controller's frames
+        dt = min(max(robot.robot_time - self._referred_at, 0.0), 0.1)
+        self._referred_at = robot.robot_time
         self._reference = self._reference + dt * self._command.qd + (robot.q - self._reference) * min(dt / 0.5, 1.0)
         apart = float(np.abs(self._reference - robot.q).max())
         # commands and state together have up to 40 ms of delay

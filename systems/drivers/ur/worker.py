@@ -122,6 +122,8 @@ class Worker:
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
+            if command.qd.any() and now - command.given_at > self._config.limits.hold_s:
+                return  # the controller waits for the cell's next command
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
             process = command.process and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.qd, ACCELERATION, process):
