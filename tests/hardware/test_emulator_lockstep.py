@@ -44,7 +44,7 @@ class Streamed:
     """A controller with a client that has streamed: the next frame would be one too far."""
 
     def __init__(self, bound_s: float = BOUND_S, recipe: int = 3) -> None:
-        self.controller: Any = SimpleNamespace(frame=0, runtime_state=RuntimeState.PLAYING)
+        self.controller: Any = SimpleNamespace(frame=0, runtime_state=RuntimeState.PLAYING, watchdogs={})
         self.client: Any = Client()
         self.lockstep = Lockstep(self.controller, bound_s)
         self.packages(STREAM_PACKAGES, recipe)
@@ -89,6 +89,22 @@ def test_after_the_bound_time_goes_on_until_the_client_streams_again() -> None:
     streamed.packages(STREAM_PACKAGES, 3)
     streamed.controller.frame += AHEAD_FRAMES
     assert streamed.waits(3.0)
+
+
+def test_a_client_that_let_a_watchdog_be_set_is_waited_for_with_its_first_package() -> None:
+    made = Streamed()
+    made.packages(1, recipe=7)
+    made.controller.frame += 12
+    assert not made.waits(), "one package is no stream"
+    made.controller.watchdogs["input_int_register_0"] = SimpleNamespace(
+        fed_at=made.controller.frame - 12, period_s=0.05
+    )
+    assert not made.waits(), "24 of 50 ms"
+    made.controller.frame += 1
+    assert made.waits(1.0)
+    assert not made.waits(1.0 + BOUND_S)
+    made.controller.frame += 1
+    assert not made.waits(1.0 + BOUND_S), "not again before it has been heard"
 
 
 def no_stream(streamed: Streamed) -> None:
