@@ -9,16 +9,20 @@ from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import LOCKSTEP_S, emulator_process
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.link import UrLink
+from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, STREAM_PACKAGES, Lockstep
 from weldcal.tools.emulators.ur.wire.net import LinkFaults
-from weldcal.tools.studies.robot.bench import Bench
+from weldcal.tools.studies.robot.bench import Bench, Stream
 
 BOUND_S = 0.5
 FRAME_S = 0.002
@@ -40,7 +44,7 @@ class Streamed:
     """A controller with a client that has streamed: the next frame would be one too far."""
 
     def __init__(self, bound_s: float = BOUND_S, recipe: int = 3) -> None:
-        self.controller: Any = SimpleNamespace(frame=0, runtime_state=RuntimeState.PLAYING)
+        self.controller: Any = SimpleNamespace(frame=0, runtime_state=RuntimeState.PLAYING, watchdogs={})
         self.client: Any = Client()
         self.lockstep = Lockstep(self.controller, bound_s)
         self.packages(STREAM_PACKAGES, recipe)
@@ -85,6 +89,22 @@ def test_after_the_bound_time_goes_on_until_the_client_streams_again() -> None:
     streamed.packages(STREAM_PACKAGES, 3)
     streamed.controller.frame += AHEAD_FRAMES
     assert streamed.waits(3.0)
+
+
+def test_a_client_that_let_a_watchdog_be_set_is_waited_for_with_its_first_package() -> None:
+    made = Streamed()
+    made.packages(1, recipe=7)
+    made.controller.frame += 12
+    assert not made.waits(), "one package is no stream"
+    made.controller.watchdogs["input_int_register_0"] = SimpleNamespace(
+        fed_at=made.controller.frame - 12, period_s=0.05
+    )
+    assert not made.waits(), "24 of 50 ms"
+    made.controller.frame += 1
+    assert made.waits(1.0)
+    assert not made.waits(1.0 + BOUND_S)
+    made.controller.frame += 1
+    assert not made.waits(1.0 + BOUND_S), "not again before it has been heard"
 
 
 def no_stream(streamed: Streamed) -> None:
@@ -135,6 +155,38 @@ def test_a_worker_that_does_not_run_costs_the_controller_no_time(bench: Bench) -
     assert after["lockstep"]["longest_s"] > 0.05
     assert after["lockstep"]["given_up"] == 0
     bench.end()
+
+
+def test_a_cell_that_is_late_finds_the_arm_where_it_left_it(bench: Bench) -> None:
+    config = UrRtde(host=bench.host, lockstep=True)
+    bench.emulator.do("reset_checker")
+    link = UrLink.start(bench.host, bench.arm, config.limits(bench.arm), payload_kg=config.payload_kg)
+    stream = Stream(link, bench.arm, bench.home)
+    stream.start()
+    until = time.monotonic() + 8.0
+    while not stream.cruising:
+        assert time.monotonic() < until, stream.state.status.fault
+        time.sleep(0.002)
+    stream.twist = lambda qd: None
+    time.sleep(0.1)
+    begin = bench.emulator.state()
+    time.sleep(0.3)
+    end = bench.emulator.state()
+    assert end["timestamp"] == begin["timestamp"]
+    assert end["q"] == begin["q"]
+    assert np.abs(begin["qd"]).max() > 0.05, "in the middle of its motion"
+    stream.twist = lambda qd: qd
+    while bench.emulator.state()["timestamp"] < end["timestamp"] + 0.3:
+        assert time.monotonic() < until + 5.0, "time does not go on"
+    assert stream.state.fault is Fault.NONE, stream.state.status.fault
+    assert bench.tool_speed() > 0.01
+    stream.stop()
+    link.close()
+
+
+def test_a_real_robot_does_not_wait_for_this_computer() -> None:
+    with pytest.raises(InputError, match="leave lockstep at false"):
+        PrepareRobot(UrRtde(host="192.0.2.1", lockstep=True), load_arm())
 
 
 def test_a_worker_that_is_silenced_on_purpose_is_not_waited_for(bench: Bench) -> None:

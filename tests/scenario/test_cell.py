@@ -42,8 +42,8 @@ job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -
 
 
 NEAR = 10  # a seed whose first poses lie near each other
-# Twice as fast as usual, so that the torch, which comes on when the tip is 60 mm ahead of where it felt the start, is on sooner.
-FAST = "welding: {speed_mm_s: 16.0}"
+# Four times as fast as usual, so that the torch, which comes on when the tip is 60 mm ahead of where it felt the start, is on sooner.
+FAST = "welding: {speed_mm_s: 32.0}"
 
 
 def run(scenario: Scenario, folder: Path, seed: int = 0) -> DemoResult:
@@ -191,7 +191,7 @@ def test_the_weld_log_needs_nothing_that_only_a_simulation_knows(short_job: Demo
 
 
 def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
-    hidden = "finger_camera: !RenderedFingerCamera {hidden_from_s: 13.0}"
+    hidden = "finger_camera: !RenderedFingerCamera {hidden_from_s: 8.0}"
     result = run(load_scenario("straight_groove", f"{TOLD}\n{FAST}\n{hidden}"), tmp_path)
     assert result.state == "held"
     assert "tag" in str(result.summary()["reason"])
@@ -202,7 +202,7 @@ def test_a_hidden_tag_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
 def test_lost_contact_holds_the_job_with_the_torch_off(tmp_path: Path) -> None:
     scenario = load_scenario("straight_groove", f"{TOLD}\n{FAST}")
     assert scenario.workpiece is not None
-    scenario.workpiece.hole_from_mm = 70.0
+    scenario.workpiece.hole_from_mm = 60.0
     result = run(scenario, tmp_path)
     assert result.state == "held"
     assert "Contact lost for 40 mm in the middle of the seam" in str(result.summary()["reason"])

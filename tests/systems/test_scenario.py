@@ -266,6 +266,7 @@ robot: !UrRtde
   host: 192.168.1.10
   rate_hz: 500.0
   pace: 0.5
+  lockstep: true
   velocity_share: 0.3
   upper_registers: false
   payload_kg: 2.0

@@ -90,7 +90,7 @@ def chosen_robot(
     ) as emulator:
         load = (scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(emulator.host, scenario)).load()
         emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
-        yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace)
+        yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace, lockstep=True)
 
 
 def _check_pace(pace: float) -> None:
@@ -98,9 +98,9 @@ def _check_pace(pace: float) -> None:
         raise InputError(f"--pace must be from {SLOWEST_PACE:g} to 1, and it is {pace:g}.")
 
 
-def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float) -> ChosenRobot:
+def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float, lockstep: bool = False) -> ChosenRobot:
     config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
-    config = dc.replace(config, host=host, pace=pace)
+    config = dc.replace(config, host=host, pace=pace, lockstep=lockstep)
     if not dry_run:
         scenario.robot = config
         draw_in_this_thread()

@@ -182,7 +182,8 @@ class UrLink:
         now = time.monotonic()
         fault, detail, fault_time = Fault(int(found[_AT["fault"]])), found[_AT["detail"]], found[_AT["fault_time"]]
         if fault is Fault.NONE and self._died is None and found[_AT["phase"]] != Phase.ENDED:
-            quiet = now - found[_AT["heartbeat"]] > HEARTBEAT_LIMIT_S / self._config.limits.pace
+            limits = self._config.limits
+            quiet = now - found[_AT["heartbeat"]] > max(HEARTBEAT_LIMIT_S / limits.pace, limits.stale_s)
             if quiet or self._process.poll() is not None:
                 self._died = (Fault.WORKER_DIED, now)
                 _kill(self._process)

@@ -35,6 +35,7 @@ class UrRtde(DriverConfig):
     host: str = ""
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
+    lockstep: bool = False  # only for the emulator: its time waits for this computer
     velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
     upper_registers: bool | None = None  # 24 to 47 (fieldbuses use the lower ones); null: where ur_rtde supports it
     payload_kg: float = 1.4  # of the welding tool
@@ -43,9 +44,10 @@ class UrRtde(DriverConfig):
 
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
-        return Limits(
+        limits = Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
+        return limits.in_lockstep() if self.lockstep else limits
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
         """The payload with which the pre-flight compares the controller's."""
@@ -143,7 +145,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     """Run the pre-flight checks, read the robot's kinematics, then start the link with its guard; the arm does not move.
 
     Raises:
-        InputError: the scenario names no host, or a pace other than 1 for a real robot.
+        InputError: the scenario names no host, or a pace other than 1 or lockstep for a real robot.
         RobotRefused, RobotUnreachable: the message gives the operator action.
     """
     require_ur_rtde()
@@ -151,6 +153,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
     if config.pace != FULL_PACE and not is_loopback(controller_address(config.host)):
         raise InputError("Only the emulator can run at another pace: leave pace at 1 for a robot.")
+    if config.lockstep and not is_loopback(controller_address(config.host)):
+        raise InputError("Only the emulator waits for this computer: leave lockstep at false for a robot.")
     if config.process_output is not None and not 0 <= config.process_output < N_OUTPUTS:
         raise InputError(
             f"robot.process_output must be a standard digital output from 0 to 7, not {config.process_output}."

@@ -24,6 +24,7 @@ GUARD_SILENT_S = 0.08
 OUTPUT_ON_S = 0.020
 # The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
 OUTPUT_OFF_S = 0.050
+PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
 
 
 class Action(IntEnum):
@@ -60,6 +61,13 @@ class Limits:
     tracking_rad: float = 0.01
     pace: float = 1.0
     position_margin: float = 0.02
+    # a moving command that is older is not sent again; in lockstep the controller waits for the next
+    hold_s: float = np.inf
+
+    @property
+    def waits(self) -> bool:
+        """Whether the controller waits for this computer."""
+        return bool(np.isfinite(self.hold_s))
 
     def slowed(self, pace: float) -> Limits:
         """The same limits where the controller runs at `pace` seconds per host second."""
@@ -70,6 +78,17 @@ class Limits:
             lost_s=self.lost_s / pace,
             deaf_s=self.deaf_s / pace,
             pace=pace,
+        )
+
+    def in_lockstep(self) -> Limits:
+        """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no stop."""
+        return replace(
+            self,
+            stale_s=max(self.stale_s, PATIENCE_S),
+            late_s=max(self.late_s, PATIENCE_S),
+            lost_s=max(self.lost_s, PATIENCE_S),
+            deaf_s=max(self.deaf_s, PATIENCE_S),
+            hold_s=HELD_S / self.pace,
         )
 
 
@@ -265,10 +284,11 @@ class Supervisor:
         """Check the arm's position against the integral of the recent commands, which decays in half a second."""
         limits = self._limits
         if self._reference is None:
-            self._reference, self._referred_at = robot.q.copy(), now
-        dt = limits.pace * min(now - self._referred_at, 0.1)
+            self._reference, self._referred_at = robot.q.copy(), robot.robot_time
+        # of the robot's time: an arm moves in its controller's frames
+        dt = min(max(robot.robot_time - self._referred_at, 0.0), 0.1)
         kept_s = min(max(robot.lost_s - self._lost_s, 0.0), 0.1)  # the guard slows the arm where numbers come late
-        self._referred_at, self._lost_s = now, robot.lost_s
+        self._referred_at, self._lost_s = robot.robot_time, robot.lost_s
         led = (dt - kept_s) * self._command.scaled_qd
         self._reference = self._reference + led + (robot.q - self._reference) * min(dt / 0.5, 1.0)
         apart = float(np.abs(self._reference - robot.q).max())

@@ -128,10 +128,13 @@ class Worker:
     def _scaled(self, command: Command, now: float) -> Command:
         """The command with the factor that slows the arm while it is late, but not under a burning torch, which goes out first."""
         factor = self._scale.step(now, now - command.given_at)
-        return command if command.process else replace(command, scale=factor)
+        kept = command.process or self._config.limits.waits
+        return command if kept else replace(command, scale=factor)
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
+            if command.qd.any() and now - command.given_at > self._config.limits.hold_s:
+                return  # the controller waits for the cell's next command
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
             process = command.process and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.scaled_qd, ACCELERATION, process):

@@ -4,6 +4,7 @@ from typing import Any
 
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RuntimeState
+from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.wire.net import Connection
 
 AHEAD_FRAMES = 5  # so far the controller goes past a stream's newest package
@@ -14,7 +15,8 @@ class Lockstep:
     """Says before every frame whether it has to wait.
 
     A stream is a run of input packages of one recipe. It ends with a package of another recipe, with its connection, with
-    the program, and where the client stays silent for `bound_s`. A connection that a fault keeps from being heard is not
+    the program, and where the client stays silent for `bound_s`. A client that has let a watchdog be set has promised to
+    write, too: half of the watchdog's period passes without it. A connection that a fault keeps from being heard is not
     waited for.
     """
 
@@ -25,6 +27,7 @@ class Lockstep:
         self._silenced: Connection | None = None
         self._recipe = 0
         self._run = 0
+        self._silent = False
         self._frame = 0
         self._since: float | None = None
         self._waits = self._given_up = 0
@@ -37,6 +40,7 @@ class Lockstep:
         again = connection is self._client and recipe == self._recipe and frame - self._frame <= AHEAD_FRAMES
         self._client, self._recipe, self._frame = connection, recipe, frame
         self._run = self._run + 1 if again else 1
+        self._silent = False
 
     def expect_silence(self) -> None:
         """The client that streams now will be silenced on purpose: it is not waited for any more."""
@@ -44,7 +48,7 @@ class Lockstep:
 
     def waits(self, now: float) -> bool:
         """Whether the next frame has to wait for the client's next package."""
-        if not (self._bound_s and self._streams(now) and self._controller.frame - self._frame >= AHEAD_FRAMES):
+        if not (self._bound_s and self._may_come(now) and self._is_late()):
             self._end_wait(now)
             return False
         if self._since is None:
@@ -54,7 +58,7 @@ class Lockstep:
             return True
         self._given_up += 1
         self._end_wait(now)
-        self._run = 0
+        self._run, self._silent = 0, True
         return False
 
     def state(self) -> dict[str, Any]:
@@ -67,9 +71,16 @@ class Lockstep:
             "waited_s": round(self._waited_s, 6),
         }
 
-    def _streams(self, now: float) -> bool:
+    def _is_late(self) -> bool:
+        frame = self._controller.frame
+        if self._run >= STREAM_PACKAGES and frame - self._frame >= AHEAD_FRAMES:
+            return True
+        watchdogs = self._controller.watchdogs.values()
+        return any(2.0 * (frame - watchdog.fed_at) * STEP_S >= watchdog.period_s for watchdog in watchdogs)
+
+    def _may_come(self, now: float) -> bool:
         client = self._client
-        if client is None or self._run < STREAM_PACKAGES or client is self._silenced:
+        if client is None or self._silent or client is self._silenced:
             return False
         if self._controller.runtime_state != RuntimeState.PLAYING:
             self._run = 0

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import map_coordinates, spline_filter
 from scipy.stats import chi2
 
 from weldcal.calibration.eye_on_base.corrected_estimate import apply_self_calibration
@@ -27,20 +27,24 @@ REFERENCE_M = 0.4
 X_BC = RigidTransform(RollPitchYaw(2.6, 0.1, 0.4), [0.4, -0.7, 0.5])
 NOISE_M, NOISE_RAD, NOISE_RATIO = 1e-4, 1e-3, 6e-4  # of a centre and a normal per axis, and of a hole circle's ratio
 _FIELD = 0.5  # half of what the scanner sees over its distance
+_BORDER = 12  # pixels
 _REACH = np.array([0.12, 0.10, 0.06])  # m, of the places round the middle of the field
 _MIDDLE = np.array([0.0, 0.0, REFERENCE_M])
 _WORK_C = np.array([0.02, -0.05, 0.38])
 
 
 @cache
-def _image(device: int, warp_m: float) -> Array:
-    return np.asarray(device_warp((401, 401), warp_m, device), dtype=float)
+def _splines(device: int, warp_m: float) -> Array:
+    """Coefficients of the cubic splines through the device's depth errors, with room for the border's continuation."""
+    image = np.pad(np.asarray(device_warp((401, 401), warp_m, device), dtype=float), _BORDER, mode="edge")
+    return np.asarray(spline_filter(image, 3, mode="nearest"))
 
 
 def warped_point(p_C: Array, device: int, warp_m: float = WARP_M) -> Array:
     """Where a scanner whose depth is off by a field of cosines over its image puts a point (3,) m; no polynomial in x and y."""
     column, row = ((1.0 + p_C[k] / p_C[2] / _FIELD) * 200.0 for k in (0, 1))
-    off = float(map_coordinates(_image(device, warp_m), [[row], [column]], order=3, mode="nearest")[0])
+    place = [[row + _BORDER], [column + _BORDER]]
+    off = float(map_coordinates(_splines(device, warp_m), place, order=3, mode="nearest", prefilter=False)[0])
     return np.asarray(p_C * (1.0 + off * (p_C[2] / REFERENCE_M) ** 2 / p_C[2]))
 
 

@@ -18,6 +18,7 @@ from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.pacing import real_time_priority
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import Emulator
 
@@ -78,6 +79,10 @@ class Stream(threading.Thread):
         self.worst_gap_s = 0.0
 
     def run(self) -> None:
+        with real_time_priority():  # as a cell
+            self._run()
+
+    def _run(self) -> None:
         deadline = last = time.monotonic()
         while not self._done.is_set():
             time.sleep(max(0.0, deadline - time.monotonic()))
