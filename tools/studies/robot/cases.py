@@ -83,6 +83,18 @@ def _is_paused_and_dies(bench: Bench) -> float:
     return at
 
 
+def _stands_still(seconds: float) -> Callable[[Bench], float]:
+    """The worker does not run for so long."""
+
+    def throw(bench: Bench) -> float:
+        at = bench.signal_worker(signal.SIGSTOP)
+        time.sleep(seconds)
+        bench.signal_worker(signal.SIGCONT)
+        return at
+
+    return throw
+
+
 def _slider(percent: int) -> Callable[[Bench], float]:
     """The slider alone: the scaling that a controller reports beside it stays at 100 %."""
     return _fault("speed_scaling", value=0.01 * percent)
@@ -254,6 +266,8 @@ RUNNING: tuple[Case, ...] = (
     _stops("worker killed", lambda b: b.signal_worker(signal.SIGKILL), Fault.WORKER_DIED),
     _stops("worker crashes", lambda b: b.signal_worker(signal.SIGSEGV), Fault.WORKER_DIED, short=False),
     _stops("worker stopped (SIGSTOP)", lambda b: b.signal_worker(signal.SIGSTOP), Fault.WORKER_DIED),
+    Case("worker stands still for 60 ms", _stands_still(0.060), GO, may_rest=True, random=False),
+    Case("worker stands still for 120 ms", _stands_still(0.120), GO, may_rest=True, random=False, short=False),
     # nobody is left who could stop the paused program: what was commanded must be worth nothing when somebody presses Play
     _paused("computer dies, pause, Play after 3 s", _dies_and_is_paused, 3.0),
     _paused("pause, computer dies, Play after 3 s", _is_paused_and_dies, 3.0),
