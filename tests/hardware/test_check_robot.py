@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
+import shlex
 import socket
 import struct
 import subprocess
@@ -15,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
 from tests.hardware.emulator_process import Emulator, emulator_process
 from tests.places import ROOT
@@ -29,6 +32,8 @@ from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.cli.app import app
 from weldcal.tools.commands.check_robot import emit_table
 from weldcal.tools.emulators.ur.addresses import PORTS, free_address
 from weldcal.tools.emulators.ur.main import HOME
@@ -549,6 +554,22 @@ def test_the_command_needs_no_project_and_no_robot(nobody: str) -> None:
     assert "port 30004 is closed" in finished.stderr
     assert "Traceback" not in finished.stderr
     assert finished.stdout.splitlines()[-1] == f"  not checked  {len(CHECKS) - 1} more that need an answer"
+
+
+def test_every_command_of_the_document_exists() -> None:
+    text = (ROOT / "docs/hardware.md").read_text()
+    lines = [line for block in re.findall(r"```sh\n(.*?)```", text, re.S) for line in block.splitlines()]
+    assert len(lines) > 12
+    for line in lines:
+        program, *words = shlex.split(line)
+        assert program == "weldcal"
+        command: Any = get_command(app)
+        while hasattr(command, "commands"):
+            command = command.commands[words.pop(0)]
+        command.make_context(line, list(words))  # unknown options and missing arguments end it
+        for k, word in enumerate(words):
+            if word == "--scenario":
+                load_scenario(words[k + 1])
 
 
 def test_the_document_names_every_check_and_every_fault() -> None:

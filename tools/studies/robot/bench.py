@@ -1,5 +1,7 @@
 """Test bench of the hardware link: an emulated controller, the link, and an arm that moves at 0.05 m/s."""
 
+import contextlib
+import os
 import signal
 import subprocess
 import sys
@@ -118,6 +120,7 @@ class Bench:
         self.link: UrLink | None = None
         self._stream: Stream | None = None
         self._child: subprocess.Popen[str] | None = None
+        self._workers: list[int] = []
         self.worst_gap_s = 0.0
 
     @property
@@ -154,7 +157,8 @@ class Bench:
         command = [sys.executable, "-m", "weldcal.tools.studies.robot.bench", self.host]
         self._child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self.cruise()
-        return worker_of(self._child.pid)
+        self._workers = worker_of(self._child.pid)
+        return self._workers
 
     def cruise(self) -> None:
         """Wait until the arm moves at full speed with the runway ahead.
@@ -194,6 +198,15 @@ class Bench:
         assert self._child is not None
         now = time.monotonic()
         self._child.kill()
+        return now
+
+    def computer_dies(self) -> float:
+        """SIGKILL to the process that owns the link and to its worker: nothing is sent or stopped any more; when."""
+        assert self._child is not None
+        now = time.monotonic()
+        for number in (self._child.pid, *self._workers):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
         return now
 
     def send(self, twist: Callable[[Array], Array | None], seconds: float) -> float:

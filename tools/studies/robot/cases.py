@@ -1,6 +1,7 @@
 """The faults that are injected into the hardware link: how, what must follow, and the repair."""
 
 import signal
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -46,6 +47,7 @@ class Case:
     wired: bool = False  # with a process output
     process: bool = False  # with a process output that is on
     burns_s: float = 0.0  # how long after the fault the process output may be on
+    resumes: bool = False  # Play resumes the program
     elsewhere: bool = False  # link and commands in a process of their own
     says: str = ""  # what a refusal's sentence must contain
     random: bool = True  # also in the random sequences
@@ -67,6 +69,32 @@ SETS_OUTPUT = f"sec theirs():\n  set_standard_digital_out({OUTPUT}, True)\nend\n
 def _output(on: bool) -> Callable[[Bench], float]:
     """Another client writes the output in every frame."""
     return _fault("set_digital_out", n=OUTPUT, on=on, seconds=FOREIGN_S)
+
+
+def _dies_and_is_paused(bench: Bench) -> float:
+    at = bench.computer_dies()
+    bench.emulator.fault("pause_program", latch=False)
+    return at
+
+
+def _is_paused_and_dies(bench: Bench) -> float:
+    """The worker may send one number more, which the paused program reads when it is resumed."""
+    at = bench.emulator.fault("pause_program", latch=False)
+    time.sleep(0.001)
+    bench.computer_dies()
+    return at
+
+
+def _stands_still(seconds: float) -> Callable[[Bench], float]:
+    """The worker does not run for so long."""
+
+    def throw(bench: Bench) -> float:
+        at = bench.signal_worker(signal.SIGSTOP)
+        time.sleep(seconds)
+        bench.signal_worker(signal.SIGCONT)
+        return at
+
+    return throw
 
 
 def _slider(percent: int) -> Callable[[Bench], float]:
@@ -96,6 +124,11 @@ def _stops(
     """A fault that must stop the arm and be reported as one of these."""
     named = frozenset({faults}) if isinstance(faults, Fault) else faults
     return Case(name, throw, STOP, named, repair, short=short, **settings)
+
+
+def _paused(name: str, throw: Callable[[Bench], float], play_s: float, *, short: bool = True) -> Case:
+    """Nobody stops the program, and Play resumes it: nothing may move."""
+    return _stops(name, throw, frozenset(), elsewhere=True, resumes=True, random=False, watch_s=play_s, short=short)
 
 
 def _either(
@@ -238,6 +271,13 @@ RUNNING: tuple[Case, ...] = (
     _stops("worker killed", lambda b: b.signal_worker(signal.SIGKILL), Fault.WORKER_DIED),
     _stops("worker crashes", lambda b: b.signal_worker(signal.SIGSEGV), Fault.WORKER_DIED, short=False),
     _stops("worker stopped (SIGSTOP)", lambda b: b.signal_worker(signal.SIGSTOP), Fault.WORKER_DIED),
+    Case("worker stands still for 60 ms", _stands_still(0.060), GO, may_rest=True, random=False),
+    Case("worker stands still for 120 ms", _stands_still(0.120), GO, may_rest=True, random=False, short=False),
+    # nobody is left who could stop the paused program: what was commanded must be worth nothing when somebody presses Play
+    _paused("computer dies, pause, Play after 3 s", _dies_and_is_paused, 3.0),
+    _paused("pause, computer dies, Play after 3 s", _is_paused_and_dies, 3.0),
+    _paused("computer dies, pause, Play after 0.5 s", _dies_and_is_paused, 0.5, short=False),
+    _paused("pause, computer dies, Play after 0.5 s", _is_paused_and_dies, 0.5, short=False),
     _stops("cell's process killed", lambda b: b.kill_child(), frozenset(), elsewhere=True, random=False, watch_s=1.0),
 )
 

@@ -36,6 +36,7 @@ STARTS = 3
 LOADED = ("LINK_STALE", "COMMAND_LATE", "WORKER_DIED")
 PLAYED_S = 0.25
 HASTE_S = 0.1
+STILL_RAD = 0.0005
 ENDED_S = 3.0  # a worker without its cell brakes, ends the program and closes its connections
 
 
@@ -145,7 +146,13 @@ def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played
         fault, sentence, seen = state.fault, state.status.fault or "", 1e3 * (state.fault_time - at)
         if fault not in case.faults:
             problems.append(f"it said {fault.name}, not {' or '.join(sorted(f.name for f in case.faults))}")
+    q_before = np.array(bench.emulator.state()["q"])
     played = _repair_and_play(bench, case, played_s)
+    turned = float(np.abs(np.array(bench.emulator.state()["q"]) - q_before).max())
+    if turned > STILL_RAD:
+        problems.append(f"a joint turned by {turned:.4f} rad when Play was pressed")
+    if case.resumes and not played.startswith("Starting"):
+        problems.append(f"the controller answered Play with {played!r}")
     again = bench.at_rest_after(at, case.rest_s)
     if again["moved_again_s"] is not None and found["moved_again_s"] is None:
         problems.append(f"it moved {again['moved_again_s']:.3f} s after the fault, when Play was pressed: {played}")
