@@ -122,6 +122,14 @@ def test_optimised_motions_come_with_5_21_and_take_shares() -> None:
     assert "share of what the arm can do" in new.log[-2]
 
 
+def test_a_joint_target_outside_its_limits_ends_the_program_without_a_stop() -> None:
+    made = controller()
+    made.start("def far():\nmovej([0, -1.57, 3.5, 0, 0, 0])\nend\n")
+    made.step()
+    assert "joint 2 of the target is outside its limits" in made.log[-2]
+    assert (made.program, made.safety_mode) == (None, SafetyMode.NORMAL)
+
+
 def test_a_popup_that_blocks_waits_until_it_is_closed() -> None:
     made = controller()
     waiting = 'popup("look", title="Seen", blocking=True)\ntextmsg("closed")'
