@@ -111,6 +111,24 @@ def test_the_tool_of_a_straight_move_stays_on_its_line_while_it_turns() -> None:
     assert rotation_vector(matrix(made.arm.tool_pose())[:3, :3] @ goal[:3, :3].T) == pytest.approx([0.0] * 3, abs=1e-6)
 
 
+def test_a_line_that_asks_a_joint_for_too_much_is_followed_more_slowly() -> None:
+    made = controller()
+    goal = made.arm.tool_pose()
+    goal[1] += 0.4
+    made.start(f"def fast():\nmovel(p{goal}, a=50, v=20, t=0.05)\nend\n")
+    fastest = np.zeros(6)
+    for _ in range(1000):
+        made.step()
+        fastest = np.maximum(fastest, np.abs(made.arm.qd))
+        if made.program is None:
+            break
+    assert made.safety_mode == SafetyMode.NORMAL, made.log
+    assert made.arm.tool_pose()[:3] == pytest.approx(goal[:3], abs=1e-6)
+    assert made.time_s > 0.1
+    assert (fastest <= made.arm.model.velocity_limit).all()
+    assert (fastest / made.arm.model.velocity_limit).max() > 0.95
+
+
 def test_optimised_motions_come_with_5_21_and_take_shares() -> None:
     goal = [angle + 0.1 for angle in HOME]
     old, new = controller("5.12"), controller()
@@ -120,6 +138,14 @@ def test_optimised_motions_come_with_5_21_and_take_shares() -> None:
     new.start(f"def go():\noptimovej({goal}, a=1.5)\nend\n")
     new.step()
     assert "share of what the arm can do" in new.log[-2]
+
+
+def test_a_joint_target_outside_its_limits_ends_the_program_without_a_stop() -> None:
+    made = controller()
+    made.start("def far():\nmovej([0, -1.57, 3.5, 0, 0, 0])\nend\n")
+    made.step()
+    assert "joint 2 of the target is outside its limits" in made.log[-2]
+    assert (made.program, made.safety_mode) == (None, SafetyMode.NORMAL)
 
 
 def test_a_popup_that_blocks_waits_until_it_is_closed() -> None:

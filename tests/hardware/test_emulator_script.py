@@ -251,7 +251,7 @@ def test_a_protective_stop_pauses_and_play_goes_on_with_the_old_speed() -> None:
     ("line", "why"),
     [
         ("speedj([9, 0, 0, 0, 0, 0], a=40, t=5)", "too fast"),
-        ("movej([0, -1.57, 3.5, 0, 0, 0])", "limit"),
+        ("speedj([0, 0, 0.5, 0, 0, 0], a=5, t=9)", "limit"),
         ("movel(p[-1.5, -0.17, 0.7, 2.22, 2.22, 0])", "reach|too fast"),
         ("speedl([-0.2, 0, 0, 0, 0, 0], a=1, t=20)", "singularity|too fast"),
     ],

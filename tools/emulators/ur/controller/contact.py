@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 
 # stiffer than this the compliant arm, 500 steps a second, would chatter
 STIFFEST_N_M = 1e5
@@ -18,6 +19,19 @@ class Surroundings:
     normal: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
     stiffness: float = 0.0
     push: Array = field(default_factory=lambda: np.zeros(6))
+
+    def place(self, point: list[float], normal: list[float], stiffness: float) -> None:
+        """Puts the plane somewhere; a stiffness of 0 takes it away.
+
+        Raises:
+            InputError: a normal without a direction, or a stiffness that is negative or too high to be stable.
+        """
+        n = np.array(normal)
+        if not (length := float(np.linalg.norm(n))) > 0.0:
+            raise InputError("Give a normal that is not zero.")
+        if not 0.0 <= stiffness <= STIFFEST_N_M:
+            raise InputError(f"Give a stiffness from 0 to {STIFFEST_N_M:.0f} N/m.")
+        self.point, self.normal, self.stiffness = np.array(point), n / length, stiffness
 
     @property
     def empty(self) -> bool:

@@ -18,6 +18,7 @@ STEP_S = 0.002
 # [M] where speedl gives up: smallest singular value of the tool's Jacobian (m and rad as they are)
 SINGULAR = 0.01
 REST_RAD_S = 1e-6
+SLOWINGS = 3  # how often a step of a path is shortened until every joint can do it
 
 
 class MotionRefused(Exception):
@@ -119,13 +120,19 @@ class Path:
         faster = self._sdot + self._acceleration * STEP_S
         slower = self._sdot - self._acceleration * STEP_S
         self._sdot = min(faster, max(self._speed * scaling, slower), math.sqrt(2.0 * self._acceleration * left))
-        if self._sdot * STEP_S >= left:
-            self._s, self._sdot = self._length, 0.0
-        else:
-            self._s += self._sdot * STEP_S
+        before, self._s = self._s, min(self._length, self._s + self._sdot * STEP_S)
+        q = self._joints(self._s, arm.q_target)
+        for _ in range(SLOWINGS):
+            # [M] a path that asks a joint for more than it can do is followed more slowly
+            excess = float((np.abs(q - arm.q_target) / arm.model.velocity_limit).max()) / STEP_S
+            if excess <= 1.0:
+                break
+            self._s = before + (self._s - before) * 0.99 / excess
+            q = self._joints(self._s, arm.q_target)
+        self._sdot = 0.0 if self._s >= self._length else (self._s - before) / STEP_S
         # one step at the goal without speed, so that what follows has nothing to brake
         self.done = left <= 0.0
-        return np.asarray((self._joints(self._s, arm.q_target) - arm.q_target) / STEP_S, dtype=np.float64)
+        return np.asarray((q - arm.q_target) / STEP_S, dtype=np.float64)
 
     def braked(self, factor: float) -> None:
         # the arm leaves its place on the path by nothing: the next step starts from the slower speed

@@ -6,6 +6,7 @@ are prefixed (v_, f_, b_), since scripts call variables `async` or `time`. Assig
 
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
+from types import CodeType
 from typing import Any
 
 from weldcal.tools.emulators.ur.script import arithmetic, syntax
@@ -41,17 +42,31 @@ class Hooks:
     alive: Callable[[Any], bool]
 
 
-def compile_program(
-    routine: Routine, builtins: Mapping[str, Callable[..., Any]], blocking: Iterable[str], hooks: Hooks
-) -> Compiled:
+@dataclass(frozen=True)
+class Translation:
+    """A program as Python code, before it is bound to one controller; `lines` as in `Compiled`."""
+
+    name: str
+    kind: str
+    code: CodeType
+    lines: tuple[int, ...]
+
+
+def translate(routine: Routine, builtins: frozenset[str], blocking: frozenset[str]) -> Translation:
     """Raises ScriptError where a name is called that neither the script nor the controller defines."""
-    emitter = _Emitter(routine, frozenset(builtins), frozenset(blocking))
+    emitter = _Emitter(routine, builtins, blocking)
     emitter.program()
+    code = compile("\n".join(emitter.text), SOURCE_NAME, "exec")
+    return Translation(routine.name, routine.kind, code, tuple(emitter.lines))
+
+
+def bind(translation: Translation, builtins: Mapping[str, Callable[..., Any]], hooks: Hooks) -> Compiled:
+    """The program with the controller's functions, with variables of its own."""
     namespace: dict[str, Any] = {f"b_{name}": function for name, function in builtins.items()}
     namespace |= {name: getattr(arithmetic, name) for name in (*_OPERATORS.values(), *_HELPERS)}
     namespace |= {"Halted": Halted, "loop": hooks.loop, "start": hooks.run, "kill": hooks.kill, "alive": hooks.alive}
-    exec(compile("\n".join(emitter.text), SOURCE_NAME, "exec"), namespace)
-    return Compiled(routine.name, routine.kind, namespace["main"], tuple(emitter.lines))
+    exec(translation.code, namespace)
+    return Compiled(translation.name, translation.kind, namespace["main"], translation.lines)
 
 
 class _Emitter:

@@ -119,7 +119,12 @@ class Motions(Sockets):
         yield from self._drive(Stop(positive(a, "The deceleration of stopl"), twist))
 
     def _goal_joints(self, goal: Any, what: str) -> Array:
-        return np.array(self.get_inverse_kin(goal)) if isinstance(goal, Pose) else six(goal, what)
+        joints = np.array(self.get_inverse_kin(goal)) if isinstance(goal, Pose) else six(goal, what)
+        model = self._controller.arm.model
+        outside = (joints < model.position_lower) | (joints > model.position_upper)
+        if outside.any():
+            raise ScriptError(f"{what}: joint {int(np.argmax(outside))} of the target is outside its limits.")
+        return joints
 
     def _goal_pose(self, goal: Any, what: str) -> Array:
         """The tool's pose (4, 4) of a goal given as a pose or as joint angles."""

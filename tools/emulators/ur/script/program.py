@@ -5,9 +5,10 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
-from weldcal.tools.emulators.ur.script.compiler import SOURCE_NAME, Halted, Hooks, Slices, compile_program
+from weldcal.tools.emulators.ur.script.compiler import SOURCE_NAME, Halted, Hooks, Slices, Translation, bind, translate
 from weldcal.tools.emulators.ur.script.parser import parse_program
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
 
@@ -46,7 +47,7 @@ class Program:
         functions, blocking = builtins(self)
         hooks = Hooks(self._loop, self._run, self._kill, self._alive)
         try:
-            self._compiled = compile_program(parse_program(source), functions, blocking, hooks)
+            self._compiled = bind(_translated(source, frozenset(functions), frozenset(blocking)), functions, hooks)
         except RecursionError:
             raise ScriptError("The script is nested too deeply.") from None
         self.name = self._compiled.name
@@ -153,6 +154,12 @@ class Program:
 
     def _alive(self, number: Any) -> bool:
         return number in self._threads
+
+
+# a client sends the same script again and again, and a frame has no time for 45 ms of translation
+@lru_cache(maxsize=8)
+def _translated(source: str, builtins: frozenset[str], blocking: frozenset[str]) -> Translation:
+    return translate(parse_program(source), builtins, blocking)
 
 
 def _plain(error: BaseException) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.checker import Checker
+from weldcal.tools.emulators.ur.controller.contact import ForceSensor, Surroundings
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import RobotMode, SafetyMode
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
@@ -107,6 +108,10 @@ class ControlServer(Server):
             "clear_links": self._clear_links,
             "recover": self._recover,
             "expect_silence": lambda r, now: lockstep.expect_silence(),
+            "contact_plane": lambda r, now: c.surroundings.place(
+                _several(r, "point", 3), _several(r, "normal", 3), _number(r, "stiffness")
+            ),
+            "push": lambda r, now: setattr(c.surroundings, "push", np.array(_several(r, "wrench", 6))),
             "reset_checker": lambda r, now: checker.reset(),
             "quit": lambda r, now: setattr(self._world, "quit", True),
         }
@@ -208,6 +213,7 @@ class ControlServer(Server):
         c.terminals.speed_slider, c.terminals.limiter, c.arm.lag_s = 1.0, 1.0, 0.0
         c.set_tcp([0.0] * 6)
         c.terminals.foreign.clear()
+        c.surroundings, c.sensor = Surroundings(), ForceSensor()
 
     def _close(self, request: Request, *, reset: bool) -> None:
         for connection in self._links(request):
@@ -265,9 +271,13 @@ def _number(request: Request, key: str, default: float | None = None) -> float:
 
 
 def _six(request: Request, key: str, default: list[float] | None = None) -> list[float]:
+    return _several(request, key, 6, default)
+
+
+def _several(request: Request, key: str, count: int, default: list[float] | None = None) -> list[float]:
     value = request.get(key, default)
-    if not isinstance(value, list) or len(value) != 6:
-        raise InputError(f"Give six numbers as {key!r}.")
+    if not isinstance(value, list) or len(value) != count:
+        raise InputError(f"Give {'six' if count == 6 else 'three'} numbers as {key!r}.")
     return [float(v) for v in value]
 
 
