@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, JobOf
+from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
 from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.systems.motion.spine import FIRST
@@ -43,7 +44,7 @@ class Run(Generic[JobOf]):
     """One run of a cell: its final root context, scans by label, and (simulated, wall) seconds at which each phase began.
 
     `interrupted`: the reason where a person ended the run before its job. `clock`: the clock of a paced run, else None.
-    `held_by_person`: how often a person held the run and let it go on.
+    `held_by_person`: how often a person held the run and let it go on. `host`: the computer's timing before the first motion.
     """
 
     cell: Cell[JobOf]
@@ -54,6 +55,7 @@ class Run(Generic[JobOf]):
     interrupted: str | None = None
     clock: WallClock | None = None
     held_by_person: int = 0
+    host: HostTiming | None = None
 
     @property
     def root(self) -> Context:
@@ -96,6 +98,8 @@ class Run(Generic[JobOf]):
         }
         if self.clock is not None:
             found |= self.clock.summary()
+        if self.host is not None:
+            found["host_timing"] = self.host.summary()
         if self.held_by_person:
             found["held_by_person"] = self.held_by_person
         return found
@@ -111,11 +115,14 @@ def run_cell(
     """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
     Records into `meshcat` where one is given. A station with a pace runs at that pace of the wall clock. The station is
-    always closed, also on Ctrl-C, which stops its arm.
+    always closed, also on Ctrl-C, which stops its arm. Before the first motion of a robot the computer's timing is measured.
 
     A `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so that the job goes on
     along the same path when the person says so. Under a burning process holding ends the run as Ctrl-C does: the process is
     turned off first, and a seam cannot be taken up again where it was left.
+
+    Raises:
+        HostTooLate: the computer cannot keep the robot's rate; nothing has moved.
     """
     simulator, station = Simulator(cell.diagram), cell.station
     run = Run(cell, simulator, clock=station.robot.clock)
@@ -171,6 +178,9 @@ def run_cell(
                 around.enter_context(no_long_garbage_collections())
                 _first_pictures(cell, run.root)
                 station.background.settle()
+                run.host = measure_host()
+                if not station.robot.waits:
+                    require_timely_host(run.host)
                 around.enter_context(short_turns())
                 around.enter_context(real_time_priority())
             simulator.Initialize()

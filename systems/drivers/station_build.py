@@ -26,13 +26,14 @@ class PreparedRobot:
     """The state of the robot before the station is built, as the driver's `PrepareRobot` returns it.
 
     `q_start` (6,) rad is the arm's present configuration. `clock` paces the Diagram by the wall clock; None: the Diagram may run
-    as fast as possible.
+    as fast as possible. `waits`: the robot is emulated, and its time waits for this computer.
     """
 
     arm: ArmModel
     q_start: np.ndarray
     handle: Closable | None = None
     clock: WallClock | None = None
+    waits: bool = False
 
     @property
     def pace(self) -> float | None:

@@ -512,7 +512,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(robot: Emulator, capsys
     assert finished.returncode == 0, finished.stderr
     lines = finished.stdout.splitlines()
     assert lines[0] == f"{robot.host}: ready"
-    assert [line.split()[0] for line in lines[1:]] == ["ok"] * len(CHECKS)
+    assert [line.split()[0] for line in lines[1:]] == ["ok"] * (len(CHECKS) + 1)
     assert finished.stderr == ""
     for fault, values in (
         ("local_mode", {}),
@@ -537,7 +537,7 @@ def test_the_command_ends_with_1_and_the_first_sentence(robot: Emulator) -> None
     result = json.loads(finished.stdout)
     assert result["state"] == "refused"
     assert result["reason"] == finished.stderr.removeprefix("weldcal: ").strip()
-    assert [check["name"] for check in result["checks"]] == list(CHECKS)
+    assert [check["name"] for check in result["checks"]] == [*CHECKS, "computer"]
     assert {check["state"] for check in result["checks"]} == {"ok", "to change"}
     assert result["version"] == "5.21.1.0"
     assert result["joints_deg"] == pytest.approx(np.rad2deg(HOME).tolist())

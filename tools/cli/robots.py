@@ -41,11 +41,11 @@ def check_robot(
         option("--scenario", "NAME", "Compare the payload with this scenario's; without it, the welding tool's."),
     ] = None,
 ) -> Outcome:
-    """Check whether a robot is ready: a table of what is right and what to change. Nothing moves or is written."""
+    """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
     from weldcal.systems.drivers.ur.readiness.preflight import preflight
-    from weldcal.tools.commands.check_robot import as_json, emit_table, expected_load
+    from weldcal.tools.commands.check_robot import as_json, emit_table, expected_load, with_host
 
-    report = preflight(host, load=expected_load(host, scenario))
+    report = with_host(preflight(host, load=expected_load(host, scenario)))
     problem = "" if report.first_problem is None else report.first_problem.operator_action
     return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
 

@@ -3,6 +3,7 @@
 import shutil
 import textwrap
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import typer
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import Check, Preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.host_timing import measure_host
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.commands.robots import robot_at
 
@@ -29,6 +31,15 @@ def expected_load(host: str, name: str | None) -> ExpectedLoad:
     scenario = load_scenario(name)
     config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
     return config.load(f"the scenario {Path(name).stem}")
+
+
+def with_host(report: Preflight) -> Preflight:
+    """The report of a controller that answered, with a further check: this computer's timing."""
+    if report.version is None:
+        return report
+    timing = measure_host()
+    check = Check("computer", timing.ok, timing.words, "" if timing.ok else timing.advice)
+    return replace(report, checks=(*report.checks, check))
 
 
 def state_of(check: Check) -> str:

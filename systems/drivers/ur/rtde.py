@@ -175,7 +175,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         payload_cog_m=(x, y, z),
         process_output=config.process_output,
     )
-    return PreparedRobot(arm, link.state().q, link, WallClock(config.pace))
+    return PreparedRobot(arm, link.state().q, link, WallClock(config.pace), config.lockstep)
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
