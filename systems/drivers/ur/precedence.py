@@ -30,6 +30,6 @@ def poll_beside_the_cell() -> None:
     if len(os.sched_getaffinity(0)) < 2:
         return
     for thread in map(int, os.listdir("/proc/self/task")):
-        if thread != threading.get_native_id() and os.sched_getscheduler(thread) == os.SCHED_RR:
-            with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a thread may end meanwhile
+            if thread != threading.get_native_id() and os.sched_getscheduler(thread) == os.SCHED_RR:
                 os.sched_setscheduler(thread, os.SCHED_RR, os.sched_param(CELL_PRIORITY))

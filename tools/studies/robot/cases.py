@@ -285,9 +285,12 @@ AT_START: tuple[Case, ...] = (
     _refused("in local mode", _fault("local_mode"), "Remote Control"),
     _refused("beside a foreign program", _fault("foreign_program"), "busy"),
     _refused("with registers in use", _fault("registers_in_use", names=["input_int_register_24"]), "in use"),
-    _refused("where uploads are refused", _fault("refuse_upload"), "did not start our program", short=False),
+    _refused("where uploads are refused", _fault("refuse_upload"), "did not start the guard script", short=False),
     _refused(
-        "where scripts begin 10 s late", _fault("slow_start", seconds=10.0), "did not start our program", short=False
+        "where scripts begin 10 s late",
+        _fault("slow_start", seconds=10.0),
+        "did not start the guard script",
+        short=False,
     ),
     _refused("in a protective stop", _fault("protective_stop"), "protective stop"),
     _refused("in an emergency stop", _fault("estop"), "emergency stop"),
