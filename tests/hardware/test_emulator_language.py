@@ -148,6 +148,27 @@ def test_a_joint_target_outside_its_limits_ends_the_program_without_a_stop() -> 
     assert (made.program, made.safety_mode) == (None, SafetyMode.NORMAL)
 
 
+def test_the_slider_stretches_the_time_of_a_streamed_step() -> None:
+    # UR's own test follows a spline that is sent as steps of speedj while the slider is down
+    made = controller()
+    made.terminals.speed_slider = 0.25
+    body = """step = 0
+    while step < 50:
+      speedj([0.1, 0, 0, 0, 0, 0], a=40, t=0.002)
+      step = step + 1
+    end
+    write_output_integer_register(0, step)
+    stopj(40)"""
+    made.start(f"def slow():\n{body}\nend\n")
+    for _ in range(198):
+        made.step()
+    assert made.outputs.integers[0] == 0
+    for _ in range(5):
+        made.step()
+    assert made.outputs.integers[0] == 50
+    assert made.arm.q[0] == pytest.approx(HOME[0] + 0.1 * 50 * 0.002, abs=3e-4)
+
+
 def test_a_popup_that_blocks_waits_until_it_is_closed() -> None:
     made = controller()
     waiting = 'popup("look", title="Seen", blocking=True)\ntextmsg("closed")'

@@ -136,18 +136,21 @@ class Motions(Sockets):
         return np.asarray(arm.flange(arm.commanded.q_target) @ arm.X_FT, dtype=np.float64)
 
     def _drive(self, motion: Motion | None, t: float = 0.0) -> Slices:
-        """Holds the arm until the motion is done, or for t seconds where that is given."""
+        """Holds the arm until the motion is done, or for t seconds of the program where that is given.
+
+        The speed slider stretches these seconds: with it UR's own test follows a spline sent as steps of speedj.
+        """
         if motion is None:
             yield
             return
         thread = self._program.claim()
         try:
             self._controller.arm.motion = motion
-            frames = 0
+            elapsed = 0.0
             while True:
                 yield
-                frames += 1
-                if (frames * STEP_S >= t - 1e-9) if t > 0.0 else motion.done:
+                elapsed += STEP_S * self._controller.speed_scaling
+                if (elapsed >= t - 1e-9) if t > 0.0 else motion.done:
                     return
         finally:
             self._program.release(thread)
