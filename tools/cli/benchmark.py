@@ -143,6 +143,24 @@ def robot(
     ).summary()
 
 
+@command("benchmark robot-jobs")
+def robot_jobs(
+    call: Call,
+    scenario: ScenarioOption = "s_groove",
+    runs: Annotated[int, option("--runs", "N", "Number of jobs.", min=1)] = 10,
+    load: Annotated[int, option("--load", "N", "Busy programs beside the jobs.", min=0)] = 0,
+    seam_mm: Annotated[
+        float | None, option("--seam-mm", "MM", "Length of the seam.", min=10.0, show_default="the scenario's")
+    ] = None,
+) -> Outcome:
+    """Run whole jobs on an emulated controller in real time: how late the velocities are, alone or beside busy programs."""
+    from weldcal.tools.studies.robot.jobs import run_jobs
+
+    folder = call.folder("benchmark", f"robot-jobs-{scenario}")
+    result = run_jobs(scenario, folder, runs, seed=call.seed, load=load, seam_mm=seam_mm, progress=call.progress)
+    return Outcome(result.summary(), rows={f"seed {job.seed}": job.line for job in result.jobs})
+
+
 @command("benchmark fuzz-files")
 def fuzz_files(
     call: Call,
@@ -160,4 +178,16 @@ def fuzz_files(
     return Outcome(result.summary(), values={}, rows=rows)
 
 
-COMMANDS = (tablet, seam_planning, hand_eye, mountings, profiler, cell, seeds, fuzz_files, robot_faults, robot)
+COMMANDS = (
+    tablet,
+    seam_planning,
+    hand_eye,
+    mountings,
+    profiler,
+    cell,
+    seeds,
+    fuzz_files,
+    robot_faults,
+    robot,
+    robot_jobs,
+)

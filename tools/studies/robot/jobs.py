@@ -1,0 +1,144 @@
+"""Whole jobs on an emulated controller in real time: how late their velocities are, alone and beside other programs."""
+
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.wall_clock import LIMITS_MS, ON_TIME_MS, Lateness
+from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.emulators.ur.process import emulator_process
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.files import write_json
+
+BUSY = "while True: pass"
+UNDER_8_MS = 8.0
+
+
+@contextmanager
+def busy_programs(count: int) -> Iterator[None]:
+    """Programs of ordinary priority that each want a whole core, for the duration of the block."""
+    programs = [subprocess.Popen([sys.executable, "-I", "-S", "-c", BUSY]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for program in programs:
+            program.kill()
+            program.wait()
+
+
+@dataclass(frozen=True)
+class JobTiming:
+    """One job: its seed, state and reason, the lateness of its velocities, the slowest rate, and its figures (mm)."""
+
+    seed: int
+    state: str
+    reason: str
+    lateness: Lateness
+    slowest_percent: float
+    slowed_s: float
+    figures: Mapping[str, Any]
+
+    @property
+    def line(self) -> str:
+        """One row of the table."""
+        late = self.lateness
+        torch = self.figures.get("torch_mean_mm")
+        return (
+            f"{self.state}{': ' + self.reason if self.reason else ''}; {late.on_time_percent:.2f} % of {sum(late.counts)} under "
+            f"{ON_TIME_MS:.0f} ms, latest {late.worst_ms:.1f} ms; slowest {self.slowest_percent:.0f} %, {self.slowed_s:.2f} s longer"
+            + ("" if torch is None else f"; torch {torch:.3f} mm mean")
+        )
+
+
+@dataclass(frozen=True)
+class JobsReport:
+    """All jobs of a study."""
+
+    jobs: list[JobTiming]
+    load: int
+
+    @property
+    def lateness(self) -> Lateness:
+        """That of all jobs together."""
+        counts = np.sum([job.lateness.counts for job in self.jobs], axis=0)
+        return Lateness([int(count) for count in counts], max(job.lateness.worst_ms for job in self.jobs))
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object; `over_8_ms` counts velocities, `limits_ms` are those of the bins of `velocities`."""
+        late = self.lateness
+        return {
+            "state": "done",
+            "jobs": len(self.jobs),
+            "jobs_done": sum(job.state == "done" for job in self.jobs),
+            "busy_programs": self.load,
+            "under_4_ms_percent": late.on_time_percent,
+            "over_8_ms": sum(late.counts[LIMITS_MS.index(UNDER_8_MS) + 1 :]),
+            "worst_ms": late.worst_ms,
+            "limits_ms": list(LIMITS_MS),
+            "velocities": late.counts,
+            "slowest_percent": min(job.slowest_percent for job in self.jobs),
+            "held": [{"id": f"seed {job.seed}", "reason": job.reason} for job in self.jobs if job.state != "done"],
+        }
+
+
+def run_jobs(
+    scenario: str,
+    out: Path,
+    runs: int,
+    *,
+    seed: int = 0,
+    load: int = 0,
+    seam_mm: float | None = None,
+    progress: Progress = no_progress,
+) -> JobsReport:
+    """Run the scenario's job with consecutive seeds, each on a controller of its own at its own pace, without lockstep.
+
+    Args:
+        scenario: name or path.
+        out: gets jobs.json, and a folder with the report of each job.
+        runs: how many jobs.
+        seed: of the first.
+        load: busy programs beside.
+        seam_mm: length of the seam to weld; the scenario's where None.
+        progress: told which job runs.
+    """
+    found = []
+    overrides = "" if seam_mm is None else f"welding: {{seam_length_mm: {seam_mm}}}"
+    with busy_programs(load):
+        for k in range(runs):
+            progress(f"job {k + 1} of {runs}", k / runs)
+            found.append(_job(load_scenario(scenario, overrides), out / f"seed{seed + k}", scenario, seed + k))
+    report = JobsReport(found, load)
+    write_json(out / "jobs.json", report.summary() | {"rows": {f"seed {job.seed}": job.line for job in found}})
+    return report
+
+
+def _job(described: Any, out: Path, name: str, seed: int) -> JobTiming:
+    q_home = np.deg2rad(described.home_deg)
+    kinematics = None if described.kinematics is None else Path(described.kinematics)
+    with emulator_process(q=q_home.tolist(), kinematics=kinematics) as controller:
+        options = RunOptions(name, out, seed, robot=controller.host, pace=1.0, recording=False)
+        try:
+            result = run_scenario(described, options)
+        except WeldcalError as error:  # the start was refused
+            return JobTiming(seed, "refused", str(error), Lateness(), 0.0, 0.0, {})
+    summary, clock = result.summary(), result.run.clock
+    assert clock is not None
+    return JobTiming(
+        seed,
+        str(summary["state"]),
+        str(summary.get("reason") or ""),
+        clock.lateness,
+        100.0 * clock.slowest_rate,
+        clock.slowed_s,
+        summary,
+    )
