@@ -52,7 +52,8 @@ class Limits:
     position_upper: Array
     speed: Array
     acceleration: Array
-    stale_s: float = 0.040
+    stale_s: float = 0.080  # the arm has been slowed to rest since 0.05 s
+    stale_process_s: float = 0.040
     late_s: float = 0.050
     lost_s: float = 0.5  # the arm is at rest since late_s
     deaf_s: float = 0.200  # later than the guard, which latches after 150 ms without a number
@@ -74,6 +75,7 @@ class Limits:
         return replace(
             self,
             stale_s=self.stale_s / pace,
+            stale_process_s=self.stale_process_s / pace,
             late_s=self.late_s / pace,
             lost_s=self.lost_s / pace,
             deaf_s=self.deaf_s / pace,
@@ -85,6 +87,7 @@ class Limits:
         return replace(
             self,
             stale_s=max(self.stale_s, PATIENCE_S),
+            stale_process_s=max(self.stale_process_s, PATIENCE_S),
             late_s=max(self.late_s, PATIENCE_S),
             lost_s=max(self.lost_s, PATIENCE_S),
             deaf_s=max(self.deaf_s, PATIENCE_S),
@@ -187,7 +190,7 @@ class Supervisor:
         limits, last = self._limits, self._last
         if not robot.connected:
             return Fault.LINK_CLOSED, 0.0
-        if now - robot.fresh_at > limits.stale_s:
+        if now - robot.fresh_at > (limits.stale_process_s if self._command.process else limits.stale_s):
             return Fault.LINK_STALE, 1e3 * (now - robot.fresh_at)
         if last is not None and robot.robot_time != last.robot_time:
             passed = robot.robot_time - last.robot_time

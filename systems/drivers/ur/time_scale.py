@@ -1,4 +1,4 @@
-"""Slows the arm while the cell gives no new velocity, before the delay is a fault."""
+"""Slows the arm while the cell gives no new velocity, or the robot no new state, before the delay is a fault."""
 
 FRESH_S = 0.012  # of robot time; three periods of the commands
 ZERO_S = 0.050

@@ -96,7 +96,8 @@ class Worker:
                 self._supervisor.excuse()
                 now = time.monotonic()
             last, deadline = now, max(deadline + period, now)
-            sample, command = robot.sample(now), self._scaled(self._command(), now)
+            sample = robot.sample(now)
+            command = self._scaled(self._command(), now, sample)
             decision = self._supervisor.step(now, sample, command)
             if decision.fault is not Fault.NONE and self._fault_time == 0.0:
                 self._fault_time = now
@@ -125,9 +126,9 @@ class Worker:
         number, given_at, stop, process, *qd = found
         return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
 
-    def _scaled(self, command: Command, now: float) -> Command:
-        """The command with the factor that slows the arm while it is late, but not under a burning torch, which goes out first."""
-        factor = self._scale.step(now, now - command.given_at)
+    def _scaled(self, command: Command, now: float, sample: RobotSample) -> Command:
+        """The command with the factor that slows the arm while command or state is late, but not under a burning torch, which goes out first."""
+        factor = self._scale.step(now, now - min(command.given_at, sample.fresh_at))
         kept = command.process or self._config.limits.waits
         return command if kept else replace(command, scale=factor)
 

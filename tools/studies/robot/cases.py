@@ -163,8 +163,8 @@ RUNNING: tuple[Case, ...] = (
     _stops("controller stands still for 200 ms", _fault("freeze", seconds=0.2), LINK),
     # chance decides when a frame is 40 ms late, and a controller that lives so slowly hears a stop late too
     _stops(
-        "controller's frames jitter by 60 ms",
-        _fault("jitter", seconds=0.06),
+        "controller's frames jitter by 120 ms",
+        _fault("jitter", seconds=0.12),
         LINK,
         CLEAR,
         watch_s=1.5,
