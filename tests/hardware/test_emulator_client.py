@@ -223,6 +223,11 @@ if {newer}:
         get()
         time.sleep(0.03)  # the client waits for one package only, which may still hold the answer to another question
         out[name] = get()
+else:
+    for _ in range(100):
+        out["pressed"] = control.forceMode([0.0] * 6, [0, 0, 1, 0, 0, 0], [0, 0, -20.0, 0, 0, 0], 2, [0.1] * 6)
+        time.sleep(0.005)
+    out["ended"] = control.forceModeStop()
 out["forward"] = control.getForwardKinematics({goal}, tcp)
 control.stopScript()
 print(json.dumps(out), flush=True)
@@ -234,14 +239,24 @@ print(json.dumps(out), flush=True)
 def test_older_and_newer_controllers_take_the_stock_client(version: str) -> None:
     goal = [0.1, -1.5, 1.5, -1.5, -1.5, 0.1]
     newer = version != "5.12"
+    arm = load_arm()
+    X_BF = forward_kinematics(arm, goal)
     with emulator_process(polyscope=version) as other:
+        plane = X_BF.translation() - [0.0, 0.0, 0.002]
+        other.do("contact_plane", point=plane.tolist(), normal=[0.0, 0.0, 1.0], stiffness=4e4)
         done = run_client(other.host, MECHANICS.format(goal=goal, newer=newer))
         assert done.returncode == 0, done.stderr + other.log()
-        assert other.state()["q"] == pytest.approx(goal, abs=1e-12)
+        state = other.state()
     out = json.loads(done.stdout.splitlines()[-1])
     assert out["moved"] is True
-    arm = load_arm()
-    tool = forward_kinematics(arm, goal) @ RigidTransform([0.0, 0.0, 0.1])
+    if newer:
+        assert state["q"] == pytest.approx(goal, abs=1e-12)
+    else:
+        # 20 N on 40 N/mm
+        assert (out["pressed"], out["ended"]) == (True, True)
+        assert state["tcp_pose"][:2] == pytest.approx(plane[:2].tolist(), abs=1e-6)
+        assert plane[2] - state["tcp_pose"][2] == pytest.approx(0.0005, abs=1e-5)
+    tool = X_BF @ RigidTransform([0.0, 0.0, 0.1])
     assert out["forward"][:3] == pytest.approx(tool.translation(), abs=1e-12)
     if newer:
         J = jacobian(arm, goal)

@@ -131,7 +131,7 @@ def test_the_word_on_the_primary_port_unlocks_a_stop_that_is_young() -> None:
         ("generate flight report system", "Flight Report generated with id: 1"),
         ("generate support file .", "Completed successfully: ursupport_20235500001_1.zip"),
         ("generate anything", "could not understand: 'generate anything'"),
-        ("set operational mode automatic", "Setting operational mode: AUTOMATIC"),
+        ("set operational mode automatic", "Operational mode AUTOMATIC is set"),
         ("set operational mode sideways", "Failed setting operational mode: sideways"),
         ("set anything", "could not understand: 'set anything'"),
         ("load /other/a.urp", "Loading program: /other/a.urp, default.installation"),

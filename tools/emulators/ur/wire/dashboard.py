@@ -167,11 +167,11 @@ class DashboardServer(Server):
         if mode.upper() not in OPERATIONAL_MODES[1:]:
             return f"Failed setting operational mode: {mode}"
         self._controller.operational_mode = mode.upper()
-        return f"Setting operational mode: {mode.upper()}"
+        return f"Operational mode {mode.upper()} is set"
 
     def _clear_operational_mode(self) -> str:
         self._controller.operational_mode = "NONE"
-        return "operational mode is no longer controlled by Dashboard Server"
+        return "No longer controlling the operational mode."
 
     def _generate(self, what: str) -> str:
         """A report or a support file: the answers of a controller, without a file."""
