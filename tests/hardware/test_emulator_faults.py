@@ -326,7 +326,7 @@ def test_the_trajectory_limiter_scales_the_motion_too(robot: Emulator) -> None:
     move(robot)
     robot.fault("speed_scaling", value=0.5, latch=False)
     robot.fault("limiter", value=0.5, latch=False)
-    with Rtde().watch("speed_scaling", "target_speed_fraction", "actual_qd") as client:
+    with Rtde(robot.host).watch("speed_scaling", "target_speed_fraction", "actual_qd") as client:
         row = client.during(0.2)[-1]
     assert (row["speed_scaling"], row["target_speed_fraction"]) == (0.5, 0.5)
     assert row["actual_qd"][0] == pytest.approx(0.25 * SPEED_RAD_S, rel=1e-3)

@@ -312,7 +312,7 @@ def test_a_plane_and_a_hand_are_put_on_the_control_channel(shared: Emulator) -> 
     height = shared.state()["tcp_pose"][2]
     shared.do("contact_plane", point=[0.0, 0.0, height + 0.001], normal=[0.0, 0.0, 2.0], stiffness=1000.0)
     shared.do("push", wrench=[2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    felt = Rtde().watch("actual_TCP_force").next()["actual_TCP_force"]
+    felt = Rtde(shared.host).watch("actual_TCP_force").next()["actual_TCP_force"]
     assert felt == pytest.approx([2.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     with pytest.raises(InputError, match="stiffness from 0 to"):
         shared.do("contact_plane", point=[0.0] * 3, normal=[0.0, 0.0, 1.0], stiffness=1e9)

@@ -149,7 +149,7 @@ class Motions(Sockets):
             elapsed = 0.0
             while True:
                 yield
-                elapsed += STEP_S * self._controller.speed_scaling
+                elapsed += STEP_S * self._controller.motion_scaling
                 if (elapsed >= t - 1e-9) if t > 0.0 else motion.done:
                     return
         finally:
