@@ -10,7 +10,7 @@ from xdist.scheduler.loadfile import LoadFileScheduling
 # They stream in time with a clock, and a Diagram that does takes a core: two at once would only slow each other down.
 STREAMING = (
     *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
-    *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py"),
+    *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
 )
 # A core that is left with one of these at the end keeps the other waiting.
 SLOWEST = ("test_readme.py", "test_cell.py")

@@ -48,7 +48,8 @@ SENTENCES = {
     "check the cable, and that no other program runs or writes its registers; start again.",
     Fault.CLOCK_JUMPED: "LINK: the controller's clock jumped by {detail:.3f} s; if it was restarted, start again when it is ready.",
     Fault.STATE_IMPLAUSIBLE: "LINK: a joint was reported {detail:.3f} rad from where it was 4 ms before; check the network and start again.",
-    Fault.COMMAND_LATE: "COMMAND LATE: the cell gave no new velocity for {detail:.0f} ms while the arm moved; close other programs here and start again.",
+    Fault.COMMAND_LATE: "COMMAND LATE: the cell gave no new velocity for {detail:.0f} ms while the arm moved or the process was on; "
+    "close other programs here and start again.",
     Fault.COMMAND_NOT_FINITE: "COMMAND: a velocity that is not a number was refused; this is a mistake of the program, report it.",
     Fault.COMMAND_TOO_FAST: "COMMAND: a joint velocity of {detail:.2f} rad/s was refused; this is a mistake of the program, report it.",
     Fault.COMMAND_JUMPED: "COMMAND: a jump of {detail:.2f} rad/s in joint velocity was refused; this is a mistake of the program, report it.",

@@ -263,9 +263,9 @@ class Supervisor:
         if share.max() > 1.0 + 1e-9:
             return Fault.COMMAND_TOO_FAST, float(np.abs(command.qd)[int(np.argmax(share))])
         late = now - command.given_at
-        # a late command slows the arm to rest within late_s; a torch may not burn there
+        # a late command slows the arm to rest within late_s; a torch may not burn there, and may not come on again by itself
         longest = limits.late_s if command.process else limits.lost_s
-        if command.qd.any() and late > longest and not (command.stop or command.orphaned):
+        if (command.process or command.qd.any()) and late > longest and not (command.stop or command.orphaned):
             return Fault.COMMAND_LATE, 1e3 * late
         if command.number != self._command.number:
             # a cell catches up after a delay of up to 20 ms and restarts its clock after a longer one; passes may skip commands

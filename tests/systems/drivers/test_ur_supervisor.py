@@ -173,6 +173,13 @@ def test_a_cell_that_commands_rest_may_think_as_long_as_it_likes() -> None:
     assert rig.passes(30.0, commands=False) == Decision(Action.SEND)
 
 
+def test_a_torch_that_went_off_because_the_cell_was_silent_at_rest_stays_off() -> None:
+    rig = Rig(velocity=np.zeros(6), process=True)
+    assert rig.passes(0.04, commands=False) == Decision(Action.SEND)
+    assert rig.passes(0.02, commands=False).fault is Fault.COMMAND_LATE
+    assert rig.passes(1.0).action is Action.BRAKE
+
+
 def test_after_a_long_thought_the_arm_may_be_ramped_up_and_not_jerked() -> None:
     # 15 rad/s^2 for one pass and 20 ms on top
     for first, fault in ((0.3, Fault.NONE), (0.4, Fault.COMMAND_JUMPED)):

@@ -1,0 +1,76 @@
+"""A person holds a move of the emulated arm: it comes to rest on its path, stays, and goes on along it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from weldcal.systems.cell import build_cell
+from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.person import Person
+from weldcal.systems.runner import run_cell
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
+
+AWAY_RAD = 0.4
+MOVING_S, HELD_S = 0.8, 0.6
+AT_REST_RAD_S = 1e-3
+
+
+def scenario() -> Scenario:
+    found = load_scenario(
+        "straight_groove",
+        "scanner: !RenderedScanner {mounting_translation_mm: 0.0, mounting_rotation_deg: 0.0}\n"
+        "job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}}",
+    )
+    found.job.weld = False
+    return found
+
+
+Q_HOME = np.deg2rad(scenario().home_deg)
+TURN = np.array([1.0, 0.0, 0.0, 0.0, 0.0, -0.5])  # of base and last wrist only: the way home is free
+
+
+@pytest.fixture
+def controller() -> Iterator[Emulator]:
+    with emulator_process(q=(Q_HOME + AWAY_RAD * TURN).tolist(), lockstep=LOCKSTEP_S) as made:
+        yield made
+
+
+def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(controller: Emulator) -> None:
+    described, person, seen = scenario(), Person(), {}
+    described.robot = UrRtde(host=controller.host, lockstep=True)
+
+    def hold_for_a_while() -> None:
+        time.sleep(MOVING_S)
+        person.hold()
+        time.sleep(0.5 * HELD_S)
+        seen["first"] = controller.state()
+        time.sleep(0.5 * HELD_S)
+        seen["last"] = controller.state()
+        person.go_on()
+
+    def watch(stage: str, _: float) -> None:
+        if stage == "move home" and not seen:
+            seen["begun"] = {}
+            threading.Thread(target=hold_for_a_while, daemon=True).start()
+
+    run = run_cell(build_cell(described), watch, person=person)
+    assert run.reason is None
+    assert run.held_by_person == 1
+    assert [name for name, _, _ in run.phases] == ["start", "move_home", "park", "done"]
+    q_first, q_last = (np.array(seen[name]["q"]) for name in ("first", "last"))
+    assert np.abs(seen["first"]["qd"]).max() < AT_REST_RAD_S
+    assert np.abs(q_last - q_first).max() < 1e-4
+    # on the straight line in joint space, neither at its begin nor at its end
+    way = (q_last - Q_HOME) / (AWAY_RAD * TURN + (TURN == 0.0))
+    assert way[0] == pytest.approx(way[5], abs=0.01)
+    assert 0.02 < way[0] < 0.98
+    assert np.abs(np.array(controller.state()["q"]) - Q_HOME).max() < 1e-3
+    assert run.clock is not None
+    assert run.clock.reanchored == 0
