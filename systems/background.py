@@ -4,7 +4,7 @@ import importlib
 import multiprocessing
 import os
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -101,6 +101,7 @@ class OwnProcess:
             1, mp_context=multiprocessing.get_context("spawn"), initializer=before_other_programs
         )
     )
+    waits: bool = False  # whether the caller may wait for its answers, because its robot waits for it
     _preparing: "list[Future[Any]]" = field(default_factory=list)
 
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
@@ -109,7 +110,10 @@ class OwnProcess:
 
     def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
         """See Background."""
-        return Answer(self._pool.submit(function, *arguments))
+        answer = Answer(self._pool.submit(function, *arguments))
+        if self.waits:
+            wait([answer.future])
+        return answer
 
     def settle(self) -> None:
         """See Background."""

@@ -227,7 +227,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
     diagram.set_name("station")
     second = None if furnishing.second is None else furnishing.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
-    background = Inline() if robot.pace is None else OwnProcess()
+    background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
     return Station(diagram, robot, tool, cad, truth, world, second, background)
 
 

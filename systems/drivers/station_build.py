@@ -71,8 +71,8 @@ class StationBuild:
 
     @property
     def may_wait(self) -> bool:
-        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot."""
-        return self.robot is None or self.robot.clock is None
+        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait for it."""
+        return self.robot is None or self.robot.clock is None or self.robot.waits
 
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""

@@ -221,7 +221,7 @@ def test_a_controller_without_its_payload_is_told_in_a_sentence(
 @pytest.mark.parametrize(("mode", "ok", "found"), [("manual", False, "Manual"), ("automatic", True, "Automatic")])
 def test_a_robot_in_manual_mode_is_refused(robot: Emulator, mode: str, ok: bool, found: str) -> None:
     assert preflight(robot.host).checks[CHECKS.index("operational mode")].found == "no operational mode is set up"
-    assert ask(robot.host, f"set operational mode {mode}") == f"Setting operational mode: {mode.upper()}"
+    assert ask(robot.host, f"set operational mode {mode}") == f"Operational mode {mode.upper()} is set"
     try:
         report = preflight(robot.host)
     finally:

@@ -17,8 +17,8 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 
-AWAY_RAD = 0.4
-MOVING_S, HELD_S = 0.8, 0.6
+AWAY_RAD = 0.8
+MOVING_S, HELD_S = 0.6, 0.6
 AT_REST_RAD_S = 1e-3
 
 

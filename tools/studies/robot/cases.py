@@ -44,6 +44,7 @@ class Case:
     rest_s: float = REST_S
     wrist_3: float = 0.0
     may_rest: bool = False  # GO, and the arm may rest for a moment
+    slow_s: float = 0.0  # STOP, and how long the arm may rest for a moment and go on before the fault is latched
     wired: bool = False  # with a process output
     process: bool = False  # with a process output that is on
     burns_s: float = 0.0  # how long after the fault the process output may be on
@@ -212,7 +213,10 @@ RUNNING: tuple[Case, ...] = (
     _stops("program replaced", _fault("replace_program"), ALL),
     _stops("speed slider to 50 % in 0.2 s", _fault("speed_scaling", value=0.5, ramp=0.2), Fault.SPEED_SLIDER),
     *(
-        _stops(f"speed slider to {percent} %", _slider(percent), Fault.SPEED_SLIDER, short=percent in (10, 90))
+        # the guard holds an arm that suddenly has less than half of its speed until the next number
+        _stops(
+            f"speed slider to {percent} %", _slider(percent), Fault.SPEED_SLIDER, short=percent in (10, 90), slow_s=0.06
+        )
         for percent in (10, 30, 50, 70, 90)
     ),
     _stops("trajectory limiter at 60 %", _fault("limiter", value=0.6), Fault.SPEED_SLIDER, short=False),

@@ -128,7 +128,7 @@ def _running(bench: Bench, case: Case, hasty: bool) -> Outcome:
 
 
 def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played_s: float) -> Outcome:
-    found = bench.at_rest_after(at, case.rest_s)
+    found = bench.at_rest_after(at + case.slow_s, case.rest_s - case.slow_s)
     problems: list[str] = []
     rest, travel = found["rest_after_s"], found["travel_m"]
     if not found["ok"]:
@@ -153,7 +153,7 @@ def _stopped(bench: Bench, case: Case, at: float, children: Several[int], played
         problems.append(f"a joint turned by {turned:.4f} rad when Play was pressed")
     if case.resumes and not played.startswith("Starting"):
         problems.append(f"the controller answered Play with {played!r}")
-    again = bench.at_rest_after(at, case.rest_s)
+    again = bench.at_rest_after(at + case.slow_s, case.rest_s - case.slow_s)
     if again["moved_again_s"] is not None and found["moved_again_s"] is None:
         problems.append(f"it moved {again['moved_again_s']:.3f} s after the fault, when Play was pressed: {played}")
     summary = bench.emulator.ask(check="summary")
