@@ -3,6 +3,7 @@
 import importlib
 import multiprocessing
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -51,6 +52,9 @@ class Answer(Message, Generic[Found]):
 class Background(Protocol):
     """Computes functions of immutable, picklable arguments for the systems of a cell."""
 
+    waiting_since: float | None
+    """Wall clock (s, monotonic) of the newest question while it has no answer, else None."""
+
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
         """Run a function once before the arm moves, for what its first call costs: imports and compiled loops."""
 
@@ -67,6 +71,8 @@ class Background(Protocol):
 class Inline:
     """Computes at once, in the caller's thread. The Diagram's time does not pass meanwhile, so the same seed gives the same run
     on any computer."""
+
+    waiting_since: float | None = None
 
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
         """See Background."""
@@ -101,6 +107,7 @@ class OwnProcess:
             1, mp_context=multiprocessing.get_context("spawn"), initializer=before_other_programs
         )
     )
+    waiting_since: float | None = None  # wall clock (monotonic) of the newest question, while it has no answer
     waits: bool = False  # whether the caller may wait for its answers, because its robot waits for it
     _preparing: "list[Future[Any]]" = field(default_factory=list)
 
@@ -111,9 +118,14 @@ class OwnProcess:
     def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
         """See Background."""
         answer = Answer(self._pool.submit(function, *arguments))
+        self.waiting_since = time.monotonic()
+        answer.future.add_done_callback(self._answered)
         if self.waits:
             wait([answer.future])
         return answer
+
+    def _answered(self, _: "Future[Any]") -> None:
+        self.waiting_since = None
 
     def settle(self) -> None:
         """See Background."""

@@ -153,6 +153,7 @@ def run_cell(
             else:
                 run.clock.held = True
         if run.clock is not None:
+            run.clock.waiting_s = 0.0 if station.robot.waits else station.waiting_s(time.monotonic())
             run.clock.wait_for(root.get_time(), _commanded(cell, root))
         if not due("job", root.get_time()):
             return EventStatus.DidNothing()

@@ -12,6 +12,8 @@ ON_TIME_MS = 4.0
 SLOW_FROM_S, SLOW_SPAN_S = 0.0015, 0.005
 FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 rad/s^2 to them, and the link allows 40
 SLOWEST = 0.1
+# The servo needs pictures and detections: where this computer makes them late the path is slowed too.
+PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
 STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops within a step of the slew limit
 
 
@@ -68,6 +70,7 @@ class WallClock:
         self.lost_s = 0.0
         self.lateness = Lateness()
         self.held = False
+        self.waiting_s = 0.0  # wall seconds for which the oldest picture or detection has been waited for
 
     @property
     def stands(self) -> bool:
@@ -111,6 +114,7 @@ class WallClock:
         # a single long delay says nothing about the rate that the computer can keep
         if not moving or late > LATE_S:
             wanted = 1.0
+        wanted = min(wanted, max(1.0 - (self.waiting_s - PICTURE_LATE_S) / PICTURE_SPAN_S, SLOWEST))
         if self.held:
             wanted = STOPPED
         robot_step = step / self.rate

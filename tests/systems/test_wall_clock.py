@@ -130,6 +130,16 @@ def test_a_held_path_slows_to_rest_and_goes_on_without_a_jerk_and_without_being_
     assert clock.slowest_rate > 0.0
 
 
+@pytest.mark.parametrize(("waiting_s", "rate"), [(0.02, 1.0), (0.075, 0.5), (1.0, SLOWEST)])
+def test_late_pictures_slow_the_path_before_the_servo_misses_them(waiting_s: float, rate: float) -> None:
+    wall, clock = clock_at(1.0)
+    clock.waiting_s = waiting_s
+    for k in range(1, 201):
+        wall.now += 1e-4
+        clock.wait_for(TICK_S * k, moving=True)
+    assert clock.rate == pytest.approx(rate, abs=0.01)
+
+
 def test_without_a_velocity_nothing_was_late() -> None:
     assert Lateness().on_time_percent == 100.0
     assert math.isfinite(Lateness().worst_ms)

@@ -1,5 +1,6 @@
 """Renders pictures in a separate thread while the Diagram advances to their arrival time."""
 
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 
@@ -34,10 +35,12 @@ class PictureWorker:
         scene.ExportOutput(hold.get_output_port(), "picture")
         self._diagram: Diagram = scene.Build()
         self._simulator: Simulator | None = None
+        self.waiting_since: float | None = None  # wall clock (s, monotonic) of the newest picture while it is not ready
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=PICTURE_THREAD)
 
     def draw(self, poses: FramePoseVector, finish: Finish) -> Future[Pixels]:
         """Start a picture; the future holds `finish` of its colours (H, W, 4). Pictures are rendered in the order of the calls."""
+        self.waiting_since = time.monotonic()
         return self._thread.submit(self._draw, AbstractValue.Make(poses), finish)
 
     def _draw(self, poses: AbstractValue, finish: Finish) -> Pixels:
@@ -46,4 +49,6 @@ class PictureWorker:
         context = self._simulator.get_mutable_context()
         self._diagram.GetInputPort("frame_poses").FixValue(context, poses)
         self._simulator.AdvanceTo(context.get_time() + 1.0)  # the hold samples the picture at the start of this second
-        return finish(self._diagram.GetOutputPort("picture").Eval(context).data)
+        pixels = finish(self._diagram.GetOutputPort("picture").Eval(context).data)
+        self.waiting_since = None
+        return pixels

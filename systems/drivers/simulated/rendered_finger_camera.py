@@ -175,6 +175,7 @@ def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None
     sensor = view.apart.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
     view.apart.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
     worker = PictureWorker(view.apart, sensor)
+    build.parts = (*build.parts, worker)
     stream = build.builder.AddSystem(
         StreamingColourCamera(
             config, int(build.rng.integers(2**31)), world.plant.time_step(), worker.draw, build.may_wait
