@@ -11,6 +11,7 @@ import pytest
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.demo import run_scenario
@@ -126,9 +127,11 @@ def run_until(controller: Emulator, folder: Path, stage: str, happens: Callable[
         if phase == stage:
             happens()
 
-    options = RunOptions("a test's own", folder, robot=controller.host, pace=PACE, recording=False)
+    options = RunOptions("a test's own", folder, pace=PACE, recording=False)
+    scenario = weld_only()
+    scenario.robot = UrRtde(host=controller.host, lockstep=True)
     controller.do("reset_checker")
-    result = run_scenario(weld_only(), options, watch)
+    result = run_scenario(scenario, options, watch)
     assert result.state == "held"
     assert (folder / "report.html").exists()
     state, checked = controller.state(), controller.ask(check="summary")

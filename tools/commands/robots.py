@@ -100,7 +100,7 @@ def _check_pace(pace: float) -> None:
 
 def _at(host: str, name: str, scenario: Scenario, *, dry_run: bool, pace: float, lockstep: bool = False) -> ChosenRobot:
     config = scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(host, scenario)
-    config = dc.replace(config, host=host, pace=pace, lockstep=lockstep)
+    config = dc.replace(config, host=host, pace=pace, lockstep=lockstep or config.lockstep)
     if not dry_run:
         scenario.robot = config
         draw_in_this_thread()
