@@ -3,12 +3,9 @@
 import gc
 import os
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from weldcal.systems.background import before_other_programs
-from weldcal.systems.drivers.simulated.picture_worker import PICTURE_THREAD
 from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY
 
 SWITCH_S = 0.0002  # the interpreter's own is 5 ms
@@ -43,12 +40,9 @@ def real_time_priority() -> Iterator[None]:
     """Give this thread real-time priority for the duration of the block, where the system allows it (rtprio, or root).
 
     The priority is below that of the link's worker and the emulated controller, so that neither waits for the cell. No other
-    thread has it: pictures, fits and plans would keep the processor from the robot's peer. Pictures, which the servo waits
-    for, are put before other programs only. Threads and processes started in the block have ordinary priority.
+    thread has it: fits and plans would keep the processor from the robot's peer. Threads and processes started in the block
+    have ordinary priority.
     """
-    for thread in threading.enumerate():
-        if thread.name.startswith(PICTURE_THREAD) and thread.native_id:
-            before_other_programs(thread.native_id)
     policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(CELL_PRIORITY))

@@ -240,8 +240,6 @@ def _first_pictures(cell: Cell[JobOf], root: Context) -> None:
             context = system.GetMyContextFromRoot(root)
             for port in (system.color_image_output_port(), system.depth_image_32F_output_port()):
                 port.Eval(context)
-        elif hasattr(system, "first_picture"):
-            system.first_picture(system.GetMyContextFromRoot(root))
 
 
 def _keep_pace(run: Run[JobOf], root: Context) -> None:

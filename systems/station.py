@@ -19,7 +19,6 @@ from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_e
 from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
-from weldcal.systems.drivers.simulated.picture_worker import PictureWorker
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import SECOND, PlacedArm
@@ -58,7 +57,6 @@ class Station:
     world: SimulatedWorld | None  # None where no device is simulated
     second: ArmModel | None = None
     background: Background = dc.field(default_factory=Inline)
-    pictures: PictureWorker | None = None  # what renders the finger camera's pictures
 
     @property
     def arm(self) -> ArmModel:
@@ -76,9 +74,9 @@ class Station:
         return self.robot.pace
 
     def waiting_s(self, now: float) -> float:
-        """Seconds for which the oldest picture or background computation has been waited for at `now` (s, monotonic)."""
-        since = [self.background.waiting_since, None if self.pictures is None else self.pictures.waiting_since]
-        return max((now - at for at in since if at is not None), default=0.0)
+        """Seconds for which the newest background computation has been waited for at `now` (s, monotonic)."""
+        since = self.background.waiting_since
+        return 0.0 if since is None else now - since
 
     def close(self) -> None:
         """Stop the arm, release the hardware and end the background; a second call has no effect."""
@@ -235,7 +233,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
     second = None if furnishing.second is None else furnishing.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
-    return Station(diagram, robot, tool, cad, truth, world, second, background, build.find(PictureWorker))
+    return Station(diagram, robot, tool, cad, truth, world, second, background)
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.common import MemoryFile
 from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
@@ -44,6 +45,8 @@ CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of
 # A camera pixel integrates light over its area through a lens; a renderer samples one point of it. The blur of lens and pixel,
 # in texels, is applied to the print. Without it, edges parallel to the pixel rows would be off by a tenth of a pixel.
 BLUR_TEXELS = 1.2
+TAG_PLATE_M = 0.016  # side of the white plate under the tag's print
+TAG_PLATE_DEPTH_M = 0.00005  # of its face below the print
 TIP_FRICTION = 0.2  # soft tip on steel
 # The contact model approximates a sphere by an inscribed polyhedron with this share of its volume (at a resolution of half the
 # radius). The requested sphere is larger by the same factor, so that the polyhedron has the tip's volume.
@@ -69,12 +72,22 @@ def add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> N
     show(plant, body, RigidTransform(), shape, "iso_flange", STEEL)
 
 
-def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: TagModel) -> None:
-    """Add the tag with a white margin of one cell, in the marker frame (x right, y up, z out of the print)."""
+def tool_tag(tool: WeldingTool) -> TagModel:
+    """The tag that the tool carries."""
+    return TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
+
+
+def printed_tag(tag: TagModel) -> tuple[NDArray[np.uint8], float]:
+    """The print (n, n) of a tag with a white margin of one cell, blurred as by a lens, and its side in m."""
     cells = cv2.copyMakeBorder(255 * tag_cells(tag).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=255)
     sharp = np.maximum(np.kron(cells, np.ones((CELL_PX, CELL_PX), dtype=np.uint8)), 5)
     print_ = np.asarray(cv2.GaussianBlur(sharp, (0, 0), BLUR_TEXELS), dtype=np.uint8)
-    size = tag.size_m * cells.shape[0] / (cells.shape[0] - 2)
+    return print_, tag.size_m * cells.shape[0] / (cells.shape[0] - 2)
+
+
+def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: TagModel) -> None:
+    """Add the tag's print, in the marker frame (x right, y up, z out of the print)."""
+    print_, size = printed_tag(tag)
     geometry = GeometryInstance(X, textured_board("tag", size, size, print_), "tag_print")
     geometry.set_perception_properties(PerceptionProperties())
     geometry.set_illustration_properties(IllustrationProperties())
@@ -150,17 +163,11 @@ def add_tool(
     show(plant, body, RigidTransform(), Sphere(radius), "tip", SOFT)
     show(plant, body, RigidTransform([0.0, 0.0, reach / 2 - 0.003]), Cylinder(0.0022, reach - 0.006), "finger", SOFT)
     show(plant, body, RigidTransform([0.0, 0.0, reach - 0.0015]), Cylinder(0.026, 0.002), "membrane", SOFT)
-    tag = TagModel(dictionary=tool.tag_dictionary, id=tool.tag_id, size_m=tool.tag_size_m)
     X_TM = RigidTransform([0.0, 0.0, reach])
-    show(
-        plant,
-        body,
-        X_TM @ RigidTransform([0.0, 0.0, -0.0003]),
-        Box(0.016, 0.016, 0.0005),
-        "tag_white",
-        (1.0, 1.0, 1.0, 1.0),
-    )
-    _print_tag(plant, body, X_TM, tag)
+    plate = Box(TAG_PLATE_M, TAG_PLATE_M, 0.0005)
+    X_TPlate = X_TM @ RigidTransform([0.0, 0.0, -0.00025 - TAG_PLATE_DEPTH_M])
+    show(plant, body, X_TPlate, plate, "tag_white", (1.0, 1.0, 1.0, 1.0))
+    _print_tag(plant, body, X_TM, tool_tag(tool))
     contact = ProximityProperties()
     AddContactMaterial(dissipation=1.0, friction=CoulombFriction(TIP_FRICTION, TIP_FRICTION), properties=contact)
     AddCompliantHydroelasticProperties(

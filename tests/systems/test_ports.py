@@ -7,7 +7,6 @@ import inspect
 import pkgutil
 import textwrap
 from collections.abc import Callable
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -29,7 +28,7 @@ from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.drivers.simulated.picture_scene import PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
-from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
+from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
 from weldcal.systems.drivers.simulated.rendered_profiler import (
     CheatTorch,
     ProfilerSensor,
@@ -111,8 +110,8 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
     UrRtdeArm: lambda: UrRtdeArm(the_arm(), StillLink(Q_HOME), WallClock(1.0)),
     DepthSensor: lambda: DepthSensor(IDEAL, 0, 0.1),
-    StreamingColourCamera: lambda: StreamingColourCamera(
-        RenderedFingerCamera(), 0, 0.002, lambda poses, finish: Future()
+    StreamingCamera: lambda: StreamingCamera(
+        RenderedFingerCamera(), 0, 0.002, lambda poses: np.zeros((300, 400), np.uint8)
     ),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
@@ -227,7 +226,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "status": UrStatus,
     },
     DepthSensor: {"trigger": 1, "depth_image": ImageDepth32F, "color_image": ImageRgba8U, "scan": Scan},
-    StreamingColourCamera: {"streaming": 1, "frame_poses": FramePoseVector, "image": Image, "capture_time": 1},
+    StreamingCamera: {"streaming": 1, "body_poses": list, "image": Image, "capture_time": 1},
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {
         "scan": Scan,

@@ -1,6 +1,5 @@
 """A separate scene graph for a camera; its poses are updated only when a picture is taken."""
 
-from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,17 +54,12 @@ class PicturePoses(LeafSystem):
 
 @dataclass(frozen=True)
 class PictureScene(Message):
-    """A scene graph with one renderer, the frames of its moving bodies, and the system that computes their poses.
-
-    `apart`: the builder of a separate Diagram that holds the scene, with the input `frame_poses`; None: the cell's Diagram
-    holds it.
-    """
+    """A scene graph with one renderer, the frames of its moving bodies, and the system that computes their poses."""
 
     scene_graph: SceneGraph
     renderer: str
     frames: dict[BodyIndex, FrameId]
     poses: PicturePoses
-    apart: DiagramBuilder | None = None
 
 
 def add_picture_scene(
@@ -74,9 +68,6 @@ def add_picture_scene(
     drawn: SceneGraph,
     renderer: str,
     mount: str | None = None,
-    only: Collection[str] | None = None,
-    background: tuple[float, float, float] | None = None,
-    apart: DiagramBuilder | None = None,
 ) -> PictureScene:
     """Add a scene with the visual geometry that the bodies of `plant` have in the scene graph `drawn`.
 
@@ -84,16 +75,10 @@ def add_picture_scene(
         plant: finalised.
         renderer: name of the VTK renderer created for the scene.
         mount: name of the body that carries the camera; None: the camera is fixed.
-        only: names of the visible geometries; None: all.
-        background: background colour, red, green and blue from 0 to 1; None: the renderer's default.
-        apart: builder of a separate Diagram that gets the scene; only the pose computation is then added to `builder`.
     """
-    scene = (builder if apart is None else apart).AddSystem(SceneGraph())
+    scene = builder.AddSystem(SceneGraph())
     scene.set_name(f"{renderer}_scene")
-    parameters = RenderEngineVtkParams()
-    if background is not None:
-        parameters.default_clear_color = background
-    scene.AddRenderer(renderer, MakeRenderEngineVtk(parameters))
+    scene.AddRenderer(renderer, MakeRenderEngineVtk(RenderEngineVtkParams()))
     source = scene.RegisterSource("world")
     inspector = drawn.model_inspector()
     world = plant.world_body().index()
@@ -108,8 +93,6 @@ def add_picture_scene(
         frame_of(plant.GetBodyByName(mount).index())
     for geometry in inspector.GetAllGeometryIds(Role.kPerception):
         name = inspector.GetName(geometry)
-        if only is not None and name.split("::")[-1] not in only:
-            continue
         body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry)).index()
         copy = GeometryInstance(inspector.GetPoseInFrame(geometry), inspector.GetShape(geometry), name)
         copy.set_perception_properties(inspector.GetPerceptionProperties(geometry))
@@ -121,8 +104,5 @@ def add_picture_scene(
     poses = builder.AddSystem(PicturePoses(plant, frames))
     poses.set_name(f"{renderer}_poses")
     builder.Connect(plant.get_body_poses_output_port(), poses.GetInputPort("body_poses"))
-    if apart is None:
-        builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
-    else:
-        apart.ExportInput(scene.get_source_pose_port(source), "frame_poses")
-    return PictureScene(scene, renderer, frames, poses, apart)
+    builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
+    return PictureScene(scene, renderer, frames, poses)

@@ -1,32 +1,25 @@
-"""Simulated finger camera: renders the tag that moves with the soft tip, and adds noise and latency."""
+"""Simulated finger camera: draws the tag that moves with the soft tip, and adds noise and latency."""
 
 import dataclasses as dc
-from concurrent.futures import Future
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, ClassVar
 
 import cv2
 import numpy as np
-from pydrake.common.value import AbstractValue
-from pydrake.geometry import (
-    ClippingRange,
-    ColorRenderCamera,
-    DepthRange,
-    DepthRenderCamera,
-    FramePoseVector,
-    RenderCameraCore,
-)
+from pydrake.common.value import AbstractValue, Value
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
-from pydrake.systems.sensors import CameraInfo, RgbdSensor
 from scipy.special import ndtri
 
 from weldcal.models.tool import FingerCamera
 from weldcal.systems.drivers.config import FingerCameraConfig
-from weldcal.systems.drivers.simulated.picture_worker import Draw, PictureWorker, Pixels
+from weldcal.systems.drivers.simulated.tag_view import Pixels, TagView
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Image, Message
+
+COVERED_GREY = 25  # of a lens under spatter
 
 
 @dc.dataclass
@@ -51,20 +44,12 @@ class RenderedFingerCamera(FingerCameraConfig):
 
 
 @dc.dataclass(frozen=True, eq=False)
-class _Exposed(Message):
-    """An exposed frame and its pixels (H, W), which may still be rendering."""
-
-    frame: Image
-    pixels: "Future[Pixels]"
-
-
-@dc.dataclass(frozen=True, eq=False)
 class _Stream(Message):
     """The newest frames, oldest first, including those that the latency has not released yet."""
 
     started: float = -np.inf
     count: int = 0
-    frames: tuple[_Exposed, ...] = ()
+    frames: tuple[Image, ...] = ()
 
 
 @lru_cache(maxsize=4)
@@ -79,67 +64,58 @@ def with_noise(grey: np.ndarray, sigma: float, rng: np.random.Generator) -> np.n
     return np.asarray(cv2.add(grey, np.take(_noise_table(sigma), drawn), dtype=cv2.CV_8U), dtype=np.uint8)
 
 
-class StreamingColourCamera(LeafSystem):
+class StreamingCamera(LeafSystem):
     """Takes grey frames at the camera's rate while streaming is on.
 
     .. pydrake_system::
 
-        name: StreamingColourCamera
+        name: StreamingCamera
         input_ports:
         - streaming
-        - frame_poses
+        - body_poses
         output_ports:
         - image
         - capture_time
 
-    A frame shows the world at the plant's last step, and its capture time is the time of that step. `frame_poses`
-    (FramePoseVector): poses of the bodies in the camera's scene; `draw` starts a picture of them. Where it is not ready when
-    the frame arrives the system waits for it, or with `waits` off, beside a robot, the frame arrives later.
+    A frame shows the world at the plant's last step, and its capture time is the time of that step. `body_poses`: the plant's;
+    `draw` makes the grey picture (H, W) of them. A frame arrives after the camera's latency.
     """
 
     def __init__(
-        self, config: RenderedFingerCamera, seed: int, plant_period_s: float, draw: Draw, waits: bool = True
+        self,
+        config: RenderedFingerCamera,
+        seed: int,
+        plant_period_s: float,
+        draw: Callable[[list[RigidTransform]], Pixels],
     ) -> None:
         super().__init__()
         self._config = config
         self._seed = seed
         self._plant_period_s = plant_period_s
-        self._draw, self._waits = draw, waits
+        self._draw = draw
         self._streaming = self.DeclareVectorInputPort("streaming", 1)
-        self._poses = self.DeclareAbstractInputPort("frame_poses", AbstractValue.Make(FramePoseVector()))
+        self._poses = self.DeclareAbstractInputPort("body_poses", Value[list[RigidTransform]]())
         self._state = self.DeclareAbstractState(AbstractValue.Make(_Stream()))
         ticket = {self.abstract_state_ticket(self._state), self.time_ticket()}
         self.DeclareAbstractOutputPort("image", lambda: AbstractValue.Make(Image()), self._image, ticket)
         self.DeclareVectorOutputPort("capture_time", 1, self._capture_time, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / config.rate_hz, 0.0, self._expose)
 
-    def first_picture(self, context: Context) -> Pixels:
-        """Render and return the colours (H, W, 4) at the current poses; a renderer's first picture takes a second."""
-        return self._draw(self._poses.Eval(context), lambda colours: colours.copy()).result()
-
     def _expose(self, context: Context, state: State) -> None:
         stream: _Stream = context.get_abstract_state(self._state).get_value()
         if self._streaming.Eval(context)[0] < 0.5:
             return
-        if not self._waits and stream.frames and not stream.frames[-1].pixels.done():
-            return  # the renderer is late: this frame is dropped, so that pictures do not pile up
         now = context.get_time()
         started = stream.started if np.isfinite(stream.started) else now
         hidden = self._config.hidden_from_s is not None and now - started >= self._config.hidden_from_s
-        rng = np.random.default_rng([self._seed, stream.count])
-        covered = np.full((self._config.height, self._config.width), 25, dtype=np.uint8)
-
-        def finish(colours: Pixels) -> Pixels:
-            # The tag is black on white: one channel is sufficient.
-            grey = covered if hidden else np.asarray(cv2.extractChannel(colours, 1), dtype=np.uint8)
-            return with_noise(grey, self._config.noise_grey, rng)
-
-        pixels = self._draw(self._poses.Eval(context), finish)
+        covered = np.full((self._config.height, self._config.width), COVERED_GREY, dtype=np.uint8)
+        grey = covered if hidden else self._draw(self._poses.Eval(context))
+        pixels = with_noise(grey, self._config.noise_grey, np.random.default_rng([self._seed, stream.count]))
         step = self._plant_period_s
         taken = (
             np.ceil(now / step - 1e-6) - 1.0
         ) * step  # at the time of a tick the plant's outputs still show the previous step
-        frame = _Exposed(Image(stream.count + 1, taken, exposed_at=now), pixels)
+        frame = Image(stream.count + 1, taken, pixels, exposed_at=now)
         kept = 4 + int(self._config.latency_s * self._config.rate_hz)  # enough frames to cover the latency
         new = dc.replace(stream, started=started, count=stream.count + 1, frames=(*stream.frames[-kept:], frame))
         state.get_mutable_abstract_state(self._state).set_value(new)
@@ -147,9 +123,8 @@ class StreamingColourCamera(LeafSystem):
     def _arrived(self, context: Context) -> Image:
         stream: _Stream = context.get_abstract_state(self._state).get_value()
         now = context.get_time()
-        ripe = [e for e in stream.frames if now >= e.frame.exposed_at + self._config.latency_s - 1e-9]
-        ripe = [e for e in ripe if self._waits or e.pixels.done()]
-        return dc.replace(ripe[-1].frame, pixels=ripe[-1].pixels.result()) if ripe else Image()
+        ripe = [frame for frame in stream.frames if now >= frame.exposed_at + self._config.latency_s - 1e-9]
+        return ripe[-1] if ripe else Image()
 
     def _image(self, context: Context, output: Any) -> None:
         output.set_value(self._arrived(context))
@@ -159,30 +134,21 @@ class StreamingColourCamera(LeafSystem):
 
 
 def ApplyDriverConfig(config: RenderedFingerCamera, build: StationBuild) -> None:
-    """Add a colour camera to the tool and its streaming system to the station."""
+    """Add the streaming camera in the tool to the station."""
     world, tool = build.require(SimulatedWorld), build.tool
-    view = world.finger_view
-    if tool is None or view is None or view.apart is None:
+    if tool is None or world.tool is None:
         return
-    camera = config.camera()
-    K = camera.camera_matrix
-    info = CameraInfo(
-        config.width, config.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5
-    )  # half pixel: VTK's convention
-    core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
-    color, depth = ColorRenderCamera(core, False), DepthRenderCamera(core, DepthRange(0.01, 0.4))
-    frame = view.frames[world.plant.GetBodyByName("tool_plate", world.tool).index()]
-    sensor = view.apart.AddSystem(RgbdSensor(frame, tool.X_FK, color, depth))
-    view.apart.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    worker = PictureWorker(view.apart, sensor)
-    build.parts = (*build.parts, worker)
-    stream = build.builder.AddSystem(
-        StreamingColourCamera(
-            config, int(build.rng.integers(2**31)), world.plant.time_step(), worker.draw, build.may_wait
-        )
+    plate, tip = (int(world.plant.GetBodyByName(name, world.tool).index()) for name in ("tool_plate", "tip_z"))
+    view, X_TM = TagView(tool, config.camera()), tool.X_FT.InvertAndCompose(tool.X_FM_rest)
+
+    def draw(body_poses: list[RigidTransform]) -> Pixels:
+        return view.picture(body_poses[plate].InvertAndCompose(body_poses[tip]) @ X_TM)
+
+    camera = build.builder.AddSystem(
+        StreamingCamera(config, int(build.rng.integers(2**31)), world.plant.time_step(), draw)
     )
-    stream.set_name("finger_camera")
-    build.builder.Connect(view.poses.GetOutputPort("frame_poses"), stream.GetInputPort("frame_poses"))
-    build.inputs["finger_camera.streaming"] = stream.GetInputPort("streaming")
-    build.outputs["finger_camera.image"] = stream.GetOutputPort("image")
-    build.outputs["finger_camera.capture_time"] = stream.GetOutputPort("capture_time")
+    camera.set_name("finger_camera")
+    build.builder.Connect(world.plant.get_body_poses_output_port(), camera.GetInputPort("body_poses"))
+    build.inputs["finger_camera.streaming"] = camera.GetInputPort("streaming")
+    build.outputs["finger_camera.image"] = camera.GetOutputPort("image")
+    build.outputs["finger_camera.capture_time"] = camera.GetOutputPort("capture_time")

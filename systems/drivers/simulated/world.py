@@ -20,14 +20,13 @@ from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
-from weldcal.systems.bodies.tool import SOFT, STEEL, TABLE, TIP_FRICTION, add_flange, add_tool, mesh_shape, show
+from weldcal.systems.bodies.tool import STEEL, TABLE, TIP_FRICTION, add_flange, add_tool, mesh_shape, show
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 
 SCANNER_RENDERER = "scanner"
-FINGER_RENDERER = "finger"
 JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of the arm's joint servos
 JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
 
@@ -42,7 +41,6 @@ class SimulatedWorld(Message):
     tool: ModelInstanceIndex | None
     tip_joints: tuple[PrismaticJoint, ...]
     scanner_view: PictureScene
-    finger_view: PictureScene | None
     second: ModelInstanceIndex | None = None  # the second arm of a co-manipulation
     touch_pair: TouchPair | None = None
 
@@ -142,20 +140,4 @@ def build_world(
         still.set_name(f"fittings_at_rest_{k}")
         builder.Connect(still.get_output_port(), plant.get_desired_state_input_port(model))
     scanner_view = add_picture_scene(builder, plant, scene_graph, SCANNER_RENDERER)
-    finger_view = None
-    if tool_instance is not None:
-        finger_view = add_picture_scene(
-            builder,
-            plant,
-            scene_graph,
-            FINGER_RENDERER,
-            mount="tool_plate",
-            only=("tag_print", "tag_white"),
-            apart=DiagramBuilder(),  # rendered in a separate thread
-            background=SOFT[
-                :3
-            ],  # the membrane fills the view behind the tag; rendering it would cost as much as the tag
-        )
-    return SimulatedWorld(
-        plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, finger_view, second_arm, touch_pair
-    )
+    return SimulatedWorld(plant, scene_graph, instance, tool_instance, tip_joints, scanner_view, second_arm, touch_pair)

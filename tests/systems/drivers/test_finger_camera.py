@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
-from pydrake.geometry import ClippingRange, ColorRenderCamera, FramePoseVector, RenderCameraCore
+from pydrake.common.value import AbstractValue, Value
+from pydrake.geometry import ClippingRange, ColorRenderCamera, RenderCameraCore
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.sensors import CameraInfo
 
 from tests.systems.cells import Q_HOME, TOOL, Drive, plain_station, scenario, the_arm
 from weldcal.models.arms.kinematics import forward_kinematics
-from weldcal.systems.drivers.simulated.picture_worker import Finish, Pixels
-from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingColourCamera
+from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
+from weldcal.systems.drivers.simulated.tag_view import Pixels, TagView
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import (
     ArucoDeformationEstimator,
     Deformation,
@@ -69,10 +68,11 @@ def read(image: Image) -> Deformation:
     return measure_deformation(image, forward_kinematics(the_arm(), Q_HOME), TOOL, TAG, CAMERA.camera_matrix)
 
 
-def test_its_scene_is_the_cells_as_seen_from_the_tool() -> None:
-    """The finger camera's scene holds the tag alone: no pixel may be other than in the picture of the whole cell."""
+@pytest.mark.parametrize("push_mm", [(0.0, 0.0, 0.0), (2.0, -3.0, 4.0), (-6.0, 5.0, -3.0)])
+def test_its_picture_is_the_cells_as_a_renderer_sees_it_from_the_tool(push_mm: tuple[float, float, float]) -> None:
+    """The homography of the print against the renderer's picture of the whole cell, from the same place."""
     drive = Drive(plain_station())
-    drive.place_arm(Q_HOME, MM * np.array([2.0, -3.0, 4.0]))
+    drive.place_arm(Q_HOME, MM * np.array(push_mm))
     world = drive.station.world
     c, K, view = CAMERA, CAMERA.camera_matrix, world.scanner_view
     info = CameraInfo(c.width, c.height, K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5)
@@ -80,10 +80,20 @@ def test_its_scene_is_the_cells_as_seen_from_the_tool() -> None:
     core = RenderCameraCore(view.renderer, info, ClippingRange(0.005, 0.5), RigidTransform())
     query = view.scene_graph.get_query_output_port().Eval(view.scene_graph.GetMyContextFromRoot(drive.context))
     whole = query.RenderColorImage(ColorRenderCamera(core), view.frames[plate], TOOL.X_FK).data.copy()
-    camera = drive.station.diagram.GetSubsystemByName("finger_camera")
-    pictures = [camera.first_picture(camera.GetMyContextFromRoot(drive.context)), whole]
-    assert np.array_equal(*pictures)
-    assert np.ptp(pictures[0][:, :, 1]) > 200, "the tag is in it"
+    poses = world.plant.get_body_poses_output_port().Eval(world.plant.GetMyContextFromRoot(drive.context))
+    tip = poses[world.plant.GetBodyByName("tip_z", world.tool).index()]
+    X_FM = poses[plate].InvertAndCompose(tip) @ TOOL.X_FT.InvertAndCompose(TOOL.X_FM_rest)
+    ours, theirs = TagView(TOOL, c).picture(X_FM), np.ascontiguousarray(whole[:, :, 1])
+    # They differ at edges alone, which a renderer samples at points: neither is shifted, nor lighter than the other.
+    difference = ours.astype(float) - theirs
+    assert np.mean(np.abs(difference) > 30.0) < 0.01
+    assert abs(np.mean(difference)) < 1.5
+    assert np.ptp(theirs) > 200, "the tag is in it"
+    one, other = (read(Image(1, 0.0, picture)).sample for picture in (ours, theirs))
+    assert one is not None
+    assert other is not None
+    assert one.deflection_T[:2] == pytest.approx(other.deflection_T[:2], abs=0.001 * MM)
+    assert one.deflection_T[2] == pytest.approx(other.deflection_T[2], abs=0.006 * MM)
 
 
 @pytest.mark.parametrize("push_mm", PUSHES_MM)
@@ -146,18 +156,16 @@ class Bench:
 
     def __init__(self, **changes: Any) -> None:
         config = RenderedFingerCamera(**{"width": 8, "height": 6, **changes})
-        self.camera = StreamingColourCamera(config, 1, 0.002, self.draw)
+        self.camera = StreamingCamera(config, 1, 0.002, self.draw)
         self.simulator = Simulator(self.camera)
         self.context = self.simulator.get_mutable_context()
-        self.camera.GetInputPort("frame_poses").FixValue(self.context, AbstractValue.Make(FramePoseVector()))
-        self.shape = (config.height, config.width, 4)
+        self.camera.GetInputPort("body_poses").FixValue(self.context, Value[list[RigidTransform]]([]))
+        self.shape = (config.height, config.width)
         self.show(100)
         self.stream(True)
 
-    def draw(self, _poses: FramePoseVector, finish: Finish) -> Future[Pixels]:
-        drawn: Future[Pixels] = Future()
-        drawn.set_result(finish(np.full(self.shape, self.grey, dtype=np.uint8)))
-        return drawn
+    def draw(self, _poses: list[RigidTransform]) -> Pixels:
+        return np.full(self.shape, self.grey, dtype=np.uint8)
 
     def show(self, grey: int) -> None:
         self.grey = grey
