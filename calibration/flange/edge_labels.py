@@ -9,8 +9,8 @@ from scipy.special import ndtr
 
 from weldcal.calibration.errors import CircleFitError
 from weldcal.calibration.geometry.circle import CircleFit
-from weldcal.calibration.geometry.compiled import compiled
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 
 Single = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -21,10 +21,10 @@ from weldcal.calibration.flange.face import (
 from weldcal.calibration.flange.rays import pinhole_rays, pinhole_window
 from weldcal.calibration.flange.rim import plane_axes
 from weldcal.calibration.geometry.circle import CircleFit, refine_circles
-from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.plane import PlaneFit, plane_steps, shared_noise
 from weldcal.calibration.geometry.robust import TUKEY
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 from weldcal.models.flanges import FlangeStandard
 
 Single = NDArray[np.float32]

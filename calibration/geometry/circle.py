@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.calibration.errors import CircleFitError
-from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 
 _STEPS = 7  # of Gauss-Newton in the compiled fit
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from weldcal.calibration.errors import PlaneFitError
-from weldcal.calibration.geometry.compiled import compiled
 from weldcal.calibration.geometry.robust import MAD, TUKEY, middle, solved
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 
 Single = NDArray[np.float32]
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from weldcal.calibration.geometry.compiled import compiled
 from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 
 TUKEY = 4.685  # 95 % efficient on Gaussian noise
 MAD = 1.4826  # median absolute deviation -> standard deviation of a Gaussian

@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from weldcal.models.compiled import compiled
 from weldcal.models.errors import InputError
-from weldcal.welding.numerics import Array, dot, within
+from weldcal.welding.numerics import Array, dot
 
 
 class GuardError(InputError):
@@ -95,26 +96,51 @@ def guarded_joint_velocity(
         config: thresholds; ArmGuardConfig() when None.
     """
     limits = config or ArmGuardConfig()
-    jacobian, velocity = np.asarray(J, dtype=float), np.asarray(V, dtype=float)
-    bound = np.asarray(q_dot_limit, dtype=float)
-    rest = np.zeros(jacobian.shape[-1])
+    # copies: the code is compiled anew for each kind of view
+    jacobian, velocity = np.array(J, dtype=float), np.array(V, dtype=float)
+    bound, rest = np.full(6, q_dot_limit, dtype=float), np.zeros(6)
     if not (np.isfinite(jacobian).all() and np.isfinite(velocity).all() and np.isfinite(bound).all()):
         return GuardedVelocity(rest, 0.0, 0.0, True, "The arm was stopped: the commanded velocity is not finite.")
-    row_scale = limits.row_scale
-    U, sigma, Vt = np.linalg.svd(row_scale[:, None] * jacobian)
-    sigma_min = float(sigma[-1])
-    if sigma_min <= limits.sigma_stop:
-        text = f"The arm was stopped {sigma_min:.3f} from a singularity; start from another arm configuration."
-        return GuardedVelocity(rest, sigma_min, 0.0, True, text)
-    scale = min(1.0, (sigma_min - limits.sigma_stop) / (limits.sigma_slow - limits.sigma_stop))
+    sigma_min, scale, slowed = _guarded(
+        jacobian, velocity, bound, limits.row_scale, limits.sigma_stop, limits.sigma_slow, rest
+    )
+    reason: str | None = None
+    if scale == 0.0:
+        reason = f"The arm was stopped {sigma_min:.3f} from a singularity; start from another arm configuration."
+    elif slowed < 1.0:
+        reason = f"Near a singularity: the arm moves at {slowed:.0%}."
+    elif scale < 1.0:
+        reason = f"A joint is at its speed limit: the arm moves at {scale:.0%}."
+    return GuardedVelocity(rest, sigma_min, scale, scale == 0.0, reason)
+
+
+@compiled()
+def _guarded(
+    J: Array, V: Array, bound: Array, row_scale: Array, stop: float, slow: float, q_dot: Array
+) -> tuple[float, float, float]:
+    """Fill q_dot (6,), which is zero; returns sigma_min, the share of the wanted velocity that is left (0: stopped), and that
+    near a singularity."""
+    scaled, wanted = J * row_scale.reshape(6, 1), V * row_scale
+    U, sigma, Vt = np.linalg.svd(scaled)
+    sigma_min = sigma[5]
+    if sigma_min <= stop:
+        return sigma_min, 0.0, 0.0
+    slowed = min(1.0, (sigma_min - stop) / (slow - stop))
     # Not damped, which would turn the twist: sigma is above sigma_stop here, and the scale ends at zero there.
-    q_dot = scale * (Vt.T @ ((U.T @ (row_scale * velocity)) / sigma))
-    reason = f"Near a singularity: the arm moves at {scale:.0%}." if scale < 1.0 else None
-    excess = float(np.max(np.abs(q_dot) / np.maximum(bound, 1e-9)))
+    excess = 0.0
+    for i in range(6):
+        part = 0.0
+        for r in range(6):
+            part += U[r, i] * wanted[r]
+        part *= slowed / sigma[i]
+        for k in range(6):
+            q_dot[k] += Vt[i, k] * part
+    for k in range(6):
+        excess = max(excess, abs(q_dot[k]) / max(bound[k], 1e-9))
     if excess > 1.0:
-        q_dot, scale = q_dot / excess, scale / excess
-        reason = reason or f"A joint is at its speed limit: the arm moves at {scale:.0%}."
-    return GuardedVelocity(q_dot, sigma_min, scale, False, reason)
+        q_dot /= excess
+        return sigma_min, slowed / excess, slowed
+    return sigma_min, slowed, slowed
 
 
 @dataclass(frozen=True)
@@ -151,14 +177,22 @@ def slew_limit(v_des: ArrayLike, v_prev: Array, a_prev: Array, limits: SlewLimit
         limits: bounds.
         dt: tick in s.
     """
-    wanted = np.asarray(v_des, dtype=float)
-    if not np.isfinite(wanted).all():
-        wanted = np.zeros_like(v_prev)
-    speed, top = np.asarray(limits.speed, dtype=float), np.asarray(limits.acceleration, dtype=float)
-    step = np.asarray(limits.jerk, dtype=float) * dt
-    gap = within(wanted, -speed, speed) - v_prev
-    # With m whole jerk steps to undo afterwards, a tick at `a` and the fall gain dt((m+1)a - step m(m+1)/2) = |gap|.
-    m = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * np.abs(gap) / (step * dt)) - 1.0))
-    a_wish = np.sign(gap) * (np.abs(gap) / dt + 0.5 * step * m * (m + 1.0)) / (m + 1.0)
-    a = within(within(a_wish, -top, top), a_prev - step, a_prev + step)
-    return v_prev + a * dt, a
+    n = len(v_prev)
+    bounds = [np.full(n, bound, dtype=float) for bound in (limits.speed, limits.acceleration, limits.jerk)]
+    v, a = np.array(v_prev, dtype=float), np.array(a_prev, dtype=float)
+    _slew(np.array(v_des, dtype=float), v, a, *bounds, dt)
+    return v, a
+
+
+@compiled()
+def _slew(wanted: Array, v: Array, a: Array, speed: Array, top: Array, jerk: Array, dt: float) -> None:
+    """One tick of each joint, in place; see slew_limit."""
+    finite = np.isfinite(wanted).all()
+    for k in range(len(v)):
+        step = jerk[k] * dt
+        gap = min(max(wanted[k] if finite else 0.0, -speed[k]), speed[k]) - v[k]
+        # With m whole jerk steps to undo afterwards, a tick at `a` and the fall gain dt((m+1)a - step m(m+1)/2) = |gap|.
+        m = np.floor(0.5 * (np.sqrt(1.0 + 8.0 * abs(gap) / (step * dt)) - 1.0))
+        wish = np.sign(gap) * (abs(gap) / dt + 0.5 * step * m * (m + 1.0)) / (m + 1.0)
+        a[k] = min(max(min(max(wish, -top[k]), top[k]), a[k] - step), a[k] + step)
+        v[k] += a[k] * dt

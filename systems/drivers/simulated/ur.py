@@ -9,13 +9,14 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
+from weldcal.models.arrays import Array
+from weldcal.models.compiled import compiled
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.config import DriverConfig
 from weldcal.systems.drivers.simulated.arm_error import draw_true_arm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import UrStatus
-from weldcal.welding.numerics import within
 
 _LARGEST_MM = 1.0  # a larger error is a defect, not repeatability
 
@@ -72,6 +73,8 @@ class SpeedJointServo(LeafSystem):
         self._arm = arm
         self._config = config
         self._seed = seed
+        rows = (arm.velocity_limit, arm.acceleration_limit, arm.position_lower, arm.position_upper)
+        self._limits = np.array([*rows, np.full(6, config.following_error_rad)])
         offset = self._offset(q_start, 0)
         own = [*offset, 0.0] if config.repeatability_mm else []
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
@@ -90,24 +93,18 @@ class SpeedJointServo(LeafSystem):
         self.DeclarePeriodicDiscreteUpdateEvent(config.control_period_s, 0.0, self._sample)
 
     def _sample(self, context: Context, discrete: DiscreteValues) -> None:
-        dt = self._config.control_period_s
-        old = context.get_discrete_state_vector().value()
-        measured = self._arm_state.Eval(context).copy()
-        command = self._command.Eval(context)
-        fault = old[25]
-        if not np.isfinite(command).all() or np.abs(old[:6] - measured[:6]).max() > self._config.following_error_rad:
-            fault = 1.0
-        wanted = np.zeros(6) if fault else within(command, -self._arm.velocity_limit, self._arm.velocity_limit)
-        step = self._arm.acceleration_limit * dt
-        v_ref = old[6:12] + within(wanted - old[6:12], -step, step)
-        q_ref = within(old[:6] + dt * v_ref, self._arm.position_lower, self._arm.position_upper)
-        own = old[26:].copy()
+        new = np.array(context.get_discrete_state_vector().value())
+        measured = np.array(self._arm_state.Eval(context))
+        moved = new[6:12].any()
+        _follow(new, measured, np.array(self._command.Eval(context)), self._limits, self._config.control_period_s)
+        own = new[26:]
         if own.size:
-            if not old[6:12].any() and v_ref.any():  # the arm starts to move
+            if not moved and new[6:12].any():  # the arm starts to move
                 own[6] += 1.0
                 own[:6] = self._offset(measured[:6], int(own[6]))
             measured[:6] -= own[:6]
-        discrete.set_value(np.concatenate([q_ref, v_ref, measured, [context.get_time(), fault], own]))
+        new[12:24], new[24] = measured, context.get_time()
+        discrete.set_value(new)
 
     def _offset(self, q: np.ndarray, stop: int) -> np.ndarray:
         """Joint offsets (6,) rad that displace the flange by the repeatability (rms) at any arm pose."""
@@ -140,6 +137,22 @@ class SpeedJointServo(LeafSystem):
             else None
         )
         output.set_value(UrStatus(safety_mode="PROTECTIVE_STOP", fault=text) if fault else READY)
+
+
+@compiled()
+def _follow(state: Array, measured: Array, command: Array, limits: Array, dt: float) -> None:
+    """Advance reference (6,), its velocity (6,) and the fault at index 25 of the servo's state, in place.
+
+    ``limits`` (5, 6): velocity, acceleration, lower and upper position, following error; rad and s.
+    """
+    for k in range(6):
+        if not np.isfinite(command[k]) or abs(state[k] - measured[k]) > limits[4, k]:
+            state[25] = 1.0
+    for k in range(6):
+        wanted = 0.0 if state[25] else min(max(command[k], -limits[0, k]), limits[0, k])
+        step = limits[1, k] * dt
+        state[6 + k] += min(max(wanted - state[6 + k], -step), step)
+        state[k] = min(max(state[k] + dt * state[6 + k], limits[2, k]), limits[3, k])
 
 
 def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
