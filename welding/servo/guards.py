@@ -178,9 +178,9 @@ def slew_limit(v_des: ArrayLike, v_prev: Array, a_prev: Array, limits: SlewLimit
         dt: tick in s.
     """
     n = len(v_prev)
-    bounds = [np.full(n, bound, dtype=float) for bound in (limits.speed, limits.acceleration, limits.jerk)]
+    speed, top, jerk = (np.full(n, b, dtype=float) for b in (limits.speed, limits.acceleration, limits.jerk))
     v, a = np.array(v_prev, dtype=float), np.array(a_prev, dtype=float)
-    _slew(np.array(v_des, dtype=float), v, a, *bounds, dt)
+    _slew(np.array(v_des, dtype=float), v, a, speed, top, jerk, dt)
     return v, a
 
 
