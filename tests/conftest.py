@@ -95,7 +95,7 @@ def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
     return run_weldcal("demo", "--no-browser", "--out", str(folder), folder=folder)
 
 
-def run_weldcal(*arguments: str, folder: Path, timeout_s: float = 400) -> FinishedRun:
+def run_weldcal(*arguments: str, folder: Path, timeout_s: float = 1200) -> FinishedRun:
     """Runs a weldcal command with --json in a process of its own, as a person would."""
     command = [sys.executable, "-P", "-m", "weldcal.tools", *arguments, "--json"]
     finished = subprocess.run(command, capture_output=True, text=True, check=False, timeout=timeout_s)

@@ -94,7 +94,7 @@ def test_the_users_own_scans_calibrate_and_others_verify_them(shared_data: Path,
     own_scans(aubo, tmp_path / "other_scans", header, slice(1, None, 2))
     for line in next(text for text in blocks(readme, "sh") if "calibrate" in text).splitlines():
         command = [sys.executable, "-P", "-m", "weldcal.tools", *shlex.split(line)[1:], "--json"]
-        finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=400)
+        finished = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, timeout=1200)
         assert finished.returncode == 0, finished.stderr
         summary = json.loads(finished.stdout.splitlines()[-1])
         assert summary["state"] == "done"
