@@ -53,18 +53,13 @@ class WallClock:
     slider. A single delay of more than LATE_S is never made up for, because a robot executes commands when they arrive: the
     Diagram goes on from where it is. Lateness is in robot time: `late_s` is the maximum while the arm was commanded to move,
     `thinking_s` the maximum while it was at rest, where computing time is not limited. `reanchored` counts the delays of more
-    than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants the path to stand still. Without `slows` the path
-    is not slowed on a late computer, because the robot is emulated and waits for it.
+    than LATE_S during motion, and `lost_s` is their sum. `held`: a person wants the path to stand still.
     """
 
     def __init__(
-        self,
-        pace: float,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-        slows: bool = True,
+        self, pace: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        self.pace, self._clock, self._sleep, self._slows = pace, clock, sleep, slows
+        self.pace, self._clock, self._sleep = pace, clock, sleep
         self._due = 0.0  # wall clock at which the Diagram's time is _at
         self._at: float | None = None
         self.rate, self.slowest_rate = 1.0, 1.0
@@ -117,7 +112,7 @@ class WallClock:
     def _set_rate(self, step: float, late: float, moving: bool) -> None:
         wanted = min(max(1.0 - (late - SLOW_FROM_S) / SLOW_SPAN_S, SLOWEST), 1.0)
         # a single long delay says nothing about the rate that the computer can keep
-        if not moving or late > LATE_S or not self._slows:
+        if not moving or late > LATE_S:
             wanted = 1.0
         wanted = min(wanted, max(1.0 - (self.waiting_s - PICTURE_LATE_S) / PICTURE_SPAN_S, SLOWEST))
         if self.held:

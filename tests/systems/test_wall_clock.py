@@ -166,16 +166,3 @@ def test_thinking_while_the_arm_stands_still_is_no_lateness() -> None:
     before = wall.now
     clock.wait_for(0.2, moving=True)
     assert wall.now - before == pytest.approx(0.1)
-
-
-def test_beside_a_robot_that_waits_the_path_is_not_slowed() -> None:
-    wall = FakeTime()
-    clock = WallClock(1.0, wall, wall.sleep, slows=False)
-    for k in range(200):
-        wall.now += 1.7 * TICK_S
-        clock.wait_for(TICK_S * k, moving=True)
-    assert (clock.rate, clock.slowed_s) == (1.0, 0.0)
-    clock.held = True
-    for k in range(200, 300):
-        clock.wait_for(TICK_S * k, moving=True)
-    assert clock.stands, "a person still holds it"

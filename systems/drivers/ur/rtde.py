@@ -175,8 +175,7 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         payload_cog_m=(x, y, z),
         process_output=config.process_output,
     )
-    clock = WallClock(config.pace, slows=not config.lockstep)
-    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)
+    return PreparedRobot(arm, link.state().q, link, WallClock(config.pace), config.lockstep)
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
