@@ -22,7 +22,7 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.studies.perfect_world import perfect
 
 # Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the edge of
-# the flange, 0.02 mm of the fit (test_cell). The largest error of a torch is a single tick's: 2 ms at 16 mm/s are 0.03 mm more.
+# the flange, 0.02 mm of the fit (test_cell). The largest error of a torch is a single tick's: 2 ms at 8 mm/s are 0.02 mm more.
 SAME_MM = {
     "X_BC_error_mm": 0.02,
     "X_BC_error_at_work_mm": 0.02,
@@ -37,7 +37,7 @@ NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 
 SEED = 5  # its planned poses lie near each other
 SHORTEST = """
-welding: {seam_length_mm: 20.0, speed_mm_s: 16.0}
+welding: {seam_length_mm: 20.0}
 calibration: {minimum_scans: 4, maximum_scans: 4}
 scanner: !RenderedScanner {preset: ideal, width: 824, height: 616}
 """
