@@ -1,0 +1,1 @@
+"""Calibration while the arm moves: continuous poses, clocks, tracking and drift."""
