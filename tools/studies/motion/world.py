@@ -160,9 +160,7 @@ class MotionWorld:
         """What frames.csv says of each frame: its arrival on the robot's clock, and the device's stamp."""
         o, stamps = self.options, self.stamps
         return [
-            FrameTime(
-                f"{k:05d}", round(o.robot_start_s + float(t), 6), round(stamps[k], 6) if o.device_clock else None
-            )
+            FrameTime(f"{k:05d}", round(o.robot_start_s + float(t), 6), round(stamps[k], 6) if o.device_clock else None)
             for k, t in enumerate(self.arrivals)
         ]
 
