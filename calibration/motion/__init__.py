@@ -1,1 +1,1 @@
-"""Calibration while the arm moves: continuous poses, clocks, tracking and drift."""
+"""Calibration and tracking while the arm moves: the robot's motion in continuous time, clocks, drift."""

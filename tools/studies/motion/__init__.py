@@ -1,1 +1,1 @@
-"""Calibration in motion: a simulated world, the paper's experiments, accuracy and speed."""
+"""Studies of calibration in motion."""
