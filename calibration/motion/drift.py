@@ -30,7 +30,7 @@ class DriftConfig:
 
     ``floor_m`` and ``floor_rad`` are sigmas per axis, at the pivot, of what no model here explains and no number of frames
     averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a change that is
-    as old as the first frame. An alarm waits ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a
+    as old as the first frame and is tested for ``stated_s``; older changes than ``longest_s`` are not. An alarm waits ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a
     warm-up explains a slow change as well. After ``novel_frames`` frames at poses that the field's features do not reach, the field
     is learnt anew.
     """
@@ -40,6 +40,8 @@ class DriftConfig:
     floor_rad: float = 2.5e-5
     stated_m: float = 8e-5
     stated_rad: float = 2e-4
+    stated_s: float = 60.0
+    longest_s: float = 1800.0
     least_frames: int = 8
     creep_frames: int = 100
     confirm_s: float = 4.0
@@ -128,9 +130,12 @@ class DriftTest:
         for i in range(len(rows)):
             t = float(rows.times[i])
             self._last_s = t
-            if self._alarm_s is None and self.filter.novel > self.config.novel_frames:
-                self.filter.renew_field()
-            self.filter.update(rows, i, self.noise, spawn=self._alarm_s is None)
+            f = self.filter
+            f.update(rows, i, self.noise, spawn=self._alarm_s is None)
+            age = np.where(f.used, t - f.start_time, 0.0)
+            f.forget(age > np.where(f.start == 0, self.config.stated_s, self.config.longest_s))
+            if self._alarm_s is None and f.novel > self.config.novel_frames:
+                f.renew_field()
             self._test(t)
             if self._alarm_s is not None and t >= self._settles_s:
                 out += self._settle(t)

@@ -109,6 +109,13 @@ class DriftFilter:
             self._F[:, k * SIZE : (k + 1) * SIZE] = 0.0
             self.information[k], self.vector[k], self.squares[k], self.frames[k] = 0.0, 0.0, 0.0, 0
 
+    def forget(self, which: NDArray[np.bool_]) -> None:
+        """Drop hypotheses (k,)."""
+        for k in np.flatnonzero(which & self.used):
+            self.start[k], self.start_time[k] = -1, np.inf
+            self._F[:, k * SIZE : (k + 1) * SIZE] = 0.0
+            self.information[k], self.vector[k], self.squares[k], self.frames[k] = 0.0, 0.0, 0.0, 0
+
     def update(self, rows: Rows, i: int, noise: FrameNoise, *, spawn: bool = True) -> Array:
         """Take frame i of the rows; returns its innovation (5,). With ``spawn``, hypotheses are added as they are due."""
         t = float(rows.times[i])
