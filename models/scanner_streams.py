@@ -75,8 +75,7 @@ class ScannerStream:
 
     def arrivals(self, captures: Array, rng: np.random.Generator) -> Array:
         """Arrival times (n,) s of frames captured at ``captures`` (n,) s; no frame overtakes another one."""
-        times = np.array([t + self.delay(rng) for t in captures])
-        return np.asarray(np.maximum.accumulate(times) + 1e-6 * np.arange(len(times)))
+        return np.asarray(np.maximum.accumulate([t + self.delay(rng) for t in captures]))
 
     def device_time(self, capture_s: float, rng: np.random.Generator) -> float:
         """The device's stamp, s of its own clock, of a frame captured at ``capture_s`` of the robot's."""

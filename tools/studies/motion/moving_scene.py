@@ -8,7 +8,9 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 import open3d as o3d
 from pydrake.math import RigidTransform, RollPitchYaw
 
@@ -21,11 +23,17 @@ from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import ScannerPreset
 
+Pixels = npt.NDArray[np.intp]
+
 _SEGMENTS = 192  # of a turned body
 _THICK_M = 0.012
 _NODES = (
     5  # exact arm poses over the readout; rows between them are interpolated, which bends by less than 0.1 micrometre
 )
+_CELL, _AROUND = (
+    8,
+    7,
+)  # pixels of a coarse picture's cell, and cells about it in which a body may show: 24 pixels either way
 _DARK = {"charcoal": 0.7, "blue_grey": 0.0, "light_grey": 0.0}
 
 
@@ -50,9 +58,6 @@ class _Cast:
                 o3d.core.Tensor.from_numpy(body.mesh.triangles.astype(np.uint32)),
             )
         self.dark = np.array([*(b.dark for b in bodies), 0.0], dtype=np.float32)
-        corners = np.concatenate([b.mesh.vertices for b in bodies])
-        self.centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-        self.radius = float(np.linalg.norm(corners - self.centre, axis=1).max())
 
     def cast(self, origins: Array, directions: Array) -> tuple[Depth, Depth]:
         """Depth (h, w) of the first surface, infinite where there is none, and how dark it is."""
@@ -148,8 +153,10 @@ class MovingScene:
         stream, shape = self.stream, self._rays.shape[:2]
         offsets = stream.exposure_s * ((np.arange(n) + 0.5) / n - 0.5)
         dark = np.zeros(shape, dtype=np.float32)
-        layers = [self._instant(joints, X_BC, capture_s + dt, dark) for dt in offsets]
-        stack = np.stack(layers)
+        X_CB = X_BC.inverse()
+        middle = [X_CB @ X for X in link_frames(self.arm, joints(capture_s))]
+        seen = [self._pixels(body, middle) for body in self._moving]
+        stack = np.stack([self._instant(joints, X_CB, capture_s + dt, seen, dark) for dt in offsets])
         low, high = stack.min(axis=0), stack.max(axis=0)
         low = np.where(np.isfinite(low), low, 0.0)
         with np.errstate(invalid="ignore"):
@@ -162,60 +169,45 @@ class MovingScene:
         out[(out < self.scanner.near_m) | (out > self.scanner.far_m)] = 0.0
         return out, dark
 
-    def _instant(self, joints: Callable[[float], Array], X_BC: RigidTransform, t: float, dark: Depth) -> Depth:
+    def _pixels(self, body: _Cast, X_CL: list[RigidTransform]) -> Pixels:
+        """Indices (n,) of the pixels in which a body may show during a frame: where a coarse picture shows it, and around."""
+        assert body.link is not None
+        X = X_CL[body.link]
+        R, p = X.rotation().matrix(), X.translation()
+        coarse = body.cast(-R.T @ p, self._rays[_CELL // 2 :: _CELL, _CELL // 2 :: _CELL] @ R)[0]
+        near = cv2.dilate(np.isfinite(coarse).astype(np.uint8), np.ones((_AROUND, _AROUND), dtype=np.uint8))
+        fine = np.kron(near, np.ones((_CELL, _CELL), dtype=np.uint8))
+        height, width = self._rays.shape[:2]
+        down, right = max(height - fine.shape[0], 0), max(width - fine.shape[1], 0)
+        return np.flatnonzero(np.pad(fine, ((0, down), (0, right)), mode="edge")[:height, :width])
+
+    def _instant(
+        self, joints: Callable[[float], Array], X_CB: RigidTransform, t: float, seen: list[Pixels], dark: Depth
+    ) -> Depth:
         """Depth (H, W) with each row at its own time; ``dark`` takes the darkness of what the moving bodies show."""
-        height = self.scanner.height
+        height, width = self._rays.shape[:2]
         out = self._static(self._X_WC).copy()
         row_times = t + self.stream.readout_s * (np.arange(height) / max(height - 1, 1) - 0.5)
         nodes = np.linspace(row_times[0], row_times[-1], _NODES) if self.stream.readout_s > 0.0 else np.array([t])
-        R_CB, p_CB = X_BC.rotation().matrix().T, X_BC.inverse().translation()
         frames = [link_frames(self.arm, joints(float(time))) for time in nodes]
-        for body in self._moving:
+        for body, at in zip(self._moving, seen, strict=True):
+            if not len(at):
+                continue
             assert body.link is not None
-            poses = [f[body.link] for f in frames]
-            R = np.array([R_CB @ X.rotation().matrix() for X in poses])
-            p = np.array([R_CB @ X.translation() + p_CB for X in poses])
-            self._draw(body, R, p, nodes, row_times, out, dark)
+            poses = [(X_CB @ f[body.link]).GetAsMatrix34() for f in frames]
+            rays = self._rays.reshape(-1, 3)[at]
+            if len(nodes) > 1:
+                X = _between(np.array(poses), nodes, row_times)[at // width]
+                rays = np.einsum("nji,nj->ni", X[:, :, :3], rays)
+                origins = -np.einsum("nji,nj->ni", X[:, :, :3], X[:, :, 3])
+            else:
+                R, p = poses[0][:, :3], poses[0][:, 3]
+                rays, origins = rays @ R, -R.T @ p
+            depth, shade = body.cast(origins, rays)
+            nearer = depth < out.ravel()[at]
+            out.ravel()[at[nearer]] = depth[nearer]
+            dark.ravel()[at[nearer]] = shade[nearer]
         return out
-
-    def _draw(self, body: _Cast, R: Array, p: Array, nodes: Array, row_times: Array, out: Depth, dark: Depth) -> None:
-        """Draw a body with poses X_CL (n, 3, 3) and (n, 3) m at ``nodes`` s before what ``out`` shows."""
-        window = self._window(R[len(R) // 2] @ body.centre + p[len(p) // 2], body.radius)
-        if window is None:
-            return
-        rows, columns = window
-        if len(nodes) > 1:
-            times = row_times[rows]
-            k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, len(nodes) - 2)
-            w = ((times - nodes[k]) / (nodes[k + 1] - nodes[k]))[:, None]
-            R_rows = (1.0 - w[..., None]) * R[k] + w[..., None] * R[k + 1]
-            p_rows = (1.0 - w) * p[k] + w * p[k + 1]
-        else:
-            R_rows, p_rows = R[:1], p[:1]
-        # rays in the link's frame: from the camera, per metre of depth
-        rays = self._rays[rows, columns] @ R_rows if len(R_rows) > 1 else self._rays[rows, columns] @ R_rows[0]
-        origins = -np.einsum("rji,rj->ri", R_rows, p_rows)[:, None, :]
-        depth, shade = body.cast(origins, rays)
-        seen = out[rows, columns]
-        nearer = depth < seen
-        seen[nearer] = depth[nearer]
-        dark[rows, columns][nearer] = shade[nearer]
-
-    def _window(self, centre_C: Array, radius: float) -> tuple[slice, slice] | None:
-        """The rows and columns that may see a ball (3,) m of that radius, with some for the motion; None outside."""
-        s, z = self.scanner, float(centre_C[2])
-        if z < -radius:
-            return None
-        nearest = max(z - radius, 0.05)
-        reach_u, reach_v = 1.1 * radius * s.fx / nearest + 4.0, 1.1 * radius * s.fy / nearest + 4.0
-        if z - radius < 0.05:
-            return slice(0, s.height), slice(0, s.width)
-        u, v = s.fx * centre_C[0] / z + s.cx, s.fy * centre_C[1] / z + s.cy
-        rows = slice(max(int(v - reach_v), 0), min(int(v + reach_v) + 2, s.height))
-        columns = slice(max(int(u - reach_u), 0), min(int(u + reach_u) + 2, s.width))
-        if rows.stop <= rows.start or columns.stop <= columns.start:
-            return None
-        return rows, columns
 
     def _static(self, X_WC: RigidTransform) -> Depth:
         """Depth (H, W) of what stands still, rendered again where the camera has moved."""
@@ -227,6 +219,13 @@ class MovingScene:
             out = body.cast(X_WC.translation(), self._rays @ X_WC.rotation().matrix().T)[0]
         self._background = (pose, out)
         return out
+
+
+def _between(poses: Array, nodes: Array, times: Array) -> Array:
+    """Poses (h, 3, 4) at ``times`` (h,), linear between those (n, 3, 4) at ``nodes`` (n,)."""
+    k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, len(nodes) - 2)
+    w = ((times - nodes[k]) / (nodes[k + 1] - nodes[k]))[:, None, None]
+    return np.asarray((1.0 - w) * poses[k] + w * poses[k + 1])
 
 
 def _edge_pixels(samples: Depth, flying: float, rng: np.random.Generator) -> Depth:
