@@ -30,9 +30,9 @@ class DriftConfig:
 
     ``floor_m`` and ``floor_rad`` are sigmas per axis, at the pivot, of what no model here explains and no number of frames
     averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a change that is
-    as old as the first frame and is tested for ``stated_s``; older changes than ``longest_s`` are not. An alarm waits ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a
-    warm-up explains a slow change as well. After ``novel_frames`` frames at poses that the field's features do not reach, the field
-    is learnt anew.
+    as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not tested. An alarm waits
+    ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up explains a slow change as well.
+    After ``novel_frames`` frames at poses that the field's features do not reach, the field is learnt anew.
     """
 
     false_alarms_per_hour: float = 1e-3
@@ -95,7 +95,7 @@ class DriftTest:
         self._recent: list[Rows] = []
         self._waiting: list[Rows] = []
         self._alarm_s: float | None = None
-        self._best = 0.0
+        self.statistic = 0.0
         self._settles_s = np.inf
         self._last_s = 0.0
         self.events: list[DriftEvent] = []
@@ -199,11 +199,11 @@ class DriftTest:
     def _test(self, t: float) -> None:
         T, theta, _, _ = self._statistics(t)
         k = int(np.argmax(T))
-        self._best = float(T[k])
+        self.statistic = float(T[k])
         change = np.zeros(SIZE)
         change[_RIGID] = theta[k]
-        self.filter.favourite = (k, change) if self._best > _LIKELY else None
-        if self._alarm_s is None and self._best > self.threshold:
+        self.filter.favourite = (k, change) if self.statistic > _LIKELY else None
+        if self._alarm_s is None and self.statistic > self.threshold:
             self._alarm_s, self._settles_s = t, t + self.config.confirm_s
 
     def _settle(self, t: float, *, last: bool = False) -> list[DriftEvent]:

@@ -10,6 +10,7 @@ from weldcal.tools.cli import (
     benchmark_flange,
     calibrate,
     hand_eye,
+    monitor,
     motion,
     profiler,
     reproduce,
@@ -22,7 +23,7 @@ from weldcal.tools.cli import (
 
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
 COMMANDS = (
-    *(runs.demo, calibrate.calibrate, verify.verify, runs.weld, view.view),
+    *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, runs.weld, view.view),
     *(robots.robots, robots.emulate_ur, robots.check_robot),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
