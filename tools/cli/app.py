@@ -28,6 +28,7 @@ COMMANDS = (
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
     *reproduce.COMMANDS,
+    *monitor.COMMANDS,
     *motion.COMMANDS,
     *(tablet.serve, tablet.calibrate, runs.tablet_demo),
     *(hand_eye.ax_xb, hand_eye.ax_yb, hand_eye.axb_ycz, runs.hand_eye_live),

@@ -53,3 +53,29 @@ def monitor(
         for e, d in zip(report.moves, summary["drift"], strict=True)
     }
     return Outcome(summary, values=values, rows=rows)
+
+
+@command("benchmark drift")
+def benchmark_drift(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
+    creeps: Annotated[int, option("--creeps", "N", "Recordings with a creep.", min=1)] = 8,
+    hours: Annotated[float, option("--hours", "H", "Simulated hours in which nothing happens.", min=0.01)] = 10.0,
+    stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
+    quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
+) -> Outcome:
+    """Measure the drift test: how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
+    from weldcal.models.errors import InputError
+    from weldcal.tools.studies.motion.drift import Size, run_drift_study
+    from weldcal.tools.studies.targets import print_targets
+
+    if stamps not in ("device", "arrival"):
+        raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
+    size = Size(2, 1, 0.01) if quick else Size(runs, creeps, hours)
+    result, targets = run_drift_study(
+        call.folder("benchmark", "drift"), size, stamps=stamps, seed=call.seed, progress=call.progress
+    )
+    return Outcome(result, text=lambda: print_targets("Drift", targets))
+
+
+COMMANDS = (benchmark_drift,)

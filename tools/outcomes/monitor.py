@@ -62,7 +62,9 @@ class MonitorReport:
             "recalibrated": None if self.recalibrated is None else str(self.out / "recalibrated"),
             "warm_up": [{"time_s": e.time_s, "found_s": e.found_s, "scale": e.scale} for e in warm],
             "warnings": list(self.warnings),
-            "dropped_for": [{"reason": r, "frames": n} for r, n in Counter(_kind(r) for _, r in w.dropped).most_common()],
+            "dropped_for": [
+                {"reason": r, "frames": n} for r, n in Counter(_kind(r) for _, r in w.dropped).most_common()
+            ],
             "gross": [id for id, g in zip(w.ids, w.gross, strict=True) if g],
             "rms_before_synchronisation_mm": _rms_mm(w.before),
             "rms_after_drift_mm": 1e3 * w.rms_after_m,
