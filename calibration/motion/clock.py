@@ -1,13 +1,13 @@
-"""Chooses the clock that orders the frames in time, and holds what is estimated of it."""
+"""Chooses the clock that orders the frames in time: the device's own where it runs evenly, else the arrivals."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.calibration.data.scanner_clock import ARRIVAL, DEVICE
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arrays import Array
 
-ARRIVAL, DEVICE = "arrival", "device"
 _MOST_LACKING = 0.2  # of the frames may have no device time; those are left out then
 _APART_S = 1.0  # a device time that deviates so far from the arrivals' straight line is of a clock that was reset
 _MOST_DRIFT = 1e-2
@@ -29,27 +29,6 @@ class FrameClock:
     def nominal(self, offset: float, drift: float = 0.0) -> Array:
         """Nominal capture times (N,) s on the robot's clock."""
         return np.asarray(self.base + self.sign * offset + drift * (self.base - self.reference))
-
-
-@dataclass(frozen=True)
-class ClockEstimate:
-    """What was found of the clock. ``kind``: arrival (capture = arrival - offset) or device (capture = device + offset +
-    drift (device - reference)); ``offset_s`` and ``sigma_s``: mean offset and one standard deviation, None where the motion does not
-    show it; ``drift`` s/s with ``drift_sigma`` (None for arrivals); ``reference_s``: the clock's time that the offset of a device
-    holds for; ``jitter_s``: standard deviation of single frames about it; ``rolling_s``: how much later an image row is exposed per
-    unit of y/z, None where the data do not show it; ``late``: ids of frames left out of the offset as grossly late or early."""
-
-    kind: str
-    offset_s: float | None
-    sigma_s: float | None
-    jitter_s: float | None
-    reference_s: float
-    drift: float | None = None
-    drift_sigma: float | None = None
-    rolling_s: float | None = None
-    rolling_sigma_s: float | None = None
-    late: tuple[str, ...] = ()
-    reason: str = ""
 
 
 def arrival_clock(frames: ObservedFrames, reason: str = "The frames have no device times.") -> FrameClock:

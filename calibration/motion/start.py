@@ -31,21 +31,28 @@ class Start:
 
 
 def search_start(
-    frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion, X_FR: RigidTransform | None = None
+    frames: ObservedFrames,
+    clock: FrameClock,
+    motion: ContinuousMotion,
+    X_FR: RigidTransform | None = None,
+    *,
+    delays: Array | None = None,
 ) -> Start | None:
-    """The delay, searched from EARLIEST_S to LATEST_S, with the least error of a rigid fit; None where no delay puts enough frames
+    """The delay, searched from EARLIEST_S to LATEST_S (or only those given, s), with the least error of a rigid fit; None where no delay puts enough frames
     within the stream. Centres and normals are used together, so that a motion along a line is enough for a start."""
     usable = np.flatnonzero(np.isfinite(clock.base))
     if len(usable) < 3:
         return None
     chosen = usable[np.unique(np.linspace(0, len(usable) - 1, min(len(usable), _MOST_FRAMES)).astype(int))]
     part, base = frames.pick(chosen), clock.base[chosen]
-    delays = np.arange(EARLIEST_S, LATEST_S + 0.5 * _STEP_S, _STEP_S)
+    given = delays is not None
+    if delays is None:
+        delays = np.arange(EARLIEST_S, LATEST_S + 0.5 * _STEP_S, _STEP_S)
     cost, _, _ = _costs(part, base, delays, motion, X_FR)
     if not np.isfinite(cost).any():
         return None
     best = float(delays[np.nanargmin(cost)])
-    fine = best + np.arange(-_STEP_S, _STEP_S + 0.5 * _FINE_S, _FINE_S)
+    fine = np.array([best]) if given else best + np.arange(-_STEP_S, _STEP_S + 0.5 * _FINE_S, _FINE_S)
     fine_cost, R, p = _costs(part, base, fine, motion, X_FR)
     k = int(np.nanargmin(fine_cost)) if np.isfinite(fine_cost).any() else 0
     order = np.argsort(np.concatenate([delays, fine]), kind="stable")
