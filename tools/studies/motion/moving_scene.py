@@ -18,6 +18,7 @@ from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.arrays import Array
 from weldcal.models.depth_noise import Depth, noisy_depth
+from weldcal.models.exposure import mixed_exposure
 from weldcal.models.flanges import FlangeStandard, flange_mesh
 from weldcal.models.mesh import TriMesh, merge, revolve
 from weldcal.models.scanner_streams import ScannerStream
@@ -157,15 +158,8 @@ class MovingScene:
         middle = [X_CB @ X for X in link_frames(self.arm, joints(capture_s))]
         seen = [self._pixels(body, middle) for body in self._moving]
         stack = np.stack([self._instant(joints, X_CB, capture_s + dt, seen, dark) for dt in offsets])
-        low, high = stack.min(axis=0), stack.max(axis=0)
-        low = np.where(np.isfinite(low), low, 0.0)
-        with np.errstate(invalid="ignore"):
-            edge = (high - low > self.scanner.noise.edge_step_m) & (low > 0.0)
-            mean = stack.mean(axis=0)
-        out = np.where(np.isfinite(mean) & ~edge, mean, 0.0).astype(np.float32)
-        at = np.flatnonzero(edge)
-        if len(at):
-            out.ravel()[at] = _edge_pixels(stack.reshape(n, -1)[:, at], self.scanner.noise.flying, rng)
+        noise = self.scanner.noise
+        out = mixed_exposure(stack, noise.edge_step_m, noise.flying, rng)
         out[(out < self.scanner.near_m) | (out > self.scanner.far_m)] = 0.0
         return out, dark
 
@@ -226,13 +220,3 @@ def _between(poses: Array, nodes: Array, times: Array) -> Array:
     k = np.clip(np.searchsorted(nodes, times, side="right") - 1, 0, len(nodes) - 2)
     w = ((times - nodes[k]) / (nodes[k + 1] - nodes[k]))[:, None, None]
     return np.asarray((1.0 - w) * poses[k] + w * poses[k + 1])
-
-
-def _edge_pixels(samples: Depth, flying: float, rng: np.random.Generator) -> Depth:
-    """Depths (k,) of pixels whose samples (n, k) saw two surfaces: one of them, by its share, or with chance ``flying`` a mix."""
-    n, k = samples.shape
-    one = samples[rng.integers(n, size=k), np.arange(k)]
-    seen = np.isfinite(samples)
-    mean = np.where(seen, samples, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-    out = np.where(rng.random(k) < flying, mean, one)
-    return np.asarray(np.where(np.isfinite(out), out, 0.0), dtype=np.float32)
