@@ -112,6 +112,8 @@ def _structured_light(sigma_m: float, optimum_m: float, correlation_px: float, f
     )
 
 
+_STREAMED = _structured_light(5.0e-4, 0.650, 1.2, 0.15)
+
 SCANNERS: dict[str, ScannerPreset] = {
     preset.name: preset
     for preset in (
@@ -123,6 +125,9 @@ SCANNERS: dict[str, ScannerPreset] = {
         _by_area(
             "motioncam_3d_motion", 1120, 800, 0.497, 0.650, 0.939, 0.590, _structured_light(2.5e-4, 0.650, 1.2, 0.15)
         ),
+        # streaming: the largest image of the second paper (section 2.3), and the same view with half a million pixels; 0.5 mm
+        _by_area("motioncam_3d_stream", 1068, 800, 0.497, 0.650, 0.939, 0.590, _STREAMED),
+        _by_area("motioncam_3d_stream_half", 816, 612, 0.497, 0.650, 0.939, 0.590, _STREAMED),
         ScannerPreset(
             "azure_kinect",
             640,

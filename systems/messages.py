@@ -35,6 +35,22 @@ class Scan(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class StreamedScan(Scan):
+    """A frame of a streaming scanner. When it was captured is not known; `arrival_time` s is on the arm's clock, `device_time` s on
+    the device's own (None: it has none)."""
+
+    arrival_time: float = -np.inf
+    device_time: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ScanStream(Message):
+    """The newest frames that have arrived, oldest first."""
+
+    frames: tuple[StreamedScan, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Image(Message):
     """One frame of the finger camera: grey (H, W) uint8.
 
@@ -110,6 +126,10 @@ class FlangeEstimate(Message):
     fit: FlangeFit | None = None
     points_C: NDArray[np.float64] | None = None  # face points around the fit, for verification and the viewer
     reason: str | None = None  # why there is no fit
+    # of a streamed scan, whose capture_time is what was believed when it was fitted
+    arrival_time: float = -np.inf
+    device_time: float | None = None
+    center_expected_C: NDArray[np.float64] | None = None  # (3,) m
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ class ScannerGuess:
 
 @dataclass
 class DatasetHeader:
-    """Contents of dataset.yaml."""
+    """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves)."""
 
     schema: int = 0
     robot: str = ""
@@ -44,3 +44,4 @@ class DatasetHeader:
     note: str = ""
     feature_in_flange: Feature = field(default_factory=Feature)
     scanner_guess: ScannerGuess | None = None
+    mode: str = "static"

@@ -13,6 +13,7 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.data.scanner_clock import ScannerClock, clock_from_document
 from weldcal.calibration.data.scanner_correction import TERMS, correction_from_document
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
@@ -52,6 +53,8 @@ class IcpRecord:
 class CalibrationResult:
     """Contents of calibration.yaml. ``covariance`` (6, 6): [rotation; translation] on the base side about the camera
     origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one;
+    ``clock`` of the scanner and ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as
+    they were estimated, where the calibration was made in motion;
     ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans."""
 
     X_BC: RigidTransform
@@ -73,6 +76,8 @@ class CalibrationResult:
     joint_covariance: Array | None = None
     axis_turn_deg: tuple[float, float] | None = None
     software: str = ""
+    clock: ScannerClock | None = None
+    clock_covariance: Array | None = None
 
 
 def software_version() -> str:
@@ -129,6 +134,13 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         else {
             "order": "as covariance, then the scanner correction's factors: scale, gradient_per_m, bend_per_m2, bend_per_m3",
             "matrix": [[float(v) for v in row] for row in result.joint_covariance],
+        },
+        "clock": None if result.clock is None else result.clock.document(),
+        "clock_covariance": None
+        if result.clock_covariance is None
+        else {
+            "order": "as covariance, then offset (s), drift (s/s) and rolling time (s), as far as the clock has them",
+            "matrix": [[float(v) for v in row] for row in result.clock_covariance],
         },
         "axis_turn_deg": None if result.axis_turn_deg is None else list(result.axis_turn_deg),
         "held_out_mm": {k: v if np.isfinite(v) else None for k, v in result.held_out_mm.items()},
@@ -195,6 +207,10 @@ def load_result(path: Path) -> CalibrationResult:
         joint_covariance=joint,
         axis_turn_deg=None if turn is None else (float(turn[0]), float(turn[1])),
         software=d.text("software"),
+        clock=clock_from_document(d.values.get("clock"), path.name),
+        clock_covariance=_covariance(d, "clock_covariance", len(d.section("clock_covariance").items("matrix")))
+        if d.has("clock_covariance")
+        else None,
     )
 
 

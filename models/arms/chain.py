@@ -72,6 +72,18 @@ def chain_forward(chain: Chain, q: ArrayLike) -> RigidTransform:
     return RigidTransform(RotationMatrix(X[:3, :3]), X[:3, 3])
 
 
+def chain_poses(chain: Chain, q: Array) -> Array:
+    """Flange poses X_BF (N, 4, 4) at joint angles (N, n) rad."""
+    c, s = np.cos(q), np.sin(q)
+    X = np.broadcast_to(np.eye(4), (len(q), 4, 4))
+    for i, joint in enumerate(chain.stack):
+        turned = np.broadcast_to(joint, (len(q), 4, 4)).copy()
+        turned[:, :, 0] = joint[:, 0] * c[:, i, None] + joint[:, 1] * s[:, i, None]
+        turned[:, :, 1] = joint[:, 1] * c[:, i, None] - joint[:, 0] * s[:, i, None]
+        X = X @ turned
+    return np.asarray(X @ chain.X_LF)
+
+
 def chain_jacobian(chain: Chain, q: ArrayLike) -> Array:
     """Geometric Jacobian (6, n) of the flange: [omega_BF; v_BF] = J qdot, in axes of B (Siciliano et al., 2009, Eq. 3.30)."""
     X = _frames(chain, np.asarray(q, dtype=float))

@@ -77,6 +77,10 @@ class FlangeMover(LeafSystem):
         self.DeclareVectorOutputPort("settled_goal", 1, self._settled_out, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
+    def limit(self, speed: float) -> None:
+        """Lower the speed (rad/s) of the fastest joint, before the run."""
+        self._speed = min(self._speed, speed)
+
     def _update(self, context: Context, state: State) -> None:
         job: JobCommand = self._job.Eval(context)
         move: _Move = context.get_abstract_state(self._move).get_value()

@@ -12,7 +12,10 @@ from weldcal.tools.cli.runs import run_options
 @command("calibrate", options=MOTION, short_help="Calibrate a scanner from a folder of scans, or live in a scenario.")
 def calibrate(
     call: Call,
-    dataset: Annotated[Path | None, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/.")] = None,
+    dataset: Annotated[
+        Path | None,
+        typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/; in motion stream.csv, frames.csv."),
+    ] = None,
     scenario: Annotated[str | None, option("--scenario", "NAME", "Calibrate live in this scenario instead.")] = None,
     robot: Annotated[
         str | None,
@@ -44,6 +47,20 @@ def calibrate(
     from weldcal.tools.outcomes.poses import pose_rows
 
     if dataset is not None and scenario is None:
+        from weldcal.calibration.data.motion_dataset import is_motion
+
+        if is_motion(dataset):
+            if poses is not None or axis_turn is not None:
+                raise typer.BadParameter(
+                    "--poses and --axis-turn are for scans at rest; omit them with a recording in motion"
+                )
+            from weldcal.tools.commands.calibrate_motion import calibrate_motion
+
+            folder = call.folder("calibrate", dataset.resolve().name)
+            moving = calibrate_motion(
+                dataset, folder, robot=robot, flange=flange, seed=call.seed, progress=call.progress, centres=centres
+            )
+            return Outcome(moving.summary(), rows=pose_rows(moving.result.X_BC))
         from weldcal.tools.commands.calibrate import calibrate_dataset
 
         report = calibrate_dataset(

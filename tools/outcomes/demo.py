@@ -56,6 +56,9 @@ class DemoResult:
         found["robot"] = self.robot
         if self.run.reason:
             found["reason"] = self.run.reason
+        sequencer = self.run.cell.job.sequencer
+        if warnings := sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings:
+            found["warnings"] = list(warnings)
         if self.calibration is not None:
             found["X_BC_error_mm"] = 1e3 * self.calibration.translation_m
             found["X_BC_error_deg"] = float(np.degrees(self.calibration.rotation_rad))

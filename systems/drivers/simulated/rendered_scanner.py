@@ -189,11 +189,17 @@ class TrueScanner(Message):
     device: ScannerPreset
 
 
-def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
-    """Mount a depth camera at the scanner's true pose (exported by `cheat.*` only) and add the scanner's errors.
+@dc.dataclass(frozen=True, eq=False)
+class MountedScanner:
+    """A scanner at its true pose ``X_LC`` in its carrier's frame, its device's errors, and what renders its pictures."""
 
-    Returns the true pose of the scanner in its carrier's frame: X_BC, X_FC or X_LC.
-    """
+    X_LC: RigidTransform
+    device: ScannerPreset
+    sensor: RgbdSensor
+
+
+def mount_scanner(config: RenderedScanner, build: StationBuild) -> MountedScanner:
+    """Add a depth camera at the scanner's true pose, which is drawn from the station's random numbers."""
     world = build.require(SimulatedWorld)
     nominal = RigidTransform(RollPitchYaw(np.deg2rad(config.rpy_deg)), config.xyz_m)
     error = random_pose_error(
@@ -216,12 +222,21 @@ def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTran
     parent = view.scene_graph.world_frame_id() if carrier is None else view.frames[carrier.index()]
     sensor = build.builder.AddSystem(RgbdSensor(parent, X_BC, colour, camera))
     sensor.set_name("scanner_depth")
-    scanner = build.builder.AddSystem(DepthSensor(preset, int(build.rng.integers(2**31)), config.exposure_s))
-    scanner.set_name("scanner")
     build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())
-    build.builder.Connect(sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))
-    build.builder.Connect(sensor.color_image_output_port(), scanner.GetInputPort("color_image"))
+    build.parts = (*build.parts, TrueScanner(preset))
+    return MountedScanner(X_BC, preset, sensor)
+
+
+def ApplyDriverConfig(config: RenderedScanner, build: StationBuild) -> RigidTransform:
+    """Mount a depth camera at the scanner's true pose (exported by `cheat.*` only) and add the scanner's errors.
+
+    Returns the true pose of the scanner in its carrier's frame: X_BC, X_FC or X_LC.
+    """
+    mounted = mount_scanner(config, build)
+    scanner = build.builder.AddSystem(DepthSensor(mounted.device, int(build.rng.integers(2**31)), config.exposure_s))
+    scanner.set_name("scanner")
+    build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), scanner.GetInputPort("depth_image"))
+    build.builder.Connect(mounted.sensor.color_image_output_port(), scanner.GetInputPort("color_image"))
     build.inputs["scanner.trigger"] = scanner.GetInputPort("trigger")
     build.outputs["scanner.scan"] = scanner.GetOutputPort("scan")
-    build.parts = (*build.parts, TrueScanner(preset))
-    return X_BC
+    return mounted.X_LC

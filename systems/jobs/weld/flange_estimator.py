@@ -14,9 +14,11 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
-from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, Scan, StreamedScan
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
+_CLOCKS_APART_S = 0.2  # a device's time that is further from the arrival's has jumped
+_NEAR_M = 0.03  # of a frame's flange from its prediction by the frame before
 # The poses are planned with the whole feature visible; otherwise an object occludes it and the rim's ends are wrong.
 LIVE_FIT = FlangeFitConfig(min_coverage=0.85)
 
@@ -35,8 +37,10 @@ class FlangeEstimator(BackgroundSystem):
         output_ports:
         - flange_estimate
 
-    The search sphere is centred at the feature's position predicted from the newest X_BC (at first the nominal one) and the
-    arm's pose at the capture time. The fit runs beside the control loop.
+    It takes the scan that the job ordered, and every frame of a streaming scanner. The search sphere is centred at the feature's
+    position predicted from the newest X_BC (at first the nominal one) and the arm's pose at the capture time. A streamed
+    frame's capture time is taken from its stamp and `delay_s`, the nominal time from
+    capture to arrival; the prediction is corrected by what the frame before it showed. The fit runs beside the control loop.
     """
 
     def __init__(
@@ -48,11 +52,12 @@ class FlangeEstimator(BackgroundSystem):
         guess_radius_m: float,
         background: Background | None = None,
         period_s: float = 0.02,
+        delay_s: float = 0.0,
     ) -> None:
         super().__init__("flange_estimate", FlangeEstimate(), background, period_s)
         self.background.prepare(warm_up)
         self._arm, self._X_FR, self._standard = arm, X_FR, standard
-        self._X_BC_guess, self._guess_radius_m = X_BC_guess, guess_radius_m
+        self._X_BC_guess, self._guess_radius_m, self._delay_s = X_BC_guess, guess_radius_m, delay_s
         self._scan = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
@@ -61,6 +66,8 @@ class FlangeEstimator(BackgroundSystem):
     def ask(self, context: Context, newest: FlangeEstimate) -> Answer[FlangeEstimate] | None:
         """Ask for the estimate of a new calibration scan."""
         scan: Scan = self._scan.Eval(context)
+        if isinstance(scan, StreamedScan):
+            return self._ask_streamed(context, scan, newest)
         job: JobCommand = self._job.Eval(context)
         if scan.sequence <= newest.sequence or scan.sequence != job.scan_sequence or job.scan_purpose == "workpiece":
             return None
@@ -70,6 +77,60 @@ class FlangeEstimator(BackgroundSystem):
         return self.background.ask(
             estimate_flange, scan, job, X_BF, self._X_FR, self._standard, X_BC, self._guess_radius_m
         )
+
+    def _ask_streamed(
+        self, context: Context, scan: StreamedScan, newest: FlangeEstimate
+    ) -> Answer[FlangeEstimate] | None:
+        """Ask for the estimate of a streamed frame."""
+        if scan.sequence <= newest.sequence:
+            return None
+        capture = believed_capture(scan, newest, self._delay_s)
+        X_BF = self._history.Eval(context).pose_at(self._arm, capture)
+        status: CalibrationStatus = self._status.Eval(context)
+        X_BC = status.X_BC or self._X_BC_guess
+        return self.background.ask(
+            estimate_streamed, scan, capture, newest, X_BF, self._X_FR, self._standard, X_BC, self._guess_radius_m
+        )
+
+
+def believed_capture(scan: StreamedScan, newest: FlangeEstimate, delay_s: float) -> float:
+    """When a frame was captured, s: by the device's time since the frame before where both have one, else by its arrival."""
+    by_arrival = scan.arrival_time - delay_s
+    if scan.device_time is None or newest.device_time is None:
+        return by_arrival
+    by_device = newest.capture_time + scan.device_time - newest.device_time
+    # frames are late and never early: the earliest arrival says most
+    return min(by_device, by_arrival) if abs(by_device - by_arrival) < _CLOCKS_APART_S else by_arrival
+
+
+def estimate_streamed(
+    scan: StreamedScan,
+    capture_time: float,
+    before: FlangeEstimate,
+    X_BF: RigidTransform | None,
+    X_FR: RigidTransform,
+    standard: FlangeStandard,
+    X_BC: RigidTransform,
+    guess_radius_m: float,
+) -> FlangeEstimate:
+    """Fit the feature in a streamed frame, near where the robot and the frame before say; without a fit, the reason is given."""
+    base = FlangeEstimate(
+        scan.sequence, capture_time, "stream", arrival_time=scan.arrival_time, device_time=scan.device_time
+    )
+    if X_BF is None:
+        return dc.replace(base, reason="the arm's pose at the time of the frame is not known")
+    X_CR = X_BC.InvertAndCompose(X_BF @ X_FR)
+    expected, normal, radius = X_CR.translation(), X_CR.rotation().matrix()[:, 2], guess_radius_m
+    base = dc.replace(base, center_expected_C=expected)
+    if before.fit is not None and before.center_expected_C is not None:
+        expected = expected + before.fit.center_C - before.center_expected_C
+        radius = min(radius, _NEAR_M)
+    guess = FlangeGuess(expected, radius + 0.5 * standard.outer_m, normal)
+    points = scan.points_C.astype(float)
+    try:
+        return dc.replace(base, fit=fit_flange(points, standard, guess=guess, config=LIVE_FIT))
+    except FlangeNotFound as error:
+        return dc.replace(base, reason=str(error))
 
 
 def estimate_flange(

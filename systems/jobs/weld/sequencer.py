@@ -12,6 +12,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, Message, PlannedSeam, UrStatus
+from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.systems.motion.goals import stands_at
 
 
@@ -47,21 +48,23 @@ class Seen(Message):
     servo: ServoReport
     hold_requested: bool = False
     arm_stopped: bool = False
+    drift: DriftStatus = dc.field(default_factory=DriftStatus)
 
 
 @dc.dataclass(frozen=True, eq=False)
 class JobState(Message):
-    """The present command, the start time of its phase, the next phase and the log of all phases."""
+    """The present command, the start time of its phase, the log of all phases, and warnings: sentences that hold nothing."""
 
     command: JobCommand = dc.field(default_factory=JobCommand)
     since: float = 0.0
     settled_since: float | None = None
     log: tuple[tuple[float, str], ...] = ((0.0, "start"),)
+    warnings: tuple[str, ...] = ()
 
 
 def _enter(state: JobState, seen: Seen, phase: str, **changes: Any) -> JobState:
     command = dc.replace(state.command, phase=phase, **changes)
-    return JobState(command, seen.time, None, (*state.log, (seen.time, phase)))
+    return JobState(command, seen.time, None, (*state.log, (seen.time, phase)), state.warnings)
 
 
 def _move(state: JobState, seen: Seen, phase: str, q_goal: NDArray[np.float64]) -> JobState:
@@ -264,6 +267,10 @@ PHASES: dict[str, Callable[[JobState, Seen, JobPlan], JobState]] = {
 }
 
 
+WELDED = ("weld", "retract", "home")
+"""Phases in which a scanner that has moved is a warning: nothing that follows depends on its pose."""
+
+
 def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     """Compute the state after one tick; `held` and `done` are final."""
     if state.command.finished:
@@ -278,7 +285,17 @@ def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
             seen,
             f"The job took longer than its {plan.maximum_time_s:.0f} s, in the phase '{state.command.phase}'.",
         )
+    if seen.drift.moved:
+        if state.command.phase not in WELDED:
+            return hold(state, seen, seen.drift.summary)
+        state = _warned(state, seen.drift)
     return PHASES[state.command.phase](state, seen, plan)
+
+
+def _warned(state: JobState, drift: DriftStatus) -> JobState:
+    """The state with the drift among its warnings: once as an alarm, once measured. A seam is finished: the tip feels it."""
+    known = drift.summary
+    return state if not known or known in state.warnings else dc.replace(state, warnings=(*state.warnings, known))
 
 
 class JobSequencer(LeafSystem):
@@ -297,13 +314,15 @@ class JobSequencer(LeafSystem):
         - servo_report
         - hold
         - arm_stopped
+        - drift
         output_ports:
         - job
         - job_state
         - scan_trigger
         - streaming
 
-    `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is 1 after the guard stopped a weld.
+    `drift` (may stay open) carries the DriftMonitor's status: a scanner that has moved holds the job before the weld and is a
+    warning from then on. `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is 1 after the guard stopped a weld.
     `job` carries the `JobCommand`, `job_state` the whole
     `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station.
     """
@@ -320,6 +339,7 @@ class JobSequencer(LeafSystem):
         self._servo = self.DeclareAbstractInputPort("servo_report", AbstractValue.Make(ServoReport()))
         self._hold = self.DeclareVectorInputPort("hold", 1)
         self._arm_stopped = self.DeclareVectorInputPort("arm_stopped", 1)
+        self._drift = self.DeclareAbstractInputPort("drift", AbstractValue.Make(DriftStatus()))
         self._state = self.DeclareAbstractState(AbstractValue.Make(JobState()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("job", lambda: AbstractValue.Make(JobCommand()), self._job_out, ticket)
@@ -345,6 +365,7 @@ class JobSequencer(LeafSystem):
             servo=self._servo.Eval(context),
             hold_requested=bool(self._hold.Eval(context)[0] > 0.5),
             arm_stopped=bool(self._arm_stopped.Eval(context)[0] > 0.5),
+            drift=self._drift.Eval(context) if self._drift.HasValue(context) else DriftStatus(),
         )
         old = self.job_state(context)
         new = next_job_state(old, seen, self._plan)

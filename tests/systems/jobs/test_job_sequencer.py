@@ -19,6 +19,7 @@ from weldcal.systems.jobs.weld.job import SHARES
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobPlan, JobSequencer, JobState, Seen, next_job_state
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, UrStatus, VerificationResult
+from weldcal.systems.motion.drift_monitor import DriftStatus
 from weldcal.welding.seam.curve import SeamCurve
 
 PLAN = JobPlan(
@@ -343,3 +344,20 @@ def test_the_progress_told_of_a_run_never_falls_from_phase_to_phase() -> None:
         "scan_verification_cloud",
         "scan_pose",
     }, "these and move_to_pose are told by the number of scans"
+
+
+def test_a_scanner_that_moved_holds_the_job_before_the_weld_and_warns_during_it() -> None:
+    moved = DriftStatus(alarmed=True)
+    world = World()
+    world.look(drift=moved)
+    assert world.phase == "held"
+    assert world.state.command.reason == moved.summary
+    welding = JobState(JobCommand(phase="weld", mode="weld", process_on=True))
+    world = World(state=welding)
+    world.look(drift=moved)
+    assert world.phase == "weld"
+    assert world.state.warnings == (moved.summary,)
+    world.look(drift=moved)
+    assert world.state.warnings == (moved.summary,)
+    world.look(drift=DriftStatus())
+    assert world.state.warnings == (moved.summary,)

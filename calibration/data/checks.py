@@ -1,0 +1,168 @@
+"""Reads dataset.yaml and checks the tables of a dataset: rows, numbers, quaternions, units, clouds that repeat."""
+
+from pathlib import Path
+
+import numpy as np
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.yaml import yaml_load_typed
+from pydrake.math import RotationMatrix
+
+from weldcal.calibration.data.clouds import CloudError, read_cloud
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.tables import read_rows
+from weldcal.calibration.errors import DatasetError
+from weldcal.models.arrays import Array
+from weldcal.models.documents import parse_document
+from weldcal.models.errors import InputError
+from weldcal.models.files import read_text, sha256
+from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
+
+UNITS = {"m": 1.0, "mm": 1e-3}
+CONFIGURATIONS = ("eye_on_base",)
+MODES = ("static", "motion")
+_SAMPLE = 10_000  # points whose distance is enough to tell metres from millimetres
+# Median distances that a flange has from its base, and a scanned point from its camera. The bounds are a factor of 1000 apart, so
+# that metres called millimetres, or the reverse, always fall outside.
+REACH_M = (0.01, 10.0)
+
+
+def read_header(path: Path) -> DatasetHeader:
+    """Contents of a dataset.yaml, checked. Raises DatasetError, one sentence that names the key."""
+    if not path.exists():
+        raise DatasetError(
+            f"'{path.parent.name}' has no dataset.yaml; add one with schema, robot, flange, scanner, configuration "
+            "and units."
+        )
+    try:
+        text = read_text(path, LARGEST_DOCUMENT)
+        parse_document(path.name, text)  # within bounds, no key twice
+        header: DatasetHeader = yaml_load_typed(schema=DatasetHeader, data=text, defaults=DatasetHeader())
+    except InputError as e:
+        raise DatasetError(str(e)) from e
+    except Exception as e:
+        # pydrake raises whatever its YAML reader meets; the first line names the key
+        raise DatasetError(f"'{path.name}' cannot be read as a dataset description: {str(e).splitlines()[0]}") from e
+    if header.schema != 1:
+        raise DatasetError(f"'{path.name}' says schema {header.schema}; this software reads schema 1.")
+    for name, unit in (("clouds", header.units.clouds), ("poses", header.units.poses)):
+        if unit not in UNITS:
+            raise DatasetError(f"'{path.name}' gives the unit '{unit}' for {name}; write m or mm.")
+    if header.mode not in MODES:
+        raise DatasetError(f"'{path.name}' gives the mode '{header.mode}'; write {' or '.join(MODES)}.")
+    if header.configuration not in CONFIGURATIONS:
+        raise DatasetError(
+            f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles "
+            f"{', '.join(CONFIGURATIONS)}."
+        )
+    _check_poses(header, path)
+    return header
+
+
+def metric_cloud(path: Path, unit: str) -> Array:
+    """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
+    points = read_cloud(path)
+    points *= UNITS[unit]
+    seen = points[np.isfinite(points[..., 2])]
+    distance = float(np.median(np.linalg.norm(seen[:: 1 + len(seen) // _SAMPLE], axis=1)))
+    if not REACH_M[0] <= distance <= REACH_M[1]:
+        other = "mm" if unit == "m" else "m"
+        raise CloudError(
+            f"The points of {path.name} lie {distance:.3g} m from the camera, as {unit}: they look like {other}; correct "
+            "units in dataset.yaml."
+        )
+    return points
+
+
+def _check_poses(header: DatasetHeader, path: Path) -> None:
+    """The lists of the header's poses: their lengths, finite numbers, metres, unit quaternions."""
+    guess = header.scanner_guess
+    for key, found in (("feature_in_flange", header.feature_in_flange), ("scanner_guess", guess)):
+        if found is None:
+            continue
+        for name, values, n in ((f"{key}.xyz", found.xyz, 3), (f"{key}.wxyz", found.wxyz, 4)):
+            if len(values) != n:
+                raise DatasetError(f"'{path.name}': {name} must hold {n} numbers, not {len(values)}.")
+            if not np.isfinite(values).all():
+                raise DatasetError(f"'{path.name}': {name} holds a number that is not finite.")
+        if float(np.abs(found.xyz).max()) > REACH_M[1]:
+            raise DatasetError(
+                f"'{path.name}': {key}.xyz must be in metres; {REACH_M[1]:g} m or more is no place of a scanner."
+            )
+        unit_quaternion(found.wxyz, key)
+    if guess is not None and not 0.0 < guess.radius_m <= REACH_M[1]:
+        raise DatasetError(
+            f"'{path.name}': scanner_guess.radius_m must be a positive number of metres up to {REACH_M[1]:g}, not {guess.radius_m:g}."
+        )
+
+
+def table_rows(path: Path, required: tuple[str, ...]) -> list[dict[str, str]]:
+    """Rows of a table with the column `id`, each id a plain name that occurs once. Raises DatasetError."""
+    try:
+        names, rows = read_rows(path)
+    except InputError as e:
+        raise DatasetError(str(e)) from e
+    missing = [c for c in required if c not in names]
+    if missing:
+        raise DatasetError(
+            f"'{path.name}' lacks the column{'s' if len(missing) > 1 else ''} {', '.join(missing)}; the header is "
+            f"{','.join(required)}."
+        )
+    if not rows:
+        raise DatasetError(f"'{path.name}' holds no poses below its header.")
+    seen: set[str] = set()
+    for row in rows:
+        if not row["id"] or Path(row["id"]).name != row["id"]:
+            raise DatasetError(f"'{path.name}' has a row whose id '{row['id'][:40]}' is empty or not a plain name.")
+        if row["id"] in seen:
+            raise DatasetError(f"'{path.name}' gives the id '{row['id']}' twice; keep one row for each scan.")
+        seen.add(row["id"])
+    return rows
+
+
+def row_numbers(row: dict[str, str], columns: tuple[str, ...], path: Path) -> list[float]:
+    """Finite numbers in these columns of one row. Raises DatasetError naming the cell."""
+    out = []
+    for c in columns:
+        try:
+            value = float(row[c])
+        except ValueError:
+            raise DatasetError(
+                f"'{path.name}' has '{row[c][:40]}' in column {c} of '{row['id']}'; a number is needed."
+            ) from None
+        if not np.isfinite(value):
+            raise DatasetError(
+                f"'{path.name}' has {row[c]} in column {c} of '{row['id']}'; remove the row or give a finite number."
+            )
+        if abs(value) > LARGEST_NUMBER:
+            raise DatasetError(f"'{path.name}' has {row[c]} in column {c} of '{row['id']}', beyond {LARGEST_NUMBER:g}.")
+        out.append(value)
+    return out
+
+
+def unit_quaternion(wxyz: list[float], where: str) -> RotationMatrix:
+    """The rotation of a unit quaternion (4,), wxyz. Raises DatasetError naming ``where``."""
+    norm = float(np.linalg.norm(wxyz))
+    if not abs(norm - 1.0) < 1e-3:
+        raise DatasetError(
+            f"The quaternion of '{where}' has the length {norm:.4f}; a rotation needs length 1 (order qw, qx, qy, qz)."
+        )
+    return RotationMatrix(Quaternion(np.asarray(wxyz) / norm))
+
+
+def check_reach(points: Array, path: Path, unit: str, of: str = "robot's base") -> None:
+    """Raise DatasetError where the median of points (n, 3) m lies where no robot or scanner has any: another unit."""
+    reach = float(np.median(np.linalg.norm(points, axis=1)))
+    if reach > REACH_M[1] or reach < REACH_M[0]:
+        other = "mm" if unit == "m" else "m"
+        raise DatasetError(
+            f"The positions in '{path.name}' lie {reach:.4g} m from the {of}, which is out of reach: they look "
+            f"like {other}; correct units in dataset.yaml."
+        )
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file. Raises DatasetError."""
+    try:
+        return sha256(path)
+    except InputError as e:
+        raise DatasetError(str(e)) from e

@@ -1,0 +1,1 @@
+"""Calibration and tracking while the arm moves: the robot's motion in continuous time, clocks, drift."""

@@ -1,0 +1,223 @@
+"""Kalman filter of the calibration's error, with a bank of hypotheses that the scanner moved at an earlier frame."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from weldcal.calibration.motion.drift_noise import FrameNoise
+from weldcal.calibration.motion.drift_rows import CLOCK, MOVE, SCALE, SIZE, Rows
+from weldcal.calibration.motion.pose_field import FieldConfig, PoseField
+from weldcal.models.arrays import Array
+
+STEP, RAMP = 0, 1
+RAMP_S = 60.0
+"""A creep's unknowns are what it reaches in so many seconds."""
+
+_ROWS = 5
+_STEPS, _RAMPS = 64, 12  # hypotheses kept of each kind
+_EVERY = {STEP: 2, RAMP: 40}  # frames between new ones
+_INFLUENCE = 25.0  # of chi-square with 5: a frame farther off counts as that far
+_NEW = 0.05  # unexplained share of the field's variance at a pose that the features do not reach
+_HOURS = 3600.0
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """What is known before: the sigmas of clock (s) and scale, and how far pose (m, rad per root hour), clock and scale wander
+    in a cell in which nothing happens; ``change`` (SIZE,) is how large a change may be."""
+
+    clock_s: float = 5e-3
+    scale: float = 3e-4
+    wander_m: float = 2e-5
+    wander_rad: float = 5e-5
+    wander_clock_s: float = 4e-3
+    wander_scale: float = 2e-5
+    change: tuple[float, ...] = (0.2, 0.2, 0.2, 0.2, 0.2, 0.2, 0.05, 0.01)
+    field: FieldConfig = field(default_factory=FieldConfig)
+
+
+class DriftFilter:
+    """State x: the calibration's error [rotation; translation] about the pivot, clock (s), scale, coefficients of the field.
+
+    Beside the estimate under "nothing happened" it carries, for each hypothesis "a change theta (SIZE,) from frame s on",
+    the sensitivity F of the estimate to theta, and the information C and the vector d of theta in the innovations (Willsky and
+    Jones 1976): innovation_k = (H_k - G_k F) theta + noise. A step adds H theta from s on, a creep H theta (t - t_s) / RAMP_S.
+    """
+
+    def __init__(self, covariance: Array, config: FilterConfig) -> None:
+        self.config = config
+        c = config.field
+        largest = SIZE + _ROWS * c.largest
+        self._x, self._P = np.zeros(largest), np.zeros((largest, largest))
+        self._P[MOVE, MOVE] = covariance
+        self._P[CLOCK, CLOCK], self._P[SCALE, SCALE] = config.clock_s**2, config.scale**2
+        self._n = SIZE
+        self._wander = np.repeat(
+            np.array([config.wander_rad, config.wander_m, config.wander_clock_s, config.wander_scale]) ** 2 / _HOURS,
+            [3, 3, 1, 1],
+        )
+        self._prior = np.repeat(np.array([c.sigma_m, c.sigma_rad]) ** 2, [3, 2])
+        self._field = PoseField(c)
+        self._time: float | None = None
+        self.count = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all hypotheses."""
+        k = _STEPS + _RAMPS
+        self._F = np.zeros((len(self._x), k * SIZE))
+        self.information, self.vector = np.zeros((k, SIZE, SIZE)), np.zeros((k, SIZE))
+        self.squares, self.frames = np.zeros(k), np.zeros(k, dtype=int)
+        self.start, self.start_time = np.full(k, -1), np.full(k, np.inf)
+        self.kind = np.repeat([STEP, RAMP], [_STEPS, _RAMPS])
+        self._since = self.count
+        self.novel = 0
+        self.favourite: tuple[int, Array] | None = None
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Which hypotheses stand for a frame (k,)."""
+        return np.asarray(self.start >= 0)
+
+    @property
+    def error(self) -> Array:
+        """Estimated [rotation; translation; clock; scale] (SIZE,) under "nothing happened"."""
+        return self._x[:SIZE].copy()
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (SIZE, SIZE) of ``error``."""
+        return self._P[:SIZE, :SIZE].copy()
+
+    def copy(self) -> "DriftFilter":
+        """A filter with the same estimate and field, without hypotheses."""
+        out = DriftFilter(np.eye(6), self.config)
+        out._x, out._P, out._n = self._x.copy(), self._P.copy(), self._n
+        out._field, out._time, out.count = self._field.copy(), self._time, self.count
+        out.clear()
+        return out
+
+    def spawn(self, time: float, kinds: tuple[int, ...] = (STEP, RAMP)) -> None:
+        """Add the hypotheses that something happened before the next frame, at ``time`` s."""
+        for kind in kinds:
+            slots = np.flatnonzero(self.kind == kind)
+            free = slots[self.start[slots] < 0]
+            k = int(free[0]) if len(free) else self._least_missed(slots)
+            self.start[k], self.start_time[k] = self.count, time
+            self._F[:, k * SIZE : (k + 1) * SIZE] = 0.0
+            self.information[k], self.vector[k], self.squares[k], self.frames[k] = 0.0, 0.0, 0.0, 0
+
+    def forget(self, which: NDArray[np.bool_]) -> None:
+        """Drop hypotheses (k,)."""
+        for k in np.flatnonzero(which & self.used):
+            self.start[k], self.start_time[k] = -1, np.inf
+            self._F[:, k * SIZE : (k + 1) * SIZE] = 0.0
+            self.information[k], self.vector[k], self.squares[k], self.frames[k] = 0.0, 0.0, 0.0, 0
+
+    def update(self, rows: Rows, i: int, noise: FrameNoise, *, spawn: bool = True) -> Array:
+        """Take frame i of the rows; returns its innovation (5,). With ``spawn``, hypotheses are added as they are due."""
+        t = float(rows.times[i])
+        if self._time is not None:
+            between = t - self._time
+            if spawn:
+                age = self.count - self._since
+                due = tuple(kind for kind, every in _EVERY.items() if age % every == 0)
+                if due:
+                    self.spawn(t - 0.5 * between, due)
+            self._P[range(SIZE), range(SIZE)] += self._wander * max(between, 0.0)
+        elif spawn:
+            self.spawn(t, (STEP,))
+        self._time = t
+        self.count += 1
+        H = rows.derivatives[i]
+        G, unexplained = self._rows(H, rows.centers[i], rows.normals[i])
+        n = self._n
+        P = self._P[:n, :n]
+        PG = P @ G.T
+        V = G @ PG + noise.covariance(rows.covariances[i], H[:, CLOCK]) + np.diag(10.0 * unexplained * self._prior)
+        innovation = np.asarray(rows.residuals[i] - G @ self._x[:n])
+        L = np.asarray(np.linalg.cholesky(V), dtype=float)
+        w = solve_triangular(L, innovation, lower=True, check_finite=False)
+        D = self._sensitivities(H, G, L, t)
+        excess = float(w @ w) / _INFLUENCE
+        if excess > 1.0 and self.favourite is not None:
+            # a frame is judged by the hypothesis that it fits better: else those that show a change best would count least
+            k, change = self.favourite
+            e = w - D.reshape(_ROWS, -1, SIZE)[:, k] @ change
+            excess = min(excess, float(e @ e) / _INFLUENCE)
+        if excess > 1.0:
+            less = 1.0 / np.sqrt(excess)
+            L, w, D = L / less, w * less, D * less
+        K = solve_triangular(L, PG.T, lower=True, check_finite=False).T  # P G' L^-T
+        self._accumulate(D, K, w)
+        self._x[:n] += K @ w
+        P -= K @ K.T
+        return innovation
+
+    def renew_field(self) -> None:
+        """Forget what was learnt of the field, and the hypotheses, where the arm works at poses that its features do not reach;
+        what is known of error, clock and scale stays."""
+        self._x[SIZE:] = 0.0
+        known = self._P[:SIZE, :SIZE].copy()
+        self._P[:] = 0.0
+        self._P[:SIZE, :SIZE] = known
+        self._n = SIZE
+        self._field = PoseField(self.config.field)
+        self.clear()
+
+    def _rows(self, H: Array, p_C: Array, n_C: Array) -> tuple[Array, float]:
+        phi, unexplained = self._field.features(p_C, n_C)
+        self.novel += unexplained > _NEW
+        n = SIZE + _ROWS * len(phi)
+        if n > self._n:
+            new = np.arange(self._n, n)
+            self._P[new, new] = np.tile(self._prior, len(new) // _ROWS)
+            self._n = n
+        G = np.zeros((_ROWS, n))
+        G[:, :SIZE] = H
+        for c in range(_ROWS):
+            G[c, SIZE + c :: _ROWS] = phi
+        return G, unexplained
+
+    def _sensitivities(self, H: Array, G: Array, L: Array, t: float) -> Array:
+        """L^-1 (H_k - G F) (5, k SIZE) of all hypotheses; zero for those that stand for no frame."""
+        k = len(self.start)
+        D = -(G @ self._F[: self._n]).reshape(_ROWS, k, SIZE)
+        ramps = self.kind == RAMP
+        share = np.where(ramps, (t - np.where(self.used, self.start_time, t)) / RAMP_S, 1.0) * self.used
+        D += H[:, None, :] * share[None, :, None]
+        # a clock does not creep with the scanner: it may have jumped
+        D[:, ramps, CLOCK] += H[:, None, CLOCK] * (self.used[ramps] - share[ramps])
+        return np.asarray(solve_triangular(L, D.reshape(_ROWS, -1), lower=True, check_finite=False))
+
+    def _accumulate(self, D: Array, K: Array, w: Array) -> None:
+        on = self.used
+        self._F[: self._n] += K @ D
+        Dk = D.reshape(_ROWS, len(on), SIZE).transpose(1, 2, 0)  # (k, SIZE, 5)
+        self.information += Dk @ Dk.transpose(0, 2, 1)
+        self.vector += Dk @ w
+        self.squares[on] += float(w @ w)
+        self.frames[on] += 1
+
+    def absorb(self, k: int, change: Array, covariance: Array) -> None:
+        """Take hypothesis k, with its change (SIZE,) and covariance (SIZE, SIZE), for the truth: the estimate is from then on
+        that of the pose after the change; the field that was learnt before it stays. Clears the hypotheses."""
+        n = self._n
+        share = 1.0
+        if self.kind[k] == RAMP:
+            assert self._time is not None
+            share = (self._time - float(self.start_time[k])) / RAMP_S
+        E = -self._F[:n, k * SIZE : (k + 1) * SIZE]
+        E[:SIZE] += np.diag([share] * CLOCK + [1.0 if self.kind[k] == RAMP else share] + [share] * (SIZE - CLOCK - 1))
+        self._x[:n] += E @ change
+        self._P[:n, :n] += E @ covariance @ E.T
+        self.clear()
+
+    def _least_missed(self, slots: NDArray[np.intp]) -> int:
+        """The hypothesis whose neighbours in time stand for it best: they stay closer the younger they are."""
+        order = slots[np.argsort(self.start[slots])]
+        s = self.start[order].astype(float)
+        gap = (s[2:] - s[:-2]) / (self.count - s[1:-1] + 8.0)
+        return int(order[1 + int(np.argmin(gap))])

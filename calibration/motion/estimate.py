@@ -1,0 +1,306 @@
+"""Calibrates from frames in motion: chooses the clock and the model, fits, and says what the motion leaves open."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
+from weldcal.calibration.errors import InconsistentPoses, TooFewPoses, UndeterminedPoses
+from weldcal.calibration.geometry.se3 import skew
+from weldcal.calibration.motion.clock import FrameClock, arrival_clock, choose_clock
+from weldcal.calibration.motion.clock_fit import DRIFT, OFFSET, ROLLING, ClockFit, fit_clock
+from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.place_errors import PlaceErrors, find_place_errors
+from weldcal.calibration.motion.start import Start, search_start
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.models.arrays import Array
+
+Flags = NDArray[np.bool_]
+
+FEWEST = 6  # frames
+_FOLDS = 5
+_ROLLING_SIGMAS = 4.0  # beyond which a rolling shutter counts as seen
+_LEAST_SHARE = 0.5  # of the frames must agree on one pose
+_WORST_M = 0.02  # spread of the residuals across the motion: beyond, nothing fits
+# what an unknown may vary by (one sigma) and still count as determined: rad, m, s, s/s, s
+_OPEN = np.array([1e-2] * 3 + [5e-3] * 3 + [2e-2, 1e-3, 2e-2])
+_WEAK = 0.2  # of that: worth a sentence
+_UNEVEN_S = 0.005  # a device's clock that jitters by more may be worse than the arrivals
+_NAMES = (
+    "rotation about x",
+    "rotation about y",
+    "rotation about z",
+    "x",
+    "y",
+    "z",
+    "clock offset",
+    "clock drift",
+    "rolling time",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionEstimate:
+    """Calibration from N frames in motion.
+
+    ``covariance`` (6, 6) of X_BC as in CalibrationResult; ``joint`` (6 + K, 6 + K) with the clock's unknowns behind it, offset (s),
+    drift, rolling (s) as far as ``names`` lists them. ``clock`` what was found of it. ``inliers`` (N,) frames used; ``capture`` (N,) s
+    their most probable capture times on the robot's clock; ``residual_m`` (N,) distance of the centres there, ``along_m`` (N,) along
+    the motion at the time that the clock says, ``before_m`` (N,) the same if arrivals are taken for captures (X_BC fitted so),
+    ``tilt_rad`` (N,); ``held_out_m``, ``held_out_along_m``, ``held_out_tilt_rad`` (N,) from fits without the frame's own block of time.
+    ``speed`` (N,) m/s.
+    """
+
+    X_BC: RigidTransform
+    covariance: Array
+    joint: Array
+    names: tuple[str, ...]
+    clock: ScannerClock
+    fit: ClockFit
+    start: Start
+    places: PlaceErrors
+    inliers: Flags
+    capture: Array
+    speed: Array
+    residual_m: Array
+    along_m: Array
+    before_m: Array
+    tilt_rad: Array
+    held_out_m: Array
+    held_out_along_m: Array
+    held_out_tilt_rad: Array
+    unobservable: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def sigma_position_m(self) -> float:
+        """Spread of the centres beyond the noise of their fits, an axis."""
+        return float(np.sqrt(self.fit.variances.spread))
+
+    @property
+    def sigma_normal_rad(self) -> float:
+        """Spread of the normals beyond the noise of their fits, an axis."""
+        return float(np.sqrt(self.fit.variances.lean))
+
+
+def estimate_in_motion(
+    frames: ObservedFrames,
+    motion: ContinuousMotion,
+    X_FR: RigidTransform | None = None,
+    *,
+    held_out: bool = True,
+) -> MotionEstimate:
+    """X_BC and the scanner's clock from frames in motion.
+
+    The device's clock is used where it runs evenly, else the arrivals. The clock's drift is estimated for a device, a rolling time
+    within the frame where it is significant. Without motion that shows the offset, X_BC comes from the frames as they are and the
+    offset is None. Raises TooFewPoses, InconsistentPoses, and UndeterminedPoses where the motion leaves X_BC open.
+    """
+    if len(frames) < FEWEST:
+        raise TooFewPoses(f"Only {len(frames)} frames show the flange; {FEWEST} are needed, some hundred are good.")
+    clock = choose_clock(frames)
+    start, fit = _fitted(frames, clock, motion, X_FR)
+    said: list[str] = []
+    if clock.kind == DEVICE and fit.variances.jitter > _UNEVEN_S**2:
+        other = arrival_clock(frames, "The device's times jitter more than the arrivals.")
+        other_start, other_fit = _fitted(frames, other, motion, X_FR)
+        if other_fit.variances.jitter < fit.variances.jitter:
+            clock, start, fit = other, other_start, other_fit
+    _check(fit, frames)
+    places = find_place_errors(fit, frames)
+    names = tuple(_NAMES[k] for k in fit.free)
+    inverse, open_names, weak = _determined(fit, places)
+    if OFFSET in fit.free and "clock offset" in open_names:
+        fit = fit_clock(
+            frames, clock, motion, fit.X_BC, -clock.sign * start.delay_s, X_FR=X_FR, free=(0, 1, 2, 3, 4, 5)
+        )
+        places = find_place_errors(fit, frames)
+        inverse, open_names, weak = _determined(fit, places)
+        names = _NAMES[:6]
+        told = [
+            "The motion does not show the clock's offset: the arm hardly moves, or all of it can as well be a shift of the scanner."
+        ]
+    else:
+        told = []
+    if open_names:
+        raise UndeterminedPoses(
+            f"The motion leaves X_BC open ({', '.join(open_names)}): move the flange in more than one direction, to and fro, and "
+            "tilt it by ten degrees or more."
+        )
+    told += [f"The motion shows {name} only to about {sigma}." for name, sigma in weak]
+    outside = ~np.isfinite(fit.centre[:, 0]) | ~(motion.known(fit.nominal))
+    if outside.any():
+        said.append(
+            f"{int(outside.sum())} frames were taken outside the robot's stream or in its gaps; they are not used."
+        )
+    if fit.late.any():
+        said.append(
+            f"{int(fit.late.sum())} frames came grossly late or early; they do not count for the clock's offset."
+        )
+    if clock.kind != DEVICE and frames.device is not None:
+        said.append(f"The device times are not used. {clock.reason}")
+    if places.found:
+        said.append(places.sentence)
+    T = np.eye(len(inverse))
+    T[3:6, :3] = -skew(np.asarray(fit.X_BC.translation()) - fit.pivot)
+    joint = T @ inverse @ T.T
+    joint = 0.5 * (joint + joint.T)
+    held = _held_out(frames, clock, motion, fit, X_FR) if held_out else (np.full(len(frames), np.nan),) * 3
+    before, speed, along = _along(frames, clock, motion, fit, start, X_FR)
+    return MotionEstimate(
+        X_BC=fit.X_BC,
+        covariance=joint[:6, :6],
+        joint=joint,
+        names=names,
+        clock=_scanner_clock(fit, clock, frames, joint),
+        fit=fit,
+        start=start,
+        places=places,
+        inliers=fit.keep,
+        capture=fit.capture,
+        speed=speed,
+        residual_m=np.linalg.norm(fit.centre, axis=1),
+        along_m=along,
+        before_m=before,
+        tilt_rad=np.linalg.norm(fit.lean, axis=1),
+        held_out_m=held[0],
+        held_out_along_m=held[1],
+        held_out_tilt_rad=held[2],
+        unobservable=tuple(told),
+        warnings=tuple(said),
+    )
+
+
+def _fitted(
+    frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion, X_FR: RigidTransform | None
+) -> tuple[Start, ClockFit]:
+    """Start and fit with the unknowns that the data ask for."""
+    start = search_start(frames, clock, motion, X_FR)
+    if start is None:
+        begin, end = motion.span
+        raise InconsistentPoses(
+            f"Too few frames were taken within the robot's stream ({begin:.3f} to {end:.3f} s); record both over the same time."
+        )
+    free = (0, 1, 2, 3, 4, 5, OFFSET) + ((DRIFT,) if clock.kind == DEVICE else ())
+    fit = fit_clock(frames, clock, motion, start.X_BC, -clock.sign * start.delay_s, X_FR=X_FR, free=free)
+    rolling = fit_clock(frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=(*free, ROLLING), after=fit)
+    covariance, _ = _inverse(rolling.information, rolling.free)
+    sigma = float(np.sqrt(covariance[-1, -1]))
+    if abs(rolling.rolling) > _ROLLING_SIGMAS * sigma and sigma < _OPEN[ROLLING]:
+        again = fit_clock(frames, clock, motion, rolling.X_BC, rolling.offset, X_FR=X_FR, free=(*free, ROLLING))
+        return start, again
+    return start, fit
+
+
+def _check(fit: ClockFit, frames: ObservedFrames) -> None:
+    used = int(fit.keep.sum())
+    if used < FEWEST:
+        raise TooFewPoses(
+            f"Only {used} of {len(frames)} frames agree with one pose of the scanner; {FEWEST} are needed."
+        )
+    if used < _LEAST_SHARE * int(np.isfinite(fit.centre[:, 0]).sum()) or fit.variances.spread > _WORST_M**2:
+        raise InconsistentPoses(
+            f"Only {used} of {len(frames)} frames agree with one pose of the scanner (spread {1e3 * fit.variances.spread**0.5:.1f} mm); "
+            "check units, the quaternion order and that stream.csv holds the flange's poses."
+        )
+
+
+def _inverse(information: Array, free: tuple[int, ...]) -> tuple[Array, Array]:
+    """Covariance (K, K) and, in units of what counts as determined, its principal variances (K,) ascending."""
+    unit = _OPEN[list(free)]
+    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    variances = 1.0 / np.maximum(values, 1e-9)
+    root = vectors * np.sqrt(variances)
+    return np.asarray(unit[:, None] * (root @ root.T) * unit), variances[::-1]
+
+
+def _determined(fit: ClockFit, places: PlaceErrors) -> tuple[Array, tuple[str, ...], list[tuple[str, str]]]:
+    """Covariance of the unknowns about the pivot, names of those that the motion leaves open, and those it shows weakly."""
+    inverse, _ = _inverse(fit.information, fit.free)
+    inverse = inverse + places.excess(inverse)
+    sigma = np.sqrt(np.diag(inverse))
+    share = sigma / _OPEN[list(fit.free)]
+    names = [_NAMES[k] for k in fit.free]
+    opened = tuple(n for n, s in zip(names, share, strict=True) if s > 1.0)
+    weak = []
+    for k, name, s, value in zip(fit.free, names, share, sigma, strict=True):
+        if _WEAK < s <= 1.0 and k < DRIFT:
+            text = f"{np.degrees(value):.2f} degrees" if k < 3 else f"{1e3 * value:.1f} " + ("mm" if k < 6 else "ms")
+            weak.append((name, text))
+    return inverse, opened, weak
+
+
+def _scanner_clock(fit: ClockFit, clock: FrameClock, frames: ObservedFrames, joint: Array) -> ScannerClock:
+    sigma = dict(zip(fit.free, np.sqrt(np.diag(joint)), strict=True))
+    known = OFFSET in sigma
+    device = clock.kind == DEVICE
+    return ScannerClock(
+        kind=clock.kind,
+        offset_s=fit.offset + clock.shift if known else None,
+        sigma_s=float(sigma[OFFSET]) if known else None,
+        jitter_s=float(np.sqrt(fit.variances.jitter)) if known else None,
+        # the device's own time
+        reference_s=clock.reference - clock.shift,
+        drift=fit.drift if device and DRIFT in sigma else None,
+        drift_sigma=float(sigma[DRIFT]) if device and DRIFT in sigma else None,
+        rolling_s=fit.rolling if ROLLING in sigma else None,
+        rolling_sigma_s=float(sigma[ROLLING]) if ROLLING in sigma else None,
+        late=tuple(id for id, late in zip(frames.ids, fit.late, strict=True) if late),
+        reason=clock.reason,
+    )
+
+
+def _along(
+    frames: ObservedFrames,
+    clock: FrameClock,
+    motion: ContinuousMotion,
+    fit: ClockFit,
+    start: Start,
+    X_FR: RigidTransform | None,
+) -> tuple[Array, Array, Array]:
+    """Residuals along the motion (N,) m without and with the clock's offset, and the speeds (N,) m/s."""
+    plain = search_start(frames, arrival_clock(frames), motion, X_FR, delays=np.array([0.0]))
+    out = []
+    for X, t in (
+        (plain.X_BC if plain is not None else start.X_BC, frames.arrival),
+        (fit.X_BC, fit.nominal),
+    ):
+        at = motion.feature(t, X_FR)
+        e = frames.p_C @ X.rotation().matrix().T + X.translation() - at.p
+        speed = np.linalg.norm(at.v, axis=1)
+        out.append(np.where(speed > 1e-3, (e * at.v).sum(axis=1) / np.maximum(speed, 1e-3), np.nan))
+    return out[0], speed, out[1]
+
+
+def _held_out(
+    frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion, fit: ClockFit, X_FR: RigidTransform | None
+) -> tuple[Array, Array, Array]:
+    """Errors (N,) of each frame by a fit without its own block of time: of the centre (m) at its most probable capture time, along
+    the motion (m) at the clock's time, and of the normal (rad)."""
+    n = len(frames)
+    position, along, tilt = (np.full(n, np.nan) for _ in range(3))
+    used = np.flatnonzero(fit.keep)
+    if len(used) < 2 * _FOLDS:
+        return position, along, tilt
+    for block in np.array_split(used, _FOLDS):
+        keep = fit.keep.copy()
+        keep[block] = False
+        try:
+            without = fit_clock(
+                frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=fit.free, keep=keep, after=fit
+            )
+        except (np.linalg.LinAlgError, TooFewPoses):
+            continue
+        _, variances = _inverse(without.information, without.free)
+        if variances.max() > 1.0:
+            continue  # this block alone shows what the others leave open
+        at = motion.feature(without.nominal[block], X_FR)
+        R = without.X_BC.rotation().matrix()
+        e = frames.p_C[block] @ R.T + without.X_BC.translation() - at.p
+        speed = np.linalg.norm(at.v, axis=1)
+        position[block] = np.linalg.norm(without.centre[block], axis=1)
+        along[block] = np.where(speed > 1e-3, (e * at.v).sum(axis=1) / np.maximum(speed, 1e-3), np.nan)
+        tilt[block] = np.linalg.norm(without.lean[block], axis=1)
+    return position, along, tilt

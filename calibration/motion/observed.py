@@ -1,0 +1,39 @@
+"""Frames with the flange found in them: centres, normals, their noise and the frames' times, as arrays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.models.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ObservedFrames:
+    """N frames in the order of their arrival. ``arrival`` (N,) s on the robot's clock; ``device`` (N,) s on the scanner's own clock,
+    NaN where a frame has none, or None; ``p_C`` (N, 3) m flange centre and ``n_C`` (N, 3) outward normal in the camera frame;
+    ``covariance`` (N, 3, 3) m^2 of the centre, ``normal_sigma`` (N,) rad an axis."""
+
+    ids: tuple[str, ...]
+    arrival: Array
+    device: Array | None
+    p_C: Array
+    n_C: Array
+    covariance: Array
+    normal_sigma: Array
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def pick(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "ObservedFrames":
+        """Some of the frames."""
+        index = np.arange(len(self.ids))[which]
+        return ObservedFrames(
+            tuple(self.ids[k] for k in index),
+            self.arrival[index],
+            None if self.device is None else self.device[index],
+            self.p_C[index],
+            self.n_C[index],
+            self.covariance[index],
+            self.normal_sigma[index],
+        )

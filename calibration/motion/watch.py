@@ -1,0 +1,197 @@
+"""Watches a calibration over a recording in motion: synchronises its frames, tests for drift, recalibrates from what follows."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.motion.drift import WARM_UP, DriftConfig, DriftEvent, DriftTest
+from weldcal.calibration.motion.drift_filter import FilterConfig
+from weldcal.calibration.motion.drift_noise import FrameNoise, measured_noise
+from weldcal.calibration.motion.drift_rows import CLOCK, Rows, rows_of
+from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.motion.synchronise import Synchronised, synchronise
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+
+_GROSS = 60.0  # chi-square with 5 of a frame that shows something else
+_LARGE_M, _LARGE_RAD = 1e-3, 2e-3  # a move that may have disturbed the clock's fit
+_CLOCK_S = 2e-3
+_MOST_SPREAD_M = 5e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """What a recording says of a calibration, for its N tracked frames in the order of their times.
+
+    ``rows`` are the residuals against the calibration at the nominal capture times; ``residuals`` (N, 3) m and ``tilts`` (N, 2)
+    rad those after each frame's own time is taken out as far as the jitter allows; ``offsets`` (N,) s is by how much each frame was
+    later than nominal. ``before`` (N, 3) m are the residuals of frames taken for as old as their arrival, ``after`` (N, 3) m those
+    against the pose that held at the time. ``gross`` (N,) frames show something else. ``statistic`` (N,) is the drift test's
+    largest, over ``threshold``. ``X_BC`` and ``covariance`` (6, 6) are those at the end; ``since_s`` is from when on they hold.
+    ``dropped`` lists (id, reason).
+    """
+
+    ids: tuple[str, ...]
+    rows: Rows
+    residuals: Array
+    tilts: Array
+    before: Array
+    after: Array
+    offsets: Array
+    gross: NDArray[np.bool_]
+    statistic: Array
+    threshold: float
+    events: tuple[DriftEvent, ...]
+    X_BC: RigidTransform
+    covariance: Array
+    since_s: float
+    clock: Synchronised
+    noise: FrameNoise
+    dropped: tuple[tuple[str, str], ...] = field(default_factory=tuple)
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square distance (m) between flange and robot, against the calibration as it was given."""
+        return _rms(self.residuals[~self.gross])
+
+    @property
+    def rms_after_m(self) -> float:
+        """The same against the pose that held at each time."""
+        return _rms(self.after[~self.gross])
+
+
+def watch(
+    result: CalibrationResult,
+    frames: ObservedFrames,
+    motion: ContinuousMotion,
+    *,
+    X_FR: RigidTransform | None = None,
+    dropped: Sequence[tuple[str, str]] = (),
+    config: DriftConfig | None = None,
+) -> Watched:
+    """Watch a calibration over the frames of a recording. Raises InputError where no frame lies within the robot's stream."""
+    frames = _corrected(result, frames)
+    clock = synchronise(frames, motion, result.X_BC, X_FR=X_FR, known=result.clock)
+    found = _tested(result, frames, motion, clock, X_FR, dropped, config)
+    moved = [e for e in found.events if e.kind != WARM_UP]
+    large = any(
+        float(np.linalg.norm(e.translation_m)) > _LARGE_M or float(np.linalg.norm(e.rotation_rad)) > _LARGE_RAD
+        for e in moved
+    )
+    if large and clock.source == "recording":
+        p_C, n_C = _as_before(result.X_BC, moved, clock.times, frames)
+        clock = synchronise(replace(frames, p_C=p_C, n_C=n_C), motion, result.X_BC, X_FR=X_FR, known=result.clock)
+        found = _tested(result, frames, motion, clock, X_FR, dropped, config)
+    return found
+
+
+def drift_config(
+    result: CalibrationResult, clock_sigma_s: float | None, config: DriftConfig | None = None
+) -> DriftConfig:
+    """The test's settings for a calibration: its spread of scanner and arm is that of the field, where it states a larger one."""
+    config = config or DriftConfig()
+    spread = float(np.clip(1e-3 * result.sigma_position_mm, config.filter.field.sigma_m, _MOST_SPREAD_M))
+    clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
+    known: FilterConfig = replace(config.filter, clock_s=clock, field=replace(config.filter.field, sigma_m=spread))
+    return replace(config, filter=known)
+
+
+def _tested(
+    result: CalibrationResult, frames: ObservedFrames, motion: ContinuousMotion, clock: Synchronised,
+    X_FR: RigidTransform | None, dropped: Sequence[tuple[str, str]], config: DriftConfig | None,
+) -> Watched:  # fmt: skip
+    at = motion.feature(clock.times, X_FR)
+    inside = np.isfinite(at.p).all(axis=1) & np.isfinite(at.v).all(axis=1)
+    order = np.flatnonzero(inside)[np.argsort(clock.times[inside], kind="stable")]
+    if not len(order):
+        raise InputError("No frame was taken while the robot's stream was recorded; give both on the robot's clock.")
+    said = [
+        *dropped,
+        *((frames.ids[k], "The robot's stream has no data at its capture.") for k in np.flatnonzero(~inside)),
+    ]
+    pivot = at.p[order].mean(axis=0)
+    rows = rows_of(
+        result.X_BC, pivot, clock.times[order], at.p[order], at.n[order], at.v[order], at.turn[order], frames.p_C[order],
+        frames.n_C[order], frames.covariance[order], frames.normal_sigma[order],
+    )  # fmt: skip
+    noise = measured_noise(rows) or FrameNoise(jitter_s=clock.jitter_s)
+    interval = float(np.median(np.diff(rows.times))) if len(rows) > 1 else 0.05
+    test = DriftTest(
+        result.X_BC,
+        result.covariance,
+        pivot,
+        drift_config(result, clock.sigma_s, config),
+        noise,
+        1.0 / max(interval, 1e-3),
+    )
+    statistic, events = np.zeros(len(rows)), []
+    for i in range(len(rows)):
+        events += test.update(rows.part(slice(i, i + 1)))
+        statistic[i] = test.statistic
+    events += test.finish()
+    X, covariance = test.current()
+    moves = [e for e in events if e.kind != WARM_UP]
+    p_C, n_C = _as_before(result.X_BC, moves, clock.times, frames)
+    held = rows_of(
+        result.X_BC, pivot, clock.times[order], at.p[order], at.n[order], at.v[order], at.turn[order], p_C[order], n_C[order],
+        frames.covariance[order], frames.normal_sigma[order],
+    )  # fmt: skip
+    late, gross = _lateness(held, noise)
+    moved = late[:, None] * rows.derivatives[:, :, CLOCK]
+    residuals, tilts = (rows.residuals - moved)[:, :3], (rows.residuals - moved)[:, 3:]
+    at_arrival = motion.feature(clock.clock.base[order], X_FR).p
+    before = rows.residuals[:, :3] + at.p[order] - at_arrival
+    after = held.residuals[:, :3] - moved[:, :3]
+    return Watched(
+        tuple(frames.ids[k] for k in order), rows, residuals, tilts, before, after, late, gross, statistic, test.threshold,
+        tuple(events), X, covariance, moves[-1].time_s if moves else float(rows.times[0]), clock, noise, tuple(said),
+    )  # fmt: skip
+
+
+def _lateness(rows: Rows, noise: FrameNoise) -> tuple[Array, NDArray[np.bool_]]:
+    """How much later than nominal each frame was most probably taken (N,) s, and which frames show something else (N,)."""
+    u = rows.derivatives[:, :, CLOCK]
+    factors = np.repeat([noise.center, noise.normal], [3, 2])
+    S = rows.covariances * np.outer(factors, factors)
+    Wu = np.linalg.solve(S, u[:, :, None])[:, :, 0]
+    told = np.einsum("ni,ni->n", Wu, u) + 1.0 / max(noise.jitter_s, 1e-7) ** 2
+    late = np.einsum("ni,ni->n", Wu, rows.residuals) / told
+    # a frame that shows something else is far from its neighbours
+    away = rows.residuals - np.array(
+        [np.median(rows.residuals[max(0, i - 7) : i + 8], axis=0) for i in range(len(rows))]
+    )
+    rest = away - (np.einsum("ni,ni->n", Wu, away) / told)[:, None] * u
+    gross = np.einsum("ni,ni->n", rest, np.linalg.solve(S, rest[:, :, None])[:, :, 0]) > _GROSS
+    return late, np.asarray(gross)
+
+
+def _as_before(
+    X_BC: RigidTransform, moves: Sequence[DriftEvent], times: Array, frames: ObservedFrames
+) -> tuple[Array, Array]:
+    """Centres and normals (N, 3) as the scanner would have seen them from X_BC, had it not moved. A creep counts from its middle."""
+    p_C, n_C = frames.p_C.copy(), frames.n_C.copy()
+    for e, following in zip(moves, [*moves[1:], None], strict=False):
+        now = times >= e.time_s
+        if following is not None:
+            now &= times < following.time_s
+        D = X_BC.inverse() @ e.X_BC_after
+        p_C[now] = (D @ frames.p_C[now].T).T
+        n_C[now] = frames.n_C[now] @ D.rotation().matrix().T
+    return p_C, n_C
+
+
+def _corrected(result: CalibrationResult, frames: ObservedFrames) -> ObservedFrames:
+    correction = correction_from_document(result.scanner_correction)
+    if correction is None:
+        return frames
+    return replace(frames, p_C=correction.points(frames.p_C), n_C=correction.normals(frames.p_C, frames.n_C))
+
+
+def _rms(residuals: Array) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")

@@ -1,0 +1,1 @@
+"""Scanners that stream, in simulation."""

@@ -1,0 +1,164 @@
+"""Simulated streaming scanner: frames at its own rate, exposed over a time, that arrive later with stamps of its own clock."""
+
+import dataclasses as dc
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
+
+from weldcal.models.errors import InputError
+from weldcal.models.exposure import mixed_exposure
+from weldcal.models.scanner_streams import ScannerStream, get_stream
+from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
+from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner, darkness, mount_scanner
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.messages import Message, ScanStream, StreamedScan
+
+_KEPT = 8  # arrived frames on the port
+
+
+@dc.dataclass
+class StreamingScanner(RenderedScanner):
+    """`!StreamingScanner`: a scanner that streams. Timing is the preset's where it is null; the shutter is global."""
+
+    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ()
+    preset: str = "motioncam_3d_stream_half"
+    width: int | None = None
+    height: int | None = None
+    exposure_s: float = 0.010
+    exposure_samples: int = 3  # instants of the exposure that are rendered and mixed
+    fps: float | None = None
+    delay_ms: float | None = None
+    jitter_ms: float | None = None
+    device_epoch_s: float | None = None  # the device's clock at time 0
+    device_drift_ppm: float | None = None
+    device_clock: bool = True  # false: frames carry no stamp of the device
+
+    def stream(self) -> ScannerStream:
+        """The timing of the stream. Raises InputError for times that no scanner has."""
+        given = {
+            "fps": self.fps,
+            "delay_s": None if self.delay_ms is None else 1e-3 * self.delay_ms,
+            "delay_jitter_s": None if self.jitter_ms is None else 1e-3 * self.jitter_ms,
+            "device_epoch_s": self.device_epoch_s,
+            "device_drift_ppm": self.device_drift_ppm,
+        }
+        known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+        return dc.replace(get_stream(self.preset), exposure_s=self.exposure_s, **known)
+
+
+@dc.dataclass(frozen=True, eq=False)
+class _Streaming(Message):
+    """Instants of the frame that is being exposed, and the frames that are under way or have arrived."""
+
+    count: int = 0
+    instants: tuple[NDArray[np.float32], ...] = ()
+    dark: NDArray[np.float32] | None = None
+    frames: tuple[StreamedScan, ...] = ()
+
+
+class DepthStream(LeafSystem):
+    """Takes a frame per period while streaming is on; it is on the port from its arrival on.
+
+    .. pydrake_system::
+
+        name: DepthStream
+        input_ports:
+        - streaming
+        - depth_image
+        - color_image
+        output_ports:
+        - stream
+        - newest_capture
+
+    The instants of an exposure are whole steps of the plant. `newest_capture` (2), the number and the true time (s) of the newest
+    exposed frame, is for reports and tests only.
+    """
+
+    def __init__(
+        self, preset: ScannerPreset, timing: ScannerStream, config: StreamingScanner, seed: int, plant_period_s: float
+    ) -> None:
+        super().__init__()
+        self._preset, self._timing, self._config, self._seed = preset, timing, config, seed
+        n, step = config.exposure_samples, plant_period_s
+        spacing = max(1, round(timing.exposure_s / n / step))
+        period = max(n * spacing, round(1.0 / timing.fps / step)) * step
+        # before a tick's own update the plant's pictures show its last step, and the first exposure ends after n - 1 spacings
+        self._capture_before_s = 0.5 * (n - 1) * spacing * step + step
+        self._streaming = self.DeclareVectorInputPort("streaming", 1)
+        self._depth = self.DeclareAbstractInputPort(
+            "depth_image", AbstractValue.Make(ImageDepth32F(preset.width, preset.height))
+        )
+        self._color = self.DeclareAbstractInputPort(
+            "color_image", AbstractValue.Make(ImageRgba8U(preset.width, preset.height))
+        )
+        self._state = self.DeclareAbstractState(AbstractValue.Make(_Streaming()))
+        ticket = {self.abstract_state_ticket(self._state), self.time_ticket()}
+        self.DeclareAbstractOutputPort("stream", lambda: AbstractValue.Make(ScanStream()), self._arrived, ticket)
+        captured = self.DeclareDiscreteState(2)
+        self.DeclareVectorOutputPort("newest_capture", 2, self._newest_capture, {self.discrete_state_ticket(captured)})
+        for k in range(n):
+            self.DeclarePeriodicUnrestrictedUpdateEvent(
+                period, (k + 1) * spacing * step, lambda c, s, k=k: self._instant(c, s, k)
+            )
+
+    def _instant(self, context: Context, state: State, k: int) -> None:
+        old: _Streaming = context.get_abstract_state(self._state).get_value()
+        if self._streaming.Eval(context)[0] < 0.5 or (k > 0 and len(old.instants) != k):
+            return
+        depth = np.array(self._depth.Eval(context).data[:, :, 0])
+        new = dc.replace(old, instants=(*old.instants[:k], depth))
+        if k == self._config.exposure_samples // 2:
+            rgb = np.asarray(self._color.Eval(context).data[:, :, :3], dtype=np.float32)
+            new = dc.replace(new, dark=darkness(rgb))
+        if len(new.instants) == self._config.exposure_samples:
+            capture = context.get_time() - self._capture_before_s
+            state.get_mutable_discrete_state().set_value(np.array([new.count + 1.0, capture]))
+            new = self._exposed(new, capture)
+        state.get_mutable_abstract_state(self._state).set_value(new)
+
+    def _exposed(self, s: _Streaming, capture: float) -> _Streaming:
+        """The frame of the completed exposure joins those under way; no frame overtakes another one."""
+        rng = np.random.default_rng([self._seed, s.count])
+        p, noise = self._preset, self._preset.noise
+        depth = mixed_exposure(np.stack(s.instants), noise.edge_step_m, noise.flying, rng)
+        noisy = apply_noise(depth, p, rng, s.dark)
+        arrival = capture + self._timing.delay(rng)
+        if s.frames:
+            arrival = max(arrival, s.frames[-1].arrival_time)
+        stamp = self._timing.device_time(capture, rng) if self._config.device_clock else None
+        points = depth_to_points(noisy, p.fx, p.fy, p.cx, p.cy).astype(np.float32)
+        frame = StreamedScan(s.count + 1, points_C=points, arrival_time=arrival, device_time=stamp)
+        lost = rng.random() < self._timing.loss
+        frames = s.frames if lost else (*s.frames[-_KEPT - 8 :], frame)
+        return _Streaming(s.count + 1, frames=frames)
+
+    def _arrived(self, context: Context, output: Any) -> None:
+        s: _Streaming = context.get_abstract_state(self._state).get_value()
+        now = context.get_time() + 1e-9
+        output.set_value(ScanStream(tuple(f for f in s.frames if f.arrival_time <= now)[-_KEPT:]))
+
+    def _newest_capture(self, context: Context, output: BasicVector) -> None:
+        output.SetFromVector(context.get_discrete_state_vector().value())
+
+
+def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTransform:
+    """Mount the scanner as a RenderedScanner is and add its stream. Returns its true pose in its carrier's frame."""
+    if not 1 <= config.exposure_samples <= 16:
+        raise InputError(f"scanner.exposure_samples must be from 1 to 16, and it is {config.exposure_samples}.")
+    timing, world = config.stream(), build.require(SimulatedWorld)
+    mounted = mount_scanner(config, build)
+    seed = int(build.rng.integers(2**31))
+    stream = build.builder.AddSystem(DepthStream(mounted.device, timing, config, seed, world.plant.time_step()))
+    stream.set_name("scanner")
+    build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), stream.GetInputPort("depth_image"))
+    build.builder.Connect(mounted.sensor.color_image_output_port(), stream.GetInputPort("color_image"))
+    build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
+    build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
+    build.outputs["cheat.scanner_capture"] = stream.GetOutputPort("newest_capture")
+    return mounted.X_LC

@@ -1,0 +1,1 @@
+"""Calibration of a streaming scanner while the arm moves."""

@@ -1,0 +1,217 @@
+"""The motion job: calibrates a streaming scanner and its clock while the flange moves through the corners of a cube."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.planning.clearance import arm_bodies
+from weldcal.models.arms.inverse import nearest_solution
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
+from weldcal.systems.jobs.job import AddedJob, Job, Phases
+from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
+from weldcal.systems.jobs.motion.collector import MotionCollector
+from weldcal.systems.jobs.motion.config import MotionJob, check_motion
+from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord
+from weldcal.systems.jobs.motion.procedure import MotionProcedure
+from weldcal.systems.jobs.motion.recorder import MotionRecorder
+from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
+from weldcal.systems.messages import CalibrationStatus, JobCommand
+from weldcal.systems.motion.clear_moves import clear_move
+from weldcal.systems.motion.frame_queue import FrameQueue
+from weldcal.systems.motion.spine import FIRST, JobPorts, Spine
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station
+from weldcal.systems.wiring import Wiring
+
+CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5  # no four in a plane
+_TRIES = 40  # leans drawn for a corner
+_POLL_S = 0.004  # of the queue and the estimator: a twelfth of a frame
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPlanned:
+    """Joint angles (6,) rad of the corners, and the scanner's timing as known from its data sheet."""
+
+    corners: tuple[Array, ...]
+    q_home: Array
+    delay_s: float
+
+
+@dataclass(eq=False)
+class AddedMotion(AddedJob):
+    """The systems of the job."""
+
+    plan: MotionPlanned
+    procedure: MotionProcedure
+    collector: MotionCollector
+    calibrator: MotionCalibrator
+    queue: FrameQueue
+    recorder: MotionRecorder | None
+    frames: int
+    ports: JobPorts
+    maximum_time_s: float
+
+    def record(self, root: Context) -> MotionRecord:
+        """What was collected so far."""
+        port = self.collector.GetOutputPort("record")
+        found: MotionRecord = port.Eval(self.collector.GetMyContextFromRoot(root))
+        return found
+
+    def calibration(self, root: Context) -> MotionCalibration:
+        """The result, where it is there."""
+        port = self.calibrator.GetOutputPort("calibration")
+        found: MotionCalibration = port.Eval(self.calibrator.GetMyContextFromRoot(root))
+        return found
+
+    def counts(self, root: Context) -> tuple[int, int]:
+        """Frames that were taken from the queue, and frames that were dropped."""
+        taken, dropped, _ = self.queue.GetOutputPort("counts").Eval(self.queue.GetMyContextFromRoot(root))
+        return int(taken), int(dropped)
+
+    def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
+        """See AddedJob."""
+        share = len(self.record(root).seen) / self.frames
+        return phases[-1][0], 0.05 + 0.85 * min(share, 1.0)
+
+
+class Motion(Job[MotionPlanned]):
+    """The job of a scenario with a `motion` part."""
+
+    key = "motion"
+    config = MotionJob
+
+    def check(self, scenario: Scenario) -> None:
+        """See Job."""
+        job, streams = scenario.part(MotionJob), isinstance(scenario.scanner, StreamingScanner)
+        if job is None:
+            if streams:
+                raise InputError("A !StreamingScanner belongs to a motion job: write motion: {} or another scanner.")
+            return
+        check_motion(job)
+        if not streams:
+            raise InputError(
+                "A motion job needs a scanner that streams: write scanner: !StreamingScanner {} in the scenario."
+            )
+        if scenario.job.weld or scenario.calibration.feature != "flange":
+            raise InputError("A motion job calibrates by the bare flange: write tool: none and job: {weld: false}.")
+
+    def plan(self, scenario: Scenario, station: Station, seed: int) -> MotionPlanned:
+        """See Job."""
+        job, scanner = scenario.part(MotionJob), scenario.scanner
+        assert job is not None
+        assert isinstance(scanner, StreamingScanner)
+        home = np.deg2rad(scenario.home_deg)
+        corners = plan_corners(scenario, station, job, home, np.random.default_rng([seed, 16]))
+        return MotionPlanned(corners, home, scanner.stream().delay_s)
+
+    def add(self, wiring: Wiring, spine: Spine, plan: MotionPlanned) -> AddedMotion:
+        """See Job."""
+        scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
+        job, standard = scenario.part(MotionJob), get_flange(scenario.flange)
+        assert job is not None
+        # the mover's limit is the fastest joint's: what moves the flange at the wanted speed on the fastest leg
+        factor = scenario.job.speed_factor
+        spine.arm.mover.limit(factor * joint_speed(station.arm, plan.corners, job.speed_m_s))
+        maximum_time_s = scenario.job.maximum_time_s / factor
+        procedure = wiring.add(
+            "motion_procedure",
+            MotionProcedure(plan.corners, plan.q_home, job.frames, maximum_time_s=maximum_time_s),
+        )
+        queue = wiring.add("frame_queue", FrameQueue(job.queue, _POLL_S))
+        estimator = wiring.add(
+            "flange_estimator",
+            FlangeEstimator(
+                station.arm, RigidTransform(), standard, c.mounting_guess.pose(), c.guess_radius_mm * 1e-3,
+                station.background, _POLL_S, plan.delay_s,
+            ),
+        )  # fmt: skip
+        collector = wiring.add("motion_collector", MotionCollector())
+        calibrator = wiring.add("motion_calibrator", MotionCalibrator(station.arm, station.background))
+        estimate, state = estimator.GetOutputPort("flange_estimate"), procedure.GetOutputPort("state")
+        record = collector.GetOutputPort("record")
+        wiring.connect(queue, stream=wiring.out("scanner.stream"), flange_estimate=estimate)
+        wiring.connect(
+            estimator,
+            scan=queue.GetOutputPort("scan"),
+            job=wiring.constant("no_ordered_scan", JobCommand()),
+            history=spine.arm.history,
+            calibration_status=wiring.constant("nominal_scanner", CalibrationStatus()),
+        )
+        wiring.connect(
+            collector, flange_estimate=estimate, state=state,
+            position_measured=spine.arm.position, sample_time=wiring.out(f"{FIRST}.sample_time"),
+        )  # fmt: skip
+        wiring.connect(calibrator, record=record, state=state)
+        wiring.connect(
+            procedure, settled_goal=spine.arm.settled_goal, robot_status=spine.arm.status, record=record,
+            calibration=calibrator.GetOutputPort("calibration"), hold=spine.hold,
+        )  # fmt: skip
+        wiring.feed("scanner.streaming", procedure.GetOutputPort("streaming"))
+        recorder = None
+        if job.record and job.recording_folder:
+            recorder = wiring.add("motion_recorder", MotionRecorder(Path(job.recording_folder)))
+            wiring.connect(recorder, stream=wiring.out("scanner.stream"))
+        logged = {"frame_counts": queue.GetOutputPort("counts")}
+        if station.diagram.HasOutputPort("cheat.scanner_capture"):
+            logged["scanner_capture"] = wiring.out("cheat.scanner_capture")
+        ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged)
+        return AddedMotion(plan, procedure, collector, calibrator, queue, recorder, job.frames, ports, maximum_time_s)
+
+
+def plan_corners(
+    scenario: Scenario, station: Station, job: MotionJob, q_home: Array, rng: np.random.Generator
+) -> tuple[Array, ...]:
+    """Joint angles (6,) rad of the cube's corners, each flange leaning another way, with free moves between all of them.
+
+    Raises:
+        InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
+    """
+    X_BC = scenario.calibration.mounting_guess.pose()
+    centre, bodies = np.array(job.centre_m), arm_bodies(station.arm)
+    found: list[Array] = []
+    for corner in CORNERS:
+        p = centre + 1e-3 * job.edge_mm * corner
+        for _ in range(_TRIES):
+            off = RollPitchYaw(*np.radians(rng.uniform(-job.lean_deg, job.lean_deg, 3))).ToRotationMatrix()
+            near = found[-1] if found else q_home
+            q = nearest_solution(station.arm, RigidTransform(facing(p, X_BC, q_home, station.arm) @ off, p), near)
+            if q is not None and all(clear_move(scenario, station, bodies, other, q) for other in (q_home, *found)):
+                found.append(q)
+                break
+        else:
+            raise InputError(
+                f"The flange cannot be moved to the corner at {np.round(p, 3).tolist()} m without touching the table or the arm itself: "
+                "move motion.centre_m, or make motion.edge_mm smaller."
+            )
+    return tuple(found)
+
+
+def facing(p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel) -> RotationMatrix:
+    """The flange rotation R_BF at ``p`` (3,) m that faces the scanner, turned about its axis as near to that at home as can be."""
+    z = X_BC.translation() - p
+    z = z / np.linalg.norm(z)
+    x_home = forward_kinematics(arm, q_home).rotation().matrix()[:, 0]
+    x = x_home - (x_home @ z) * z
+    x = x / np.linalg.norm(x)
+    return RotationMatrix(np.column_stack([x, np.cross(z, x), z]))
+
+
+def joint_speed(arm: ArmModel, corners: tuple[Array, ...], speed_m_s: float) -> float:
+    """Speed (rad/s) of the fastest joint at which no leg between corners moves the flange faster than ``speed_m_s``."""
+    slowest = np.inf
+    for k, a in enumerate(corners):
+        b = corners[(k + 1) % len(corners)]
+        p = np.array([forward_kinematics(arm, a + s * (b - a)).translation() for s in np.linspace(0.0, 1.0, 17)])
+        metres = float(np.linalg.norm(np.diff(p, axis=0), axis=1).max()) * 16.0
+        slowest = min(slowest, speed_m_s * float(np.abs(b - a).max()) / metres)
+    return float(slowest)
+
+
+JOB = Motion()

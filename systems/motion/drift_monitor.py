@@ -1,0 +1,198 @@
+"""DriftMonitor: tests a calibration on streamed observations of the flange and says whether the scanner has moved."""
+
+import copy
+import dataclasses as dc
+from typing import Any
+
+import numpy as np
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
+
+from weldcal.calibration.data.scanner_clock import ScannerClock
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.motion.drift import WARM_UP, DriftConfig, DriftEvent, DriftTest
+from weldcal.calibration.motion.drift_rows import TrackedFrame, tracked_rows
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
+from weldcal.systems.messages import FlangeEstimate, Message
+from weldcal.systems.motion.pose_recorder import PoseHistory
+
+_HALF_S = 0.01  # about a capture: its velocity
+_RECENT = 400  # frames that the view shows
+
+
+@dc.dataclass(frozen=True, eq=False)
+class MonitoredCalibration:
+    """What is watched: X_BC with its covariance (6, 6) [rotation; translation] about the camera's origin, the scanner's correction
+    and its clock. Without a clock a streamed frame was captured ``delay_s`` before its arrival."""
+
+    X_BC: RigidTransform
+    covariance: Array
+    correction: ScannerCorrection = dc.field(default_factory=ScannerCorrection)
+    clock: ScannerClock | None = None
+    delay_s: float = 0.0
+
+
+@dc.dataclass(frozen=True, eq=False)
+class DriftStatus(Message):
+    """The state of the watch after its newest frame. ``recent`` (n, 5): time s, error (3) m, offset of the frame's time s.
+
+    ``X_BC`` with its ``covariance`` (6, 6) is the scanner's pose by all frames since the last change: the recalibration.
+    ``alarmed``: a change is being measured; ``events``: those that were measured.
+    """
+
+    sequence: int = 0
+    frames: int = 0
+    dropped: int = 0
+    recent: Array = dc.field(default_factory=lambda: np.empty((0, 5)))
+    statistic: float = 0.0
+    threshold: float = np.inf
+    alarmed: bool = False
+    events: tuple[DriftEvent, ...] = ()
+    X_BC: RigidTransform | None = None
+    covariance: Array | None = None
+    recalibrations: int = 0
+
+    @property
+    def moved(self) -> bool:
+        """Whether the scanner, or the robot's base, has moved, as far as is known now."""
+        return self.alarmed or any(e.kind != WARM_UP for e in self.events)
+
+    @property
+    def summary(self) -> str:
+        """What was found, in one sentence; empty where nothing was."""
+        moves = [e for e in self.events if e.kind != WARM_UP]
+        if moves:
+            e = moves[-1]
+            size, angle = 1e3 * np.linalg.norm(e.translation_m), np.degrees(np.linalg.norm(e.rotation_rad))
+            return f"The scanner's pose changed by {size:.2f} mm and {angle:.3f} degrees at {e.time_s:.1f} s ({e.cause}); calibrate again."
+        if self.alarmed:
+            return "The scanner's pose has changed; how far is being measured. Calibrate again."
+        return ""
+
+
+@dc.dataclass(frozen=True, eq=False)
+class _Watch(Message):
+    """The status and the test behind it, which is copied before it is changed."""
+
+    status: DriftStatus = dc.field(default_factory=DriftStatus)
+    test: DriftTest | None = None
+    watched: MonitoredCalibration | None = None
+    pivot: Array | None = None
+    asked: bool = False
+
+
+class DriftMonitor(LeafSystem):
+    """Feeds each new estimate of the flange, with the arm's pose at its capture, to the drift test.
+
+    .. pydrake_system::
+
+        name: DriftMonitor
+        input_ports:
+        - flange_estimate
+        - history
+        - recalibrate
+        output_ports:
+        - drift
+        - moved
+
+    `drift` is a `DriftStatus`; `moved` (1) is 1 from an alarm on. When `recalibrate` (1, may stay open) rises, the pose that the
+    frames since the last change show becomes the calibration that is watched. All state is in the Context. Theory: docs/drift.md.
+    """
+
+    def __init__(
+        self, arm: ArmModel, X_FR: RigidTransform, calibration: MonitoredCalibration, config: DriftConfig | None = None,
+        period_s: float = 0.02,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self._arm, self._X_FR, self._config = arm, X_FR, config
+        self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
+        self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
+        self._recalibrate = self.DeclareVectorInputPort("recalibrate", 1)
+        first = _Watch(DriftStatus(X_BC=calibration.X_BC, covariance=calibration.covariance), watched=calibration)
+        self._state = self.DeclareAbstractState(AbstractValue.Make(first))
+        ticket = {self.abstract_state_ticket(self._state)}
+        self.DeclareAbstractOutputPort("drift", lambda: AbstractValue.Make(DriftStatus()), self._drift_out, ticket)
+        self.DeclareVectorOutputPort("moved", 1, self._moved_out, ticket)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
+
+    def status(self, context: Context) -> DriftStatus:
+        """The status in this system's context."""
+        watch: _Watch = context.get_abstract_state(self._state).get_value()
+        return watch.status
+
+    def _update(self, context: Context, state: State) -> None:
+        old: _Watch = context.get_abstract_state(self._state).get_value()
+        asked = self._recalibrate.HasValue(context) and float(self._recalibrate.Eval(context)[0]) > 0.5
+        new = old
+        if asked != old.asked:
+            new = dc.replace(recalibrated(new) if asked else new, asked=asked)
+        estimate: FlangeEstimate = self._estimate.Eval(context)
+        if estimate.sequence > old.status.sequence:
+            history: PoseHistory = self._history.Eval(context)
+            new = watched_frame(new, estimate, history, self._arm, self._X_FR, self._config)
+        if new is not old:
+            state.get_mutable_abstract_state(self._state).set_value(new)
+
+    def _drift_out(self, context: Context, output: Any) -> None:
+        output.set_value(self.status(context))
+
+    def _moved_out(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self.status(context).moved))
+
+
+def watched_frame(
+    watch: _Watch, estimate: FlangeEstimate, history: PoseHistory, arm: ArmModel, X_FR: RigidTransform, config: DriftConfig | None
+) -> _Watch:  # fmt: skip
+    """The watch after one more estimate; a frame without a fit, a time or a pose of the arm is counted as dropped."""
+    status = dc.replace(watch.status, sequence=estimate.sequence)
+    frame = _tracked(watch.watched, estimate, history, arm, X_FR)
+    if frame is None or watch.watched is None:
+        return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
+    pivot = frame.p_BR if watch.pivot is None else watch.pivot
+    c = watch.watched
+    test = DriftTest(c.X_BC, c.covariance, pivot, config) if watch.test is None else copy.deepcopy(watch.test)
+    rows = tracked_rows(c.X_BC, pivot, [frame])
+    events = test.update(rows)
+    X, covariance = test.current()
+    row = np.concatenate([[frame.time], rows.residuals[0, :3], [test.clock_s]])
+    status = dc.replace(
+        status, frames=status.frames + 1, recent=np.vstack([status.recent[1 - _RECENT :], row]), statistic=test.statistic,
+        threshold=test.threshold, alarmed=test.alarmed, events=(*status.events, *events), X_BC=X, covariance=covariance,
+    )  # fmt: skip
+    return dc.replace(watch, status=status, test=test, pivot=pivot)
+
+
+def recalibrated(watch: _Watch) -> _Watch:
+    """The watch of the pose that the frames since the last change show; events and alarms are cleared."""
+    status, c = watch.status, watch.watched
+    if c is None or status.X_BC is None or status.covariance is None or status.alarmed:
+        return watch  # a change that is still being measured is no pose to go on with
+    watched = dc.replace(c, X_BC=status.X_BC, covariance=status.covariance)
+    status = dc.replace(status, events=(), statistic=0.0, recalibrations=status.recalibrations + 1)
+    return dc.replace(watch, status=status, test=None, watched=watched)
+
+
+def _tracked(
+    c: MonitoredCalibration | None, estimate: FlangeEstimate, history: PoseHistory, arm: ArmModel, X_FR: RigidTransform
+) -> TrackedFrame | None:
+    """A frame with the feature's pose and rates at its capture; None where one of them is missing."""
+    fit = estimate.fit
+    if fit is None or c is None:
+        return None
+    time: float | None = estimate.capture_time
+    if np.isfinite(estimate.arrival_time):  # streamed: when it was captured is not known
+        time = None if c.clock is None else c.clock.capture(estimate.arrival_time, estimate.device_time)
+        time = estimate.arrival_time - c.delay_s if time is None else time
+    assert time is not None
+    X = [history.pose_at(arm, t) for t in (time - _HALF_S, time, time + _HALF_S)]
+    before, now, after = (None if x is None else (x @ X_FR).GetAsMatrix4() for x in X)
+    if now is None or before is None or after is None:
+        return None
+    rates = (after - before) / (2.0 * _HALF_S)
+    p_C, n_C = c.correction.points(fit.center_C), c.correction.normals(fit.center_C, fit.normal_C)
+    return TrackedFrame(
+        str(estimate.sequence), time, now[:3, 3], now[:3, 2], rates[:3, 3], rates[:3, 2], p_C, n_C,
+        fit.center_covariance, fit.normal_sigma,
+    )  # fmt: skip

@@ -1,0 +1,99 @@
+"""DriftMonitor: a knock raises `moved`, is measured, and the recalibrated pose is the new one; all state is in the Context."""
+
+import numpy as np
+import pytest
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.models.arrays import Array
+from weldcal.systems.messages import FlangeEstimate
+from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
+from weldcal.systems.motion.pose_recorder import PoseHistory
+
+ARM = load_arm("ur10e")
+X_BC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [-0.6, -0.2, 1.1])
+SHIFT = np.array([0.3e-3, 0.0, -0.4e-3])
+DELAY_S, KNOCK_S = 0.14, 8.0
+SIGMA_M, SIGMA_RAD = 3e-5, 4e-4
+
+
+def joints(t: Array) -> Array:
+    """Joint angles (n, 6) of a slow dance near one pose."""
+    base = np.array([0.3, -1.6, 2.0, -2.0, -1.5, 0.3])
+    wave = np.column_stack([np.sin((0.7 + 0.2 * k) * t + k) for k in range(6)])
+    return base + 0.08 * wave
+
+
+def estimate(k: int, t: float, rng: np.random.Generator, *, seen: bool = True) -> FlangeEstimate:
+    """Estimate k of a frame captured at ``t`` s, after the knock from a scanner that stands elsewhere."""
+    X = RigidTransform(X_BC.rotation(), X_BC.translation() + SHIFT * (t > KNOCK_S))
+    X_CR = X.InvertAndCompose(forward_kinematics(ARM, joints(np.array([t]))[0]))
+    n = X_CR.rotation().matrix()[:, 2] + SIGMA_RAD * rng.standard_normal(3)
+    center = X_CR.translation() + SIGMA_M * rng.standard_normal(3)
+    fit = FlangeFit(
+        center, n / np.linalg.norm(n), SIGMA_M**2 * np.eye(3), SIGMA_RAD, 1e-4, 1e-4, 0.0315, None, 1000, 100, 1.0
+    )
+    return FlangeEstimate(k, t, "stream", fit=fit if seen else None, arrival_time=t + DELAY_S)
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[list[DriftStatus], list[float], DriftStatus]:
+    """The status after each frame, the port `moved`, and the status after a recalibration at the end."""
+    rng = np.random.default_rng(1)
+    watched = MonitoredCalibration(X_BC, np.diag([1e-9] * 6), delay_s=DELAY_S)
+    monitor = DriftMonitor(ARM, RigidTransform(), watched)
+    context = monitor.CreateDefaultContext()
+    times = np.arange(0.0, 16.0, 0.008)
+    history = PoseHistory(times, joints(times))
+    monitor.GetInputPort("history").FixValue(context, AbstractValue.Make(history))
+    monitor.GetInputPort("recalibrate").FixValue(context, [0.0])
+    port = monitor.GetInputPort("flange_estimate").FixValue(context, AbstractValue.Make(FlangeEstimate()))
+    found, moved = [], []
+
+    def tick() -> None:
+        monitor._update(context, context.get_mutable_state())
+
+    for k, t in enumerate(np.arange(0.3, 14.0, 0.05)):
+        port.GetMutableData().set_value(estimate(k + 1, float(t), rng, seen=k != 30))
+        tick()
+        found.append(monitor.GetOutputPort("drift").Eval(context))
+        moved.append(float(monitor.GetOutputPort("moved").Eval(context)[0]))
+    monitor.GetInputPort("recalibrate").FixValue(context, [1.0])
+    tick()
+    return found, moved, monitor.GetOutputPort("drift").Eval(context)
+
+
+def test_moved_rises_after_the_knock_and_stays(run: tuple[list[DriftStatus], list[float], DriftStatus]) -> None:
+    _, moved, _ = run
+    times = np.arange(0.3, 14.0, 0.05)
+    first = float(times[moved.index(1.0)])
+    assert KNOCK_S < first < KNOCK_S + 2.0
+    assert all(moved[moved.index(1.0) :])
+
+
+def test_the_move_is_measured(run: tuple[list[DriftStatus], list[float], DriftStatus]) -> None:
+    found, _, _ = run
+    (e,) = found[-1].events
+    assert e.translation_m == pytest.approx(SHIFT, abs=5e-5)
+    assert abs(e.time_s - KNOCK_S) < 0.25
+    assert "0.5" in found[-1].summary
+    assert found[-1].frames == len(found) - 1
+    assert found[-1].dropped == 1
+    assert np.isfinite(found[-1].recent).all()
+
+
+def test_an_earlier_status_does_not_change(run: tuple[list[DriftStatus], list[float], DriftStatus]) -> None:
+    found, _, _ = run
+    assert not found[100].moved
+    assert found[100].events == ()
+    assert found[100].summary == ""
+
+
+def test_a_recalibration_takes_the_new_pose(run: tuple[list[DriftStatus], list[float], DriftStatus]) -> None:
+    _, _, after = run
+    assert after.recalibrations == 1
+    assert not after.moved
+    assert after.X_BC is not None
+    assert after.X_BC.translation() - X_BC.translation() == pytest.approx(SHIFT, abs=8e-5)

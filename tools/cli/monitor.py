@@ -1,0 +1,81 @@
+"""weldcal monitor: watches a calibration while the arm moves."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from weldcal.tools.cli.options import Call, FlangeOption, Outcome, command, option, switch
+
+
+@command("monitor", short_help="Watch a calibration while the arm moves.")
+def monitor(
+    call: Call,
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FOLDER",
+            help="A recording in motion: dataset.yaml (mode: motion), stream.csv, frames.csv, clouds/.",
+        ),
+    ],
+    calibration: Annotated[
+        Path, option("--calibration", "RESULT", "The calibration: its folder, or its calibration.yaml.")
+    ],
+    flange: FlangeOption = None,
+    false_alarms: Annotated[float, option("--false-alarms", "N", "False alarms per hour that are accepted.")] = 1e-3,
+    recalibrate: Annotated[
+        bool, switch("--recalibrate", "Write the scanner's pose after the last change to recalibrated/.")
+    ] = False,
+) -> Outcome:
+    """Track the flange through a recording and test the calibration: has the scanner moved, when, by how much, which way.
+
+    Times are on the robot's clock. Translation and rotation are those of the scanner about its own origin, in the robot's base.
+    """
+    from weldcal.tools.commands.monitor import monitor_recording
+
+    report = monitor_recording(
+        recording,
+        calibration,
+        call.folder("monitor", recording.resolve().name),
+        flange=flange,
+        false_alarms_per_hour=false_alarms,
+        recalibrate=recalibrate,
+        seed=call.seed,
+        progress=call.progress,
+    )
+    summary = report.summary()
+    values = {
+        key: summary[key]
+        for key in ("verdict", "cause", "rms_mm", "rms_before_synchronisation_mm", "frames", "dropped", "delay_ms")
+    }
+    rows = {
+        f"{e.kind} at {e.time_s:.2f} s": f"{d['translation_mm']:.3f} mm, {d['rotation_deg']:.4f} deg, found at {e.found_s:.2f} s"
+        for e, d in zip(report.moves, summary["drift"], strict=True)
+    }
+    return Outcome(summary, values=values, rows=rows)
+
+
+@command("benchmark drift")
+def benchmark_drift(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Recordings with a knock: every other one shifts, turns.", min=2)] = 200,
+    creeps: Annotated[int, option("--creeps", "N", "Recordings with a creep.", min=1)] = 8,
+    hours: Annotated[float, option("--hours", "H", "Simulated hours in which nothing happens.", min=0.01)] = 10.0,
+    stamps: Annotated[str, option("--stamps", "KIND", "device (0.1 ms) or arrival (15 ms, skewed).")] = "device",
+    quick: Annotated[bool, switch("--quick", "Few recordings and minutes: seconds instead of an hour.")] = False,
+) -> Outcome:
+    """Measure the drift test: how soon knocks of 0.2 mm or 0.03 degrees and creeps are found, and false alarms."""
+    from weldcal.models.errors import InputError
+    from weldcal.tools.studies.motion.drift import Size, run_drift_study
+    from weldcal.tools.studies.targets import print_targets
+
+    if stamps not in ("device", "arrival"):
+        raise InputError(f"Stamps are 'device' or 'arrival', not '{stamps}'.")
+    size = Size(2, 1, 0.01) if quick else Size(runs, creeps, hours)
+    result, targets = run_drift_study(
+        call.folder("benchmark", "drift"), size, stamps=stamps, seed=call.seed, progress=call.progress
+    )
+    return Outcome(result, text=lambda: print_targets("Drift", targets))
+
+
+COMMANDS = (benchmark_drift,)

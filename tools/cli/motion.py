@@ -1,0 +1,59 @@
+"""weldcal reproduce motion-data: calibration in motion, simulated."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from weldcal.tools.cli.options import Call, command, option, switch
+
+
+@command("reproduce motion-data")
+def motion_data(
+    call: Call,
+    frames: Annotated[int, option("--frames", "N", "Frames that the scanner captures.", min=1)] = 900,
+    robot: Annotated[str, option("--arm", "NAME", "A UR arm.")] = "ur5e",
+    scanner: Annotated[str, option("--scanner", "NAME", "A streaming scanner.")] = "motioncam_3d_stream",
+    width: Annotated[
+        int | None, option("--width", "PX", "Resize the scanner's image.", min=64, show_default="its own")
+    ] = None,
+    move: Annotated[str, option("--move", "NAME", "moveJ or moveL.")] = "moveJ",
+    speed: Annotated[float, option("--speed", "M/S", "Largest speed of the flange.", min=0.001)] = 0.25,
+    noise_mm: Annotated[
+        float | None, option("--noise-mm", "MM", "Noise of one pixel at the best distance.", show_default="its own")
+    ] = None,
+    readout_ms: Annotated[float, option("--readout-ms", "MS", "From the first to the last row.", min=0.0)] = 0.0,
+    stream_hz: Annotated[float, option("--stream-hz", "HZ", "Rate of the robot's stream.")] = 500.0,
+    poses: Annotated[bool, switch("--poses", "Write flange poses to the stream, not joint angles.")] = False,
+    device_clock: Annotated[
+        bool, switch("--device-clock/--no-device-clock", "With the device's stamps, or arrivals only.")
+    ] = True,
+    surroundings: Annotated[
+        bool, switch("--surroundings/--no-surroundings", "Show the table and blocks on it too.")
+    ] = True,
+    knock: Annotated[
+        str, option("--knock", "T,X,Y,Z[,R,P,Y]", "The scanner jumps: s, mm, degrees.", show_default="none")
+    ] = "",
+    creep: Annotated[
+        str, option("--creep", "T,X,Y,Z", "The scanner creeps from then on: s, mm/min.", show_default="none")
+    ] = "",
+    base: Annotated[
+        str, option("--base", "T,X,Y,Z[,R,P,Y]", "The robot's base jumps: s, mm, degrees.", show_default="none")
+    ] = "",
+    warm_up: Annotated[
+        str,
+        option("--warm-up", "TAU,PPM[,PPM/M]", "The scanner's scale error dies away: s, ppm.", show_default="none"),
+    ] = "",
+) -> Mapping[str, object]:
+    """Write a simulated recording in motion: a UR arm moves through a cube's corners, seen by a streaming scanner.
+
+    The recording is the folder 'dataset', the truth of pose and clock the file truth.json beside it.
+    """
+    from weldcal.tools.studies.motion.command import DataRequest, write_motion_data
+
+    request = DataRequest(
+        call.folder("reproduce", "motion-data"), call.seed, frames, robot, scanner, width, move, speed, noise_mm, readout_ms,
+        stream_hz, poses, device_clock, surroundings, knock, creep, base, warm_up,
+    )  # fmt: skip
+    return write_motion_data(request, call.progress)
+
+
+COMMANDS = (motion_data,)

@@ -1,0 +1,148 @@
+"""`weldcal calibrate DATASET` on a recording in motion: estimates X_BC and the scanner's clock, writes exports and a report."""
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pydrake.math import RigidTransform
+
+from weldcal.calibration.data.motion_dataset import load_motion_dataset
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
+from weldcal.calibration.motion.frames import see_frames
+from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.observability import turn_deg
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.tools.console import Progress
+from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.motion import MotionReport
+from weldcal.tools.report.files import csv_text
+from weldcal.tools.report.motion_calibration import motion_report
+from weldcal.tools.report.render import write_atomic
+
+_TURN_DEG = 3.0  # orientations closer than this are one orientation to a calibration
+_MOST_TURNED = 50  # poses whose orientations are compared
+
+
+def calibrate_motion(
+    folder: Path,
+    out: Path,
+    *,
+    robot: str | None = None,
+    flange: str | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+    centres: bool = False,
+) -> MotionReport:
+    """Calibrate from a recording in motion and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
+
+    ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, with the capture time).
+    A frame that cannot be used is refused and reported. No scanner correction is estimated: a stream through a few places cannot
+    tell it from the clock. Nothing is written unless the calibration succeeded.
+
+    Raises:
+        InputError: the data cannot be used, or the motion leaves X_BC open; TooFewPoses: too few frames can be used.
+    """
+    started = time.monotonic()
+    tell: Progress = progress or (lambda stage, fraction: None)
+    if Path(out).exists() and not Path(out).is_dir():
+        raise InputError(f"'{out}' is a file. Give a folder for the result.")
+    data = load_motion_dataset(Path(folder), robot=robot)
+    standard = get_flange(flange or data.header.flange)
+    motion = ContinuousMotion(data.stream)
+    seen = see_frames(data, standard, motion, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.8 * fraction))
+    frames = seen.observed
+    tell("solving", 0.8)
+    X_FR = data.X_FR
+    estimate = estimate_in_motion(frames, motion, X_FR)
+    outliers = tuple(
+        id
+        for id, keep, r in zip(frames.ids, estimate.inliers, estimate.residual_m, strict=True)
+        if not keep and np.isfinite(r)
+    )
+    refused = [*seen.refused, *_reasons(frames, estimate)]
+    warnings = [*data.warnings, *estimate.warnings]
+    shown = data.stream.poses[:: max(1, len(data.stream.poses) // _MOST_TURNED)]
+    if turn_deg([RigidTransform(X) for X in shown]) < _TURN_DEG:
+        warnings.append(
+            "The orientation hardly changes, so the motion cannot show a TCP that is set at the robot: it would shift X_BC by its own "
+            "length. Check that the TCP is zero, or tilt the flange on the way."
+        )
+    used = estimate.inliers
+    result = CalibrationResult(
+        X_BC=estimate.X_BC,
+        covariance=estimate.covariance,
+        held_out_mm=error_summary(1e3 * estimate.held_out_m[used]),
+        tilt_deg=_tilts(estimate),
+        poses=_records(frames, estimate, refused),
+        unobservable=estimate.unobservable,
+        warnings=tuple(warnings),
+        robot=robot or data.header.robot,
+        flange=standard.designation,
+        scanner=data.header.scanner,
+        sigma_position_mm=1e3 * estimate.sigma_position_m,
+        sigma_normal_deg=float(np.degrees(estimate.sigma_normal_rad)),
+        seed=seed,
+        data_hashes=data.hashes,
+        software=software_version(),
+        clock=estimate.clock,
+        clock_covariance=estimate.joint,
+    )
+    report = MotionReport(result, estimate, frames, tuple(refused), outliers, time.monotonic() - started, Path(out))
+    tell("writing the report", 0.95)
+    write_atomic(Path(out) / "report.html", motion_report(report, dataset=Path(folder).name))
+    export_all(result, Path(out))
+    if centres:
+        write_atomic(Path(out) / "centres.csv", _centres_csv(frames, estimate))
+    # last, so that its presence means that everything else is there
+    save_result(result, Path(out))
+    report = replace(report, seconds=time.monotonic() - started)
+    tell("done", 1.0)
+    return report
+
+
+def _reasons(frames: ObservedFrames, estimate: MotionEstimate) -> list[tuple[str, str]]:
+    """Frames that show the flange and are not used, with the reason."""
+    return [
+        (
+            id,
+            f"It disagrees by {1e3 * r:.1f} mm with the other frames; it is not used."
+            if np.isfinite(r)
+            else "The robot's stream has no data for its time; it is not used.",
+        )
+        for id, keep, r in zip(frames.ids, estimate.inliers, estimate.residual_m, strict=True)
+        if not keep
+    ]
+
+
+def _tilts(estimate: MotionEstimate) -> dict[str, float | None]:
+    s = error_summary(np.degrees(estimate.held_out_tilt_rad[estimate.inliers]))
+    return {k: s[k] if np.isfinite(s[k]) else None for k in ("median", "p95")}
+
+
+def _records(
+    frames: ObservedFrames, estimate: MotionEstimate, refused: list[tuple[str, str]]
+) -> tuple[PoseRecord, ...]:
+    reasons = dict(refused)
+    records = []
+    for k, id in enumerate(frames.ids):
+        values = (
+            1e3 * estimate.residual_m[k],
+            1e3 * estimate.held_out_m[k],
+            np.degrees(estimate.tilt_rad[k]),
+            np.degrees(estimate.held_out_tilt_rad[k]),
+        )
+        numbers = [float(v) if np.isfinite(v) else None for v in values]
+        records.append(PoseRecord(id, bool(estimate.inliers[k]), reasons.pop(id, ""), *numbers))
+    return (*records, *(PoseRecord(i, False, t) for i, t in reasons.items()))
+
+
+def _centres_csv(frames: ObservedFrames, estimate: MotionEstimate) -> str:
+    rows = [
+        [id, f"{t:.6f}", *(f"{v:.9f}" for v in (*p, *n))]
+        for id, t, p, n in zip(frames.ids, estimate.capture, frames.p_C, frames.n_C, strict=True)
+    ]
+    return csv_text(("id", "capture", *(f"{what}_{axis}" for what in ("centre", "normal") for axis in "xyz")), rows)

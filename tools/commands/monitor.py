@@ -1,0 +1,125 @@
+"""`weldcal monitor FOLDER --calibration RESULT`: tracks the flange through a recording in motion and tests for drift."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.calibration.data.checks import read_header
+from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
+from weldcal.calibration.data.results import CalibrationResult, export_all, load_result, save_result, software_version
+from weldcal.calibration.motion.drift import DriftConfig
+from weldcal.calibration.motion.frames import FramesSeen, see_frames
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.motion.watch import Watched, watch
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.tools.console import Progress
+from weldcal.tools.outcomes.monitor import MonitorReport
+from weldcal.tools.report.monitor import monitor_page
+from weldcal.tools.report.render import write_atomic
+
+_FEW = 40  # frames: fewer leave the noise, and so small changes, open
+
+
+def monitor_recording(
+    folder: Path,
+    calibration: Path,
+    out: Path,
+    *,
+    flange: str | None = None,
+    false_alarms_per_hour: float = DriftConfig.false_alarms_per_hour,
+    recalibrate: bool = False,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> MonitorReport:
+    """Watch a calibration (its folder or calibration.yaml) over a recording in motion; write report.html and monitor.json.
+
+    The clock's offset is estimated from the recording itself; the calibration's is used where the recording does not show it.
+    ``flange`` overrides dataset.yaml. With ``recalibrate`` the pose that the frames since the last change show is written to
+    ``out``/recalibrated. Raises InputError: the result or the recording cannot be used; TooFewPoses: no frames show the flange.
+    """
+    started = time.monotonic()
+    tell: Progress = progress or (lambda stage, fraction: None)
+    if not 0.0 < false_alarms_per_hour <= 3600.0:
+        raise InputError(
+            f"The rate of false alarms must be positive and at most 3600 per hour, not {false_alarms_per_hour:g}."
+        )
+    if Path(out).exists() and not Path(out).is_dir():
+        raise InputError(f"'{out}' is a file. Give a folder for the result.")
+    result = load_result(Path(calibration))
+    data = load_motion_dataset(Path(folder), robot=read_header(Path(folder) / "dataset.yaml").robot or result.robot)
+    standard = get_flange(flange or data.header.flange or result.flange)
+    motion = ContinuousMotion(data.stream)
+    seen = see_frames(
+        data, standard, motion, X_BC=result.X_BC, seed=seed,
+        tell=lambda fraction: tell("tracking the flange", 0.85 * fraction),
+    )  # fmt: skip
+    tell("testing for drift", 0.85)
+    config = DriftConfig(false_alarms_per_hour=false_alarms_per_hour)
+    watched = watch(result, seen.observed, motion, X_FR=data.X_FR, dropped=seen.refused, config=config)
+    recalibrated = _recalibrated(result, watched, data, standard.designation, seed) if recalibrate else None
+    report = MonitorReport(
+        watched, result, recalibrated, _cause(watched), false_alarms_per_hour,
+        (*data.warnings, *_warnings(result, data, watched, seen, standard.designation)), time.monotonic() - started, Path(out),
+    )  # fmt: skip
+    tell("writing the report", 0.95)
+    write_atomic(Path(out) / "report.html", monitor_page(report, recording=Path(folder).resolve().name))
+    if recalibrated is not None:
+        export_all(recalibrated, Path(out) / "recalibrated")
+        save_result(recalibrated, Path(out) / "recalibrated")
+    # last, so that its presence means that everything else is there
+    write_atomic(Path(out) / "monitor.json", json.dumps(report.summary(), indent=2, allow_nan=False) + "\n")
+    tell("done", 1.0)
+    return report
+
+
+def _recalibrated(
+    result: CalibrationResult, watched: Watched, data: MotionDataset, flange: str, seed: int
+) -> CalibrationResult:
+    """The calibration as it is at the end of the recording, from all frames since the last change and the calibration before it."""
+    held = 1e3 * np.linalg.norm(watched.after[~watched.gross & (watched.rows.times >= watched.since_s)], axis=1)
+    errors = {"median": float(np.median(held)), "mean": float(held.mean()), "p95": float(np.percentile(held, 95.0))}
+    return replace(
+        result,
+        X_BC=watched.X_BC,
+        covariance=watched.covariance,
+        held_out_mm=errors if len(held) else result.held_out_mm,
+        poses=(),
+        icp=(),
+        warnings=(*result.warnings, f"Recalibrated in motion from frames since {watched.since_s:.3f} s (robot clock)."),
+        seed=seed,
+        flange=flange,
+        data_hashes=data.hashes,
+        joint_covariance=None,
+        clock_covariance=None,
+        software=software_version(),
+    )
+
+
+def _cause(watched: Watched) -> str:
+    """What the data tell of the cause, over all events."""
+    return "; ".join(dict.fromkeys(e.cause for e in watched.events))
+
+
+def _warnings(
+    result: CalibrationResult, data: MotionDataset, watched: Watched, seen: FramesSeen, flange: str
+) -> list[str]:
+    h, out = data.header, []
+    for what, was, now in (
+        ("robot", result.robot, h.robot), ("flange", result.flange, flange), ("scanner", result.scanner, h.scanner),
+    ):  # fmt: skip
+        if was and now and was != now:
+            out.append(f"The calibration was made with the {what} '{was}', this recording with '{now}'.")
+    if len(watched.ids) < _FEW:
+        out.append(f"Only {len(watched.ids)} frames show the flange; small changes cannot be found in so few.")
+    clock = watched.clock
+    if clock.delay_s is None:
+        out.append("The motion does not show when the frames were taken: their arrivals are used as they are.")
+    elif clock.source == "calibration":
+        out.append("The motion does not show when the frames were taken: the calibration's clock is used.")
+    if len(seen.refused) > len(watched.ids):
+        out.append(f"{len(seen.refused)} of {len(data.frames)} frames do not show the flange well enough.")
+    return out

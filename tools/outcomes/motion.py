@@ -1,0 +1,87 @@
+"""The result of `weldcal calibrate` on a recording in motion, and its JSON object."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from weldcal.calibration.data.results import CalibrationResult, matrix4
+from weldcal.calibration.motion.estimate import MotionEstimate
+from weldcal.calibration.motion.observed import ObservedFrames
+
+
+@dataclass(frozen=True, eq=False)
+class MotionReport:
+    """The estimate, the records written, and the folder. ``dropped``: frames of the recording that no estimate used."""
+
+    result: CalibrationResult
+    estimate: MotionEstimate
+    frames: ObservedFrames
+    refused: tuple[tuple[str, str], ...]
+    outliers: tuple[str, ...]
+    seconds: float
+    out: Path
+
+    @property
+    def rms_mm(self) -> float:
+        """Rms distance of the used frames' centres at their capture times, mm."""
+        e = self.estimate
+        return 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2)))
+
+    @property
+    def along_rms_mm(self) -> tuple[float, float]:
+        """Rms residual along the motion, mm: arrivals taken for captures, and by the clock that was found."""
+        e = self.estimate
+        used = e.inliers & np.isfinite(e.before_m) & np.isfinite(e.along_m)
+        if not used.any():
+            return float("nan"), float("nan")
+        before, after = (1e3 * float(np.sqrt(np.mean(x[used] ** 2))) for x in (e.before_m, e.along_m))
+        return before, after
+
+    def summary(self) -> dict[str, Any]:
+        """The JSON object of `calibrate` in motion: the keys of the calibration at rest, and those of the clock."""
+        e, r = self.estimate, self.result
+        clock = e.clock
+        before, after = (None if not np.isfinite(v) else v for v in self.along_rms_mm)
+        return {
+            "state": "done",
+            "mode": "motion",
+            "n_used": int(e.inliers.sum()),
+            "refused": [{"id": i, "reason": t} for i, t in self.refused],
+            "X_BC": matrix4(r.X_BC),
+            "covariance": r.covariance.tolist(),
+            "clock_offset_ms": _ms(clock.offset_s),
+            "clock_offset_sigma_ms": _ms(clock.sigma_s),
+            "clock": clock.kind,
+            "clock_reason": clock.reason,
+            "clock_jitter_ms": _ms(clock.jitter_s),
+            "clock_drift_ppm": None if clock.drift is None else 1e6 * clock.drift,
+            "clock_drift_sigma_ppm": None if clock.drift_sigma is None else 1e6 * clock.drift_sigma,
+            "clock_reference_s": clock.reference_s,
+            "rolling_ms": _ms(clock.rolling_s),
+            "late": list(clock.late),
+            "scanner_correction": None,
+            "held_out_mm": {k: _number(r.held_out_mm[k]) for k in ("median", "mean", "p95")},
+            "held_out_interval_mm": None,
+            "tilt_deg": r.tilt_deg,
+            "rms_mm": self.rms_mm,
+            "along_motion_rms_mm": {"before": before, "after": after},
+            "outliers": list(self.outliers),
+            "warnings": list(r.warnings),
+            "unobservable": list(r.unobservable),
+            "seconds": self.seconds,
+            "k_fold_mm": {k: _number(v) for k, v in r.held_out_mm.items()},
+            "axis_turn_deg": None,
+            "advice": [],
+            "features": [],
+            "algorithm1": None,
+        }
+
+
+def _ms(seconds: float | None) -> float | None:
+    return None if seconds is None else 1e3 * seconds
+
+
+def _number(value: float) -> float | None:
+    return value if np.isfinite(value) else None

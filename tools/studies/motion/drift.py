@@ -1,0 +1,176 @@
+"""`weldcal benchmark drift`: knocks, creeps and quiet hours of a watched calibration, on a world of features."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from weldcal.calibration.motion.drift import DriftConfig, DriftEvent, DriftTest
+from weldcal.models.arrays import Array
+from weldcal.tools.console import Progress
+from weldcal.tools.report.files import records_csv, write_json
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.motion.feature_world import Change, WorldConfig, simulate
+from weldcal.tools.studies.targets import Target, all_met
+
+SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
+WITHIN_S = 2.0
+CREEP_M_S, CREEP_MOST_M = 2e-5 / 60.0, 2e-4
+_KNOCK_S, _AFTER_S = (25.0, 35.0), 10.0
+_CREEP_START_S = 60.0
+_CHUNK = 200  # frames handed over at a time
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was measured.
+    ``along_view`` is the cosine between the change's axis and the line of sight."""
+
+    kind: str
+    seed: int
+    along_view: float
+    found_after_s: float
+    time_error_s: float
+    translation_error_mm: float
+    rotation_error_deg: float
+    named: str
+    false_alarms: int
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is run: knocks, creeps, quiet hours."""
+
+    knocks: int = 200
+    creeps: int = 8
+    hours: float = 10.0
+
+
+def run_drift_study(
+    out: Path | None, size: Size, *, stamps: str = "device", seed: int = 0, progress: Progress | None = None
+) -> tuple[dict[str, object], list[Target]]:
+    """Run the trials; write trials.csv and result.json to ``out``. The result's state is "failed" where a target is missed."""
+    tell: Progress = progress or (lambda stage, fraction: None)
+    world = WorldConfig(stamps=stamps)
+    trials: list[Trial] = []
+    for k in range(size.knocks):
+        tell("knocks", 0.3 * k / size.knocks)
+        trials.append(knock_trial(world, seed + k, turn=k % 2 == 1))
+    for k in range(size.creeps):
+        tell("creeps", 0.3 + 0.1 * k / size.creeps)
+        trials.append(creep_trial(world, seed + 5000 + k))
+    alarms, largest, threshold = quiet_hours(
+        world, size.hours, seed + 9000, lambda f: tell("quiet hours", 0.4 + 0.6 * f)
+    )
+    knocks = [t for t in trials if t.kind != "creep"]
+    found = np.array([t.found_after_s for t in knocks])
+    creeps = np.array([t.found_after_s for t in trials if t.kind == "creep"])
+    reached = 1e3 * CREEP_M_S * np.where(np.isnan(creeps), np.inf, creeps)
+    early = sum(t.false_alarms for t in trials)
+    targets = [
+        Target(f"knocks found within {WITHIN_S:g} s", "%", _percent(found <= WITHIN_S), 100.0, "≥"),
+        Target(f"false alarms in {size.hours:g} quiet hours", "", float(alarms), 0.0),
+        Target("false alarms before a change", "", float(early), 0.0),
+        Target("creep when found", "mm", float(reached.max(initial=0.0)), 1e3 * CREEP_MOST_M, over="worst"),
+    ]
+    result: dict[str, object] = {
+        "state": "done" if all_met(targets) else "failed",
+        "stamps": stamps,
+        "knocks": len(knocks),
+        "found_within_2_s": int((found <= WITHIN_S).sum()),
+        "found": int(np.isfinite(found).sum()),
+        "found_after_s": _spread(found),
+        "time_error_s": _spread(np.abs(np.array([t.time_error_s for t in knocks]))),
+        "translation_error_mm": _spread(np.array([t.translation_error_mm for t in knocks if t.kind == "shift"])),
+        "rotation_error_deg": _spread(np.array([t.rotation_error_deg for t in knocks if t.kind == "turn"])),
+        "named_right": sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in knocks),
+        "latest": [asdict(t) for t in sorted(knocks, key=lambda t: -np.nan_to_num(t.found_after_s, nan=np.inf))[:5]],
+        "creep_mm_when_found": reached.tolist(),
+        "quiet_hours": size.hours,
+        "false_alarms": alarms,
+        "largest_statistic": largest,
+        "threshold": threshold,
+        "targets": [{**t._asdict(), "met": t.met} for t in targets],
+    }
+    if out is not None:
+        write_atomic(out / "trials.csv", records_csv(trials))
+        write_json(out / "result.json", result)
+    return result, targets
+
+
+def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
+    """A recording of some 40 s with a knock of 0.2 mm, or 0.03 degrees, along or about a random axis."""
+    rng = np.random.default_rng([seed, 3])
+    axis = rng.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    at = float(rng.uniform(*_KNOCK_S))
+    shift, rotation = (np.zeros(3), TURN_RAD * axis) if turn else (SHIFT_M * axis, np.zeros(3))
+    change = Change(at, tuple(shift.tolist()), tuple(rotation.tolist()))
+    events, view = _watched(replace(world, changes=(change,)), at + _AFTER_S, seed)
+    return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)))
+
+
+def creep_trial(world: WorldConfig, seed: int) -> Trial:
+    """A recording with a creep of 0.02 mm/min in a random direction."""
+    rng = np.random.default_rng([seed, 4])
+    axis = rng.standard_normal(3)
+    axis /= np.linalg.norm(axis)
+    over = CREEP_MOST_M / CREEP_M_S
+    shift = CREEP_MOST_M * axis
+    change = Change(_CREEP_START_S, tuple(shift.tolist()), over_s=over)
+    slow = replace(world, frame_s=8.0 * world.frame_s, changes=(change,))
+    events, view = _watched(slow, _CREEP_START_S + over, seed)
+    return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)))
+
+
+def quiet_hours(
+    world: WorldConfig, hours: float, seed: int, tell: Callable[[float], None] | None = None
+) -> tuple[int, float, float]:
+    """False alarms, the largest statistic and the threshold over hours in which nothing happens."""
+    w = simulate(world, 3600.0 * hours, seed)
+    test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / world.frame_s)
+    largest = 0.0
+    for k in range(len(w.rows)):
+        test.update(w.rows.part(slice(k, k + 1)))
+        largest = max(largest, test.statistic)
+        if tell is not None and k % _CHUNK == 0:
+            tell(k / len(w.rows))
+    test.finish()
+    return len(test.events), largest, test.threshold
+
+
+def _watched(config: WorldConfig, duration_s: float, seed: int) -> tuple[list[DriftEvent], Array]:
+    """Events of a recording, and the line of sight in the base."""
+    w = simulate(config, duration_s, seed)
+    test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
+    for k in range(0, len(w.rows), _CHUNK):
+        test.update(w.rows.part(slice(k, k + _CHUNK)))
+    test.finish()
+    return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2])
+
+
+def _trial(
+    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float
+) -> Trial:
+    early = sum(e.found_s < at for e in events)
+    later = [e for e in events if e.found_s >= at]
+    if not later:
+        return Trial(kind, seed, view, *(4 * (float("nan"),)), "", early)
+    e = later[0]
+    return Trial(
+        kind, seed, view, e.found_s - at, e.time_s - at, 1e3 * float(np.linalg.norm(e.translation_m - shift)),
+        float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))), e.model, early,
+    )  # fmt: skip
+
+
+def _percent(hits: NDArray[np.bool_]) -> float:
+    return 100.0 * float(np.mean(hits)) if len(hits) else float("nan")
+
+
+def _spread(values: Array) -> dict[str, float]:
+    known = values[np.isfinite(values)]
+    if not len(known):
+        return {}
+    return {"median": float(np.median(known)), "p95": float(np.percentile(known, 95.0)), "worst": float(known.max())}
