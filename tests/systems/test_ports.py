@@ -81,6 +81,7 @@ from weldcal.systems.messages import (
     UrStatus,
 )
 from weldcal.systems.motion.command_arbiter import CommandArbiter
+from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.operator_panel import OperatorPanel
@@ -130,6 +131,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     MotionCollector: MotionCollector,
     MotionCalibrator: lambda: MotionCalibrator(the_arm()),
     MotionRecorder: lambda: MotionRecorder(Path("unused")),
+    DriftMonitor: lambda: DriftMonitor(the_arm(), X, MonitoredCalibration(X, 1e-8 * np.eye(6))),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
     IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, get_flange("tool-ring-63"), CALIBRATOR),
@@ -271,6 +273,13 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     MotionCalibrator: {"record": MotionRecord, "state": MotionState, "calibration": MotionCalibration},
     MotionRecorder: {"stream": ScanStream},
+    DriftMonitor: {
+        "flange_estimate": FlangeEstimate,
+        "history": PoseHistory,
+        "recalibrate": 1,
+        "drift": DriftStatus,
+        "moved": 1,
+    },
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {
         "scan": Scan,
@@ -345,6 +354,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "servo_report": ServoReport,
         "hold": 1,
         "arm_stopped": 1,
+        "drift": DriftStatus,
         "job": JobCommand,
         "job_state": JobState,
         "scan_trigger": 1,

@@ -57,6 +57,15 @@ finger_camera: !RenderedFingerCamera
   latency_s: 0.02
   noise_grey: 1.0
   hidden_from_s: 3.0
+motion:
+  centre_m: [0.6, 0.05, 0.35]
+  edge_mm: 150.0
+  lean_deg: 10.0
+  frames: 200
+  speed_m_s: 0.2
+  queue: 3
+  record: true
+  recording_folder: "recording"
 wrist_camera: !RenderedWristCamera
   xyz_m: [0.07, 0.01, 0.04]
   rpy_deg: [1.0, 2.0, 91.0]
