@@ -4,9 +4,9 @@ Frame S: x along the laser line, z away from the sensor, y across the plane of l
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import open3d as o3d
 from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
@@ -43,8 +43,10 @@ class ProfilerPreset:
         return np.linspace(-0.5 * self.width_m, 0.5 * self.width_m, self.samples)
 
 
-def make_scene(mesh: TriMesh) -> o3d.t.geometry.RaycastingScene:
-    """A mesh made ready for rays."""
+def make_scene(mesh: TriMesh) -> Any:
+    """A mesh made ready for rays: Open3D's RaycastingScene."""
+    import open3d as o3d  # slow to import
+
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor.from_numpy(np.asarray(mesh.vertices, np.float32)),
@@ -53,10 +55,10 @@ def make_scene(mesh: TriMesh) -> o3d.t.geometry.RaycastingScene:
     return scene
 
 
-def cast_profiles(
-    scene: o3d.t.geometry.RaycastingScene, rotation: Floats, translation: Floats, preset: ProfilerPreset
-) -> Floats:
+def cast_profiles(scene: Any, rotation: Floats, translation: Floats, preset: ProfilerPreset) -> Floats:
     """What a perfect profiler sees (n, samples, 2) [x, z] m from poses R_WS (n, 3, 3), p_WS (n, 3) m; NaN: nothing in range."""
+    import open3d as o3d  # slow to import
+
     x = preset.x_m
     start = translation[:, None] + x[None, :, None] * rotation[:, None, :, 0]
     rays = np.concatenate([start, np.broadcast_to(rotation[:, None, :, 2], start.shape)], axis=2)

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Literal, Protocol
 
 import numpy as np
-import open3d as o3d
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.flange.fit import FlangeFit
@@ -158,6 +157,8 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     its holes), the plane of a face whose chamfers were not scanned. Point-to-point registration sees less than that:
     `sight` measures how much.
     """
+    import open3d as o3d  # slow to import
+
     X_RC = verification.X_BR.inverse() @ X_BC
     source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector((X_RC @ verification.points_C.T).T))
     target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(verification.model_R))

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import open3d as o3d
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.errors import FlangeNotFound
@@ -68,6 +67,8 @@ def published_model(standard: FlangeStandard, n: int = 20_000, *, seed: int = 0)
     """The ground-true cloud of Fig. 6 in F: points (m, 3) m of a CAD model with sharp edges, sampled evenly over the face and
     the first 2 mm of its walls, and normals (m, 3) estimated from 30 neighbours within 1 mm as in the authors' program
     (which makes them lean at every edge)."""
+    import open3d as o3d  # slow to import
+
     mesh = flange_mesh(standard, chamfers=False)
     points, normals = mesh.sample(5 * n, np.random.default_rng(seed))
     near = (normals[:, 2] > -0.1) & (points[:, 2] > -0.002)
@@ -84,6 +85,8 @@ def published_icp(X_BC: RigidTransform, verification: PublishedVerification) -> 
     stop rule that depends on the unit. One is not, for the paper itself says so: without a match the error is infinite, where the
     registration returns the identity.
     """
+    import open3d as o3d  # slow to import
+
     X_CF = X_BC.InvertAndCompose(verification.X_BF)
     unit = verification.unit_m
     source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(verification.points_C / unit))

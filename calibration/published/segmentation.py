@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import open3d as o3d
 
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.models.arrays import Array
@@ -38,6 +37,8 @@ def segment_flange(
     passes (three did for the UR5, section 3.2.2). Deterministic for ``seed``. Raises FlangeNotFound, saying at which
     step nothing was left.
     """
+    import open3d as o3d  # slow to import
+
     p = parameters or SegmentationParameters()
     flat = np.asarray(points_C, dtype=float).reshape(-1, 3)
     flat = flat[np.isfinite(flat).all(axis=1)]

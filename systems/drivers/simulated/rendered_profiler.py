@@ -4,7 +4,6 @@ import dataclasses as dc
 from typing import ClassVar
 
 import numpy as np
-import open3d as o3d
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import ContactResults
@@ -96,7 +95,10 @@ class RayFan:
     """Casts the fan of rays at the objects fixed in B: meshes, and the exact sphere."""
 
     def __init__(self, config: RenderedProfiler, fixture: ProfilerFixture) -> None:
+        import open3d as o3d  # slow to import
+
         self._config = config
+        self._tensor = o3d.core.Tensor.from_numpy
         self._scene = o3d.t.geometry.RaycastingScene()
         # relative to the sphere's centre, where single precision resolves 0.1 micrometre
         self._origin = np.array(fixture.truth.center)
@@ -104,8 +106,8 @@ class RayFan:
         self._dark = []
         for mesh, dark in fixture.meshes:
             self._scene.add_triangles(
-                o3d.core.Tensor.from_numpy(np.asarray(mesh.vertices - self._origin, np.float32)),
-                o3d.core.Tensor.from_numpy(np.asarray(mesh.triangles, np.uint32)),
+                self._tensor(np.asarray(mesh.vertices - self._origin, np.float32)),
+                self._tensor(np.asarray(mesh.triangles, np.uint32)),
             )
             self._dark.append(dark)
 
@@ -117,7 +119,7 @@ class RayFan:
         start = X_BS.translation() - self._origin - c.apex_m * R[:, 2]
         d = slopes[:, None] * R[:, 0] + R[:, 2]
         rays = np.hstack([np.broadcast_to(start, d.shape), d]).astype(np.float32)
-        hit = self._scene.cast_rays(o3d.core.Tensor.from_numpy(rays))
+        hit = self._scene.cast_rays(self._tensor(rays))
         t = hit["t_hit"].numpy().astype(float)
         normal = hit["primitive_normals"].numpy().astype(float)
         number = hit["geometry_ids"].numpy().astype(np.int64)
