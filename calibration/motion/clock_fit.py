@@ -80,7 +80,7 @@ class ClockFit:
     weights: Array
 
 
-class _Problem:
+class MotionProblem:
     """Frames, clock and motion of one fit, with the state that it moves."""
 
     def __init__(
@@ -128,7 +128,7 @@ def fit_clock(
     ``after``: a fit of the same frames whose drift, rolling time, variances and capture times begin this one.
     Gauss-Newton with the pivot of rotations at the middle of the feature's places; frames with gross errors are left out.
     """
-    problem = _Problem(frames, clock, motion, X_FR)
+    problem = MotionProblem(frames, clock, motion, X_FR)
     allowed = np.isfinite(clock.base) if keep is None else keep & np.isfinite(clock.base)
     drift, rolling, edge = (0.0, 0.0, 0.0) if after is None else (after.drift, after.rolling, after.edge)
     nominal = problem.nominal(offset, drift, rolling)
@@ -147,7 +147,7 @@ def fit_clock(
     linear, information, W = None, np.eye(len(free)), np.zeros((len(frames), 5, 5))
     for step_number in range(_STEPS):
         capture = _polished_capture(problem, X_BC, nominal, capture, variances, rolling, edge, late)
-        linear = _linearised(problem, X_BC, nominal, capture, rolling, edge, pivot)
+        linear = linearised(problem, X_BC, nominal, capture, rolling, edge, pivot)
         reach = _GUARD * float(np.sqrt(variances.jitter))
         inside = motion.known(nominal - reach) & motion.known(nominal + reach) & np.isfinite(linear.y[:, 0])
         W = frame_weights(linear, variances, late)
@@ -204,7 +204,9 @@ def _tangents(n: Array) -> Array:
     return np.stack([x, np.cross(n, x)], axis=2)
 
 
-def _first_variances(problem: _Problem, X: RigidTransform, nominal: Array, allowed: Flags) -> tuple[Variances, Flags]:
+def _first_variances(
+    problem: MotionProblem, X: RigidTransform, nominal: Array, allowed: Flags
+) -> tuple[Variances, Flags]:
     """Variances from medians of the start's residuals, across and along the motion, and the frames that agree with them."""
     e, m, v, _, _ = problem.residuals(X, nominal, 0.0, 0.0)
     speed = np.linalg.norm(v, axis=1)
@@ -219,7 +221,7 @@ def _first_variances(problem: _Problem, X: RigidTransform, nominal: Array, allow
     return Variances(1.0, s_p**2, s_n**2, s_j**2), allowed & agree
 
 
-def _precision(problem: _Problem, X: RigidTransform, variances: Variances) -> tuple[Array, Array]:
+def _precision(problem: MotionProblem, X: RigidTransform, variances: Variances) -> tuple[Array, Array]:
     """Inverse covariances (N, 3, 3) of centres in the base frame, and (N,) of normals."""
     R = X.rotation().matrix()
     f = problem.frames
@@ -228,7 +230,7 @@ def _precision(problem: _Problem, X: RigidTransform, variances: Variances) -> tu
 
 
 def _searched_capture(
-    problem: _Problem,
+    problem: MotionProblem,
     X: RigidTransform,
     nominal: Array,
     variances: Variances,
@@ -250,7 +252,7 @@ def _searched_capture(
 
 
 def _polished_capture(
-    problem: _Problem,
+    problem: MotionProblem,
     X: RigidTransform,
     nominal: Array,
     capture: Array,
@@ -274,9 +276,11 @@ def _polished_capture(
     return capture
 
 
-def _linearised(
-    problem: _Problem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
+def linearised(
+    problem: MotionProblem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
 ) -> Linearised:
+    """The model at capture times (N,) s: residuals extrapolated to the nominal times, and their derivatives by all unknowns. ``rolling``
+    s, ``edge`` in noises of the face, rotations about ``pivot`` (3,) m."""
     f = problem.frames
     e, m, v, turn, A = problem.residuals(X, capture, rolling, edge)
     R = X.rotation().matrix()
