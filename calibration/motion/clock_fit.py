@@ -10,12 +10,13 @@ move. The variances (a factor of the fit's own noise, a common spread of centres
 restricted maximum likelihood.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.motion.clock import FrameClock
 from weldcal.calibration.motion.observed import ObservedFrames
@@ -31,6 +32,11 @@ _GUARD = 4.0  # jitters that a frame must lie within the stream's data
 _STEPS = 60
 _FLOOR = np.array([1e-6, 1e-14, 1e-14, 1e-14])  # factor, m^2, rad^2, s^2
 _GRID = np.linspace(-6.0, 6.0, 25)
+_WIDEST = np.array(
+    [10.0] * 3 + [10.0] * 3 + [1.0, 1.0, 1.0]
+)  # steps in directions without information stay within: rad, m, s, s/s, s
+_TOLD = 0.5  # residuals that a variance explains: with fewer it is not estimated
+_MOST_JITTER_S = 0.2
 _FREE_S2 = 1.0  # variance of the time of a frame that is grossly late
 
 OFFSET, DRIFT, ROLLING = 6, 7, 8
@@ -131,22 +137,29 @@ def fit_clock(
     X_FR: RigidTransform | None = None,
     free: tuple[int, ...] = (0, 1, 2, 3, 4, 5, OFFSET),
     keep: Flags | None = None,
+    after: ClockFit | None = None,
 ) -> ClockFit:
     """Fit X_BC and the clock from a start that is right to some millimetres and tens of milliseconds.
 
     ``offset`` s is that of ``clock``; ``free``: which unknowns to estimate. ``keep`` (N,) limits the frames, for cross-validation.
+    ``after``: a fit of the same frames whose drift, rolling time, variances and capture times begin this one.
     Gauss-Newton with the pivot of rotations at the middle of the feature's places; frames with gross errors are left out.
     """
     problem = _Problem(frames, clock, motion, X_FR)
     allowed = np.isfinite(clock.base) if keep is None else keep & np.isfinite(clock.base)
-    drift = rolling = 0.0
+    drift, rolling = (0.0, 0.0) if after is None else (after.drift, after.rolling)
     nominal = problem.nominal(offset, drift, rolling)
     allowed = allowed & motion.known(nominal)
-    variances, first = _first_variances(problem, X_BC, nominal, allowed)
-    kept = allowed & first
-    late = np.zeros(len(frames), dtype=bool)
-    pivot = np.nanmean(motion.feature(nominal[kept], X_FR).p, axis=0)
-    capture = _searched_capture(problem, X_BC, nominal, variances, rolling, allowed)
+    if after is None:
+        variances, first = _first_variances(problem, X_BC, nominal, allowed)
+        kept = allowed & first
+        late = np.zeros(len(frames), dtype=bool)
+        capture = _searched_capture(problem, X_BC, nominal, variances, rolling, allowed)
+    else:
+        variances, kept, late, capture = after.variances, allowed & after.keep, after.late.copy(), after.capture
+    if np.count_nonzero(kept) < 4:
+        raise TooFewPoses(f"Only {np.count_nonzero(kept)} of {len(frames)} frames agree with one pose of the scanner.")
+    pivot = motion.feature(nominal[kept], X_FR).p.mean(axis=0)
     index = np.array(free)
     linear, information, W = None, np.eye(len(free)), np.zeros((len(frames), 5, 5))
     for step_number in range(_STEPS):
@@ -162,7 +175,7 @@ def fit_clock(
         information = np.einsum("nij,nik->jk", J, WJ)
         score = np.einsum("nij,ni->j", WJ, linear.y[kept])
         delta = np.zeros(9)
-        delta[index] = -_solved(information, score)
+        delta[index] = -_solved(information + np.diag(1.0 / _WIDEST[index] ** 2), score)
         R = exp_rotation(delta[:3]) @ X_BC.rotation().matrix()
         p = exp_rotation(delta[:3]) @ (X_BC.translation() - pivot) + pivot + delta[3:6]
         X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
@@ -170,12 +183,12 @@ def fit_clock(
         nominal = problem.nominal(offset, drift, rolling)
         linear.y[kept] += linear.J[kept] @ delta
         new = _new_variances(linear, variances, W, information, kept, late, index)
-        change = float(np.abs(np.log(new.array / variances.array)).max())
+        change = float(np.abs(np.log(_totals(linear, new, kept) / _totals(linear, variances, kept))).max())
         variances = new
-        if step_number == 3:
+        if step_number == 3 and after is None:
             capture = _searched_capture(problem, X_BC, nominal, variances, rolling, allowed)
-        small = np.sqrt(np.maximum(delta[index] @ information @ delta[index], 0.0)) < 1e-3
-        if step_number > 6 and small and change < 1e-3 and settled_sets:
+        small = np.sqrt(np.maximum(delta[index] @ information @ delta[index], 0.0)) < 1e-2
+        if step_number > (6 if after is None else 3) and small and change < 3e-3 and settled_sets:
             break
     assert linear is not None
     g = linear.g
@@ -188,6 +201,16 @@ def fit_clock(
         X_BC, float(offset), float(drift), float(rolling), free, pivot, information, variances, kept, late, capture, nominal,
         e, m, v, jitters, 1.0 / a, linear.J[:, :, index], W,
     )  # fmt: skip
+
+
+def _totals(linear: _Linear, variances: Variances, keep: Flags) -> Array:
+    """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from. The share of the fits' own noise
+    in them converges slowly, and matters little."""
+    own = np.einsum("nii->", linear.own[keep]) / (3.0 * np.count_nonzero(keep))
+    lean = np.einsum("nii->", linear.own_lean[keep]) / (2.0 * np.count_nonzero(keep))
+    return np.array(
+        [variances.factor * own + variances.spread, variances.factor * lean + variances.lean, variances.jitter]
+    )
 
 
 def _solved(N: Array, b: Array) -> Array:
@@ -363,10 +386,9 @@ def _new_variances(
         t = float(np.einsum("nij,nji->", w, V)) - float(
             np.einsum("jk,nij,nil,nlk->", inverse, wJ, V, wJ, optimize=True)
         )
-        if t > 0.0:
+        # what no frame tells stays as it is: an arm at rest says nothing of the jitter
+        if t * values[k] > _TOLD:
             values[k] *= np.clip(q / t, 0.05, 20.0)
     factor, spread, lean, jitter = np.maximum(values, _FLOOR)
     # the fit's own covariance and the common spread are told apart only where it differs from frame to frame
-    return replace(
-        variances, factor=min(float(factor), 1.0), spread=float(spread), lean=float(lean), jitter=float(jitter)
-    )
+    return Variances(min(float(factor), 1.0), float(spread), float(lean), min(float(jitter), _MOST_JITTER_S**2))

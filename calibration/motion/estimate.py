@@ -185,7 +185,7 @@ def _fitted(
         )
     free = (0, 1, 2, 3, 4, 5, OFFSET) + ((DRIFT,) if clock.kind == DEVICE else ())
     fit = fit_clock(frames, clock, motion, start.X_BC, -clock.sign * start.delay_s, X_FR=X_FR, free=free)
-    rolling = fit_clock(frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=(*free, ROLLING), keep=fit.keep)
+    rolling = fit_clock(frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=(*free, ROLLING), after=fit)
     covariance, _ = _inverse(rolling.information, rolling.free)
     sigma = float(np.sqrt(covariance[-1, -1]))
     if abs(rolling.rolling) > _ROLLING_SIGMAS * sigma and sigma < _OPEN[ROLLING]:
@@ -288,8 +288,10 @@ def _held_out(
         keep = fit.keep.copy()
         keep[block] = False
         try:
-            without = fit_clock(frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=fit.free, keep=keep)
-        except np.linalg.LinAlgError:
+            without = fit_clock(
+                frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=fit.free, keep=keep, after=fit
+            )
+        except (np.linalg.LinAlgError, TooFewPoses):
             continue
         _, variances = _inverse(without.information, without.free)
         if variances.max() > 1.0:

@@ -16,6 +16,8 @@ _STEP_S, _FINE_S = 0.01, 0.001
 _MOST_FRAMES = 150
 _ARM_M = 0.1  # a lever that turns an error of the normal into a length
 _SHARE = 0.8  # of the frames that must agree
+_ALIAS = 1.3  # times the least rms: another delay that fits so well is one of a motion that repeats itself
+_SAME_M = 2e-5  # rms below any scanner's
 _LEAST_KNOWN = 0.5  # of the frames must lie within the stream
 
 
@@ -51,7 +53,7 @@ def search_start(
     cost, _, _ = _costs(part, base, delays, motion, X_FR)
     if not np.isfinite(cost).any():
         return None
-    best = float(delays[np.nanargmin(cost)])
+    best = _plausible(delays, cost)
     fine = np.array([best]) if given else best + np.arange(-_STEP_S, _STEP_S + 0.5 * _FINE_S, _FINE_S)
     fine_cost, R, p = _costs(part, base, fine, motion, X_FR)
     k = int(np.nanargmin(fine_cost)) if np.isfinite(fine_cost).any() else 0
@@ -62,6 +64,14 @@ def search_start(
         np.concatenate([delays, fine])[order],
         np.sqrt(np.concatenate([cost, fine_cost])[order]),
     )
+
+
+def _plausible(delays: Array, cost: Array) -> float:
+    """The delay of least cost; where a motion repeats itself, of those about as good the one nearest to zero."""
+    c = np.where(np.isfinite(cost), cost, np.inf)
+    around = np.minimum(np.concatenate([[np.inf], c[:-1]]), np.concatenate([c[1:], [np.inf]]))
+    good = np.flatnonzero((c <= around) & (c <= _ALIAS**2 * c.min() + _SAME_M**2))
+    return float(delays[good[np.argmin(np.abs(delays[good]))]])
 
 
 def _costs(

@@ -178,6 +178,20 @@ def fuzz_files(
     return Outcome(result.summary(), values={}, rows=rows)
 
 
+@command("benchmark motion-clock")
+def motion_clock(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of calibrations with each clock.", min=2)] = 300,
+    seconds: Annotated[float, option("--seconds", "S", "Length of each recording.", min=5.0)] = 20.0,
+) -> Outcome:
+    """Repeat calibrations in motion with known truth: coverage of the clock's offset, error and NEES of the scanner's pose."""
+    from weldcal.tools.studies.motion.clock import clock_table, run_clock_study
+
+    folder = call.folder("benchmark", "motion-clock")
+    found = run_clock_study(runs, folder, seed=call.seed, duration_s=seconds, progress=call.progress)
+    return Outcome({name: kind.summary() for name, kind in found.items()}, text=clock_table(found))
+
+
 COMMANDS = (
     tablet,
     seam_planning,
@@ -190,4 +204,5 @@ COMMANDS = (
     robot_faults,
     robot,
     robot_jobs,
+    motion_clock,
 )
