@@ -1,9 +1,9 @@
-"""weldcal reproduce motion-data: calibration in motion, simulated."""
+"""weldcal reproduce motion and motion-data: calibration in motion, simulated."""
 
 from collections.abc import Mapping
 from typing import Annotated
 
-from weldcal.tools.cli.options import Call, command, option, switch
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 
 @command("reproduce motion-data")
@@ -56,4 +56,24 @@ def motion_data(
     return write_motion_data(request, call.progress)
 
 
-COMMANDS = (motion_data,)
+@command("reproduce motion")
+def motion(
+    call: Call,
+    quick: Annotated[bool, switch("--quick", "A quarter of the pixels and 90 frames; decides nothing.")] = False,
+    frames: Annotated[int | None, option("--frames", "N", "Frames in motion.", min=40, show_default="600")] = None,
+) -> Outcome:
+    """Repeat the flange paper on motion: Table 1, Eq. 21, Fig. 5, 6 and 9; the recording and its truth are kept. 15 min."""
+    from functools import partial
+
+    from weldcal.tools.studies.motion.reproduce import run_motion_study
+    from weldcal.tools.studies.motion.results import MotionStudyOptions
+    from weldcal.tools.studies.targets import print_targets
+
+    options = MotionStudyOptions(call.folder("reproduce", "motion"), call.seed, quick, frames)
+    study = run_motion_study(options, call.progress)
+    text = partial(print_targets, "calibration in motion", study.targets)
+    missed = "" if study.met else "Some targets were missed; see the table."
+    return Outcome(study.summary(), {}, {}, text, problem=missed)
+
+
+COMMANDS = (motion_data, motion)
