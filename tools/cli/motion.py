@@ -1,4 +1,4 @@
-"""weldcal reproduce motion and motion-data: calibration in motion, simulated."""
+"""weldcal reproduce motion, reproduce motion-data and benchmark motion: calibration in motion, simulated."""
 
 from collections.abc import Mapping
 from typing import Annotated
@@ -76,4 +76,18 @@ def motion(
     return Outcome(study.summary(), {}, {}, text, problem=missed)
 
 
-COMMANDS = (motion_data, motion)
+@command("benchmark motion")
+def throughput(
+    call: Call, seconds: Annotated[float, option("--seconds", "S", "Length of the stream.", min=2.0)] = 30.0
+) -> Outcome:
+    """Fit half-megapixel frames at 20 per second beside an arm's control: frames per second, and arrival to estimate."""
+    from functools import partial
+
+    from weldcal.tools.studies.motion.throughput import run_throughput
+    from weldcal.tools.studies.targets import print_targets
+
+    found = run_throughput(call.folder("benchmark", "motion"), seconds, call.seed, call.progress)
+    return Outcome(found.summary(), text=partial(print_targets, "streamed scans", found.targets))
+
+
+COMMANDS = (motion_data, motion, throughput)

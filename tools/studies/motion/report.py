@@ -82,9 +82,7 @@ def quality_picture(study: MotionStudy) -> bytes:
             points[:, 0], points[:, 1], c=points[:, 2], s=0.6, cmap="viridis", vmin=-1.5, vmax=1.5, rasterized=True
         )
         front.set_aspect("equal")
-        front.set_title(
-            f"{name}: {q.points} points on the face, {q.plane_mm:.2f} mm rms, edge {q.edge_mm:.2f} mm", fontsize=9
-        )
+        front.set_title(f"{name}: {q.points} points, {q.plane_mm:.2f} mm rms", fontsize=10)
         plain(front, "", "mm")
         front.set_xlim(-36, 36)
         front.set_ylim(-36, 36)
@@ -100,7 +98,7 @@ def table_rows(rows: tuple[Row, ...]) -> list[tuple[str, ...]]:
     """Mean and standard deviation of each component."""
 
     def cells(row: Row) -> list[str]:
-        return [f"{fixed(m)} ± {fixed(s)}" for m, s in zip(row.mean, row.spread, strict=True)]
+        return [f"{fixed(row.mean[k])} ± {fixed(row.spread[k])}" for k in (0, 1, 3, 4, 5)]
 
     return [(r.name, str(len(r.errors)), *cells(r), fixed(r.rms_mm)) for r in rows]
 

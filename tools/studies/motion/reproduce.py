@@ -17,7 +17,7 @@ from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_moti
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.published.icp import face_cloud, icp_error, make_verification
+from weldcal.calibration.published.icp import face_cloud, icp_error, make_verification, sight
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress
@@ -97,6 +97,7 @@ def _evaluated(
     return MotionStudy(
         options=options,
         rows=rows,
+        icp_share=verify.share(observed.ids[chosen[0]], at_capture[chosen[0]], found.X_BC),
         history_t=np.asarray(observed.arrival[kept_after] - t0),
         history_before=_matching(before, kept, kept_after),
         history_after=after,
@@ -144,11 +145,15 @@ class _Verifier:
 
     def one(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[Array, RigidTransform | None]:
         """Error (6,) deg and mm, and the correction of Eq. 21, None where the registration failed."""
-        pose = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BF[:3, :3]), X_BF[:3, 3])
         # some 30 mm of unsynchronised error must be within reach
-        verification = replace(make_verification(self.face(id), pose, self._standard), max_distance_m=_REACH_M)
+        verification = replace(make_verification(self.face(id), _rigid(X_BF), self._standard), max_distance_m=_REACH_M)
         reach = icp_error(X_BC, verification)
         return np.asarray(reach.value * _TO_MM), reach.X_CpC
+
+    def share(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[float, float, float]:
+        """Share of a known shift along x, y and z that the registration of this frame reports."""
+        x, y, z = sight(X_BC, make_verification(self.face(id), _rigid(X_BF), self._standard)).share[3:]
+        return float(x), float(y), float(z)
 
     def errors(
         self, ids: tuple[str, ...], which: NDArray[np.intp], poses: Array, X_BC: RigidTransform
@@ -243,6 +248,10 @@ def _matching(errors: Array, kept: Array, wanted: Array) -> Array:
 def _spread(index: NDArray[np.intp], n: int) -> NDArray[np.intp]:
     """At most ``n`` of the indices, evenly spread."""
     return np.asarray(index[np.unique(np.linspace(0, len(index) - 1, min(n, len(index))).astype(int))])
+
+
+def _rigid(X: Array) -> RigidTransform:
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
 def _rms(values: Array) -> float:
