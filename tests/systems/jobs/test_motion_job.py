@@ -31,6 +31,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.commands.motion_live import follower_delay
 
 
 def scenario(frames: int = 45) -> Scenario:
@@ -65,6 +66,15 @@ def test_the_job_finds_the_scanner_and_its_clock() -> None:
     delays = [f.arrival - captures[int(f.id)] for f, _ in record.seen]
     assert min(delays) > 0.118
     assert np.mean(delays) == pytest.approx(0.14, abs=0.01)
+
+
+def test_the_drawn_arm_is_where_the_stream_says_and_a_late_one_is_noticed() -> None:
+    run = a_run()
+    record, log = run.cell.job.record(run.root), run.cell.logs["joints"].FindLog(run.root)
+    t, q = log.sample_times(), log.data()[:6].T
+    here = follower_delay(t, q, record)
+    assert abs(here) < 2.1e-3  # a step of the plant
+    assert follower_delay(t + 0.005, q, record) - here == pytest.approx(0.005, abs=2e-4)
 
 
 def test_no_frame_is_dropped_in_simulation() -> None:
