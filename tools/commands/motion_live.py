@@ -51,9 +51,12 @@ class MotionOutcome:
             return {}
         numbers, times = logs["scanner_capture"].FindLog(root).data()
         behind = 0.0
-        if "joints" in logs and self.record.blocks:
+        world = self.run.cell.station.world
+        if "joints" in logs and self.record.blocks and world is not None:
             log = logs["joints"].FindLog(root)
-            behind = follower_delay(log.sample_times(), log.data()[:6].T, self.record)
+            # as in a picture, at a tick the plant's last step shows
+            stepped = log.sample_times() - world.plant.time_step()
+            behind = follower_delay(stepped, log.data()[:6].T, self.record)
         return {int(n): float(t) - behind for n, t in zip(numbers, times, strict=True) if n}
 
     def truth(self) -> dict[str, object]:
