@@ -28,7 +28,7 @@ from weldcal.tools.studies.motion.results import MotionStudy, MotionStudyOptions
 from weldcal.tools.studies.motion.static_mode import Look, StaticMode, noise_of_face
 from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
 
-_ICP_FRAMES = 120  # for Table 1 and Fig. 6
+_ICP_FRAMES, _QUICK_FRAMES = 120, 24  # for Table 1 and Fig. 6
 _REACH_M = 0.06
 _TO_MM = np.array([*[np.degrees(1.0)] * 3, *[1e3] * 3])
 
@@ -77,7 +77,7 @@ def _evaluated(
     progress("ICP of the flange mesh", 0.88)
     verify = _Verifier(data, seen.fits, world.flange)
     at_capture = motion.poses(found.capture)
-    chosen = _spread(np.flatnonzero(both), _ICP_FRAMES)
+    chosen = _spread(np.flatnonzero(both), _QUICK_FRAMES if options.quick else _ICP_FRAMES)
     before, kept = verify.errors(observed.ids, chosen, at_arrival, X_raw)
     after, kept_after = verify.errors(observed.ids, chosen, at_capture, found.X_BC)
     rows = (
