@@ -123,6 +123,20 @@ def test_errors_that_depend_on_the_place_are_stated() -> None:
     assert at_work_mm(found) < 0.15
 
 
+def test_edges_found_below_a_rough_face_are_estimated() -> None:
+    f, _ = frames(device=True)
+    view = f.p_C / np.linalg.norm(f.p_C, axis=1)[:, None]
+    along = (view * f.n_C).sum(axis=1)[:, None]
+    slide = 5e-4 * (view - along * f.n_C) / np.abs(along)
+    low = replace(f, p_C=f.p_C - 2.5 * slide)
+    plain = estimate_in_motion(low, world()[3], held_out=False)
+    found = estimate_in_motion(replace(low, slide=slide), world()[3], held_out=False)
+    assert found.fit.edge == pytest.approx(2.5, abs=0.2)
+    assert at_work_mm(found) < 0.04
+    assert at_work_mm(plain) > 2.0 * at_work_mm(found)
+    assert found.joint.shape == (8, 8)
+
+
 def test_an_arm_at_rest_leaves_the_pose_open() -> None:
     f, _ = frames()
     stream = world()[2]
