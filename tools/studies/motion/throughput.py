@@ -4,6 +4,7 @@ Frames are rendered beforehand and replayed at the scanner's rate on the wall cl
 the cell's own; the arm's control is a simulated arm at 500 Hz in the same Diagram.
 """
 
+import os
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -50,6 +51,7 @@ class Throughput:
     dropped: int
     wait_ms: tuple[float, ...]
     behind_ms: tuple[float, ...]
+    load_average: float  # of the computer meanwhile, over a minute
 
     @property
     def fps(self) -> float:
@@ -73,7 +75,7 @@ class Throughput:
             "offered": self.offered, "estimated": self.estimated, "refused": self.refused, "dropped": self.dropped,
             "arrival_to_estimate_ms": {"median": float(p[0]), "p95": float(p[1]), "worst": float(p[2])},
             "loop_behind_ms": {"median": float(np.median(self.behind_ms)), "worst": float(max(self.behind_ms))},
-            "points_per_second": self.pixels * self.fps, "paper": _PAPER,
+            "load_average": self.load_average, "cores": os.cpu_count(), "points_per_second": self.pixels * self.fps, "paper": _PAPER,
             "targets": [{"what": t.what, "reached": t.value, "wanted": t.wanted, "met": t.met} for t in self.targets],
         }  # fmt: skip
 
@@ -190,4 +192,6 @@ def _replayed(
     spent = time.monotonic() - start
     offered = int((0.1 + seconds - delay_s) * _FPS)
     pixels = world.scanner.width * world.scanner.height
-    return Throughput(pixels, spent, offered, len(waits), refused, dropped, tuple(waits), tuple(behind))
+    return Throughput(
+        pixels, spent, offered, len(waits), refused, dropped, tuple(waits), tuple(behind), os.getloadavg()[0]
+    )
