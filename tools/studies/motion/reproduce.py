@@ -29,7 +29,7 @@ from weldcal.tools.studies.motion.static_mode import Look, StaticMode, noise_of_
 from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
 
 _ICP_FRAMES, _QUICK_FRAMES = 120, 24  # for Table 1 and Fig. 6
-_REACH_M = 0.06
+_REACH_M = 0.01
 _TO_MM = np.array([*[np.degrees(1.0)] * 3, *[1e3] * 3])
 
 
@@ -145,10 +145,13 @@ class _Verifier:
 
     def one(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[Array, RigidTransform | None]:
         """Error (6,) deg and mm, and the correction of Eq. 21, None where the registration failed."""
-        # some 30 mm of unsynchronised error must be within reach
-        verification = replace(make_verification(self.face(id), _rigid(X_BF), self._standard), max_distance_m=_REACH_M)
-        reach = icp_error(X_BC, verification)
-        return np.asarray(reach.value * _TO_MM), reach.X_CpC
+        # the unsynchronised error, some 30 mm, must be within reach; a search farther than needed takes most of the time
+        off = float(np.linalg.norm(X_BC @ self._fits[id].center_C - X_BF[:3, 3]))
+        verification = replace(
+            make_verification(self.face(id), _rigid(X_BF), self._standard), max_distance_m=max(_REACH_M, 2.0 * off)
+        )
+        found = icp_error(X_BC, verification)
+        return np.asarray(found.value * _TO_MM), found.X_CpC
 
     def share(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[float, float, float]:
         """Share of a known shift along x, y and z that the registration of this frame reports."""
