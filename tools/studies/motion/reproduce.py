@@ -17,7 +17,7 @@ from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_moti
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.published.icp import face_cloud, icp_error, make_verification, sight
+from weldcal.calibration.published.icp import Verification, face_cloud, icp_error, make_verification, sight
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
 from weldcal.tools.console import Progress
@@ -135,27 +135,26 @@ class _Verifier:
 
     def __init__(self, data: MotionDataset, fits: dict[str, FlangeFit], standard: FlangeStandard) -> None:
         self._data, self._fits, self._standard = data, fits, standard
-        self._clouds: dict[str, Array] = {}
+        self._models: dict[str, Verification] = {}
 
-    def face(self, id: str) -> Array:
-        """The points of the flange's face in one frame."""
-        if id not in self._clouds:
-            self._clouds[id] = face_cloud(self._data.cloud(id), self._fits[id], self._standard)
-        return self._clouds[id]
+    def model(self, id: str) -> Verification:
+        """The face of one frame against the mesh, without the robot's pose."""
+        if id not in self._models:
+            cloud = face_cloud(self._data.cloud(id), self._fits[id], self._standard)
+            self._models[id] = make_verification(cloud, RigidTransform(), self._standard)
+        return self._models[id]
 
     def one(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[Array, RigidTransform | None]:
         """Error (6,) deg and mm, and the correction of Eq. 21, None where the registration failed."""
         # the unsynchronised error, some 30 mm, must be within reach; a search farther than needed takes most of the time
         off = float(np.linalg.norm(X_BC @ self._fits[id].center_C - X_BF[:3, 3]))
-        verification = replace(
-            make_verification(self.face(id), _rigid(X_BF), self._standard), max_distance_m=max(_REACH_M, 2.0 * off)
-        )
+        verification = replace(self.model(id), X_BR=_rigid(X_BF), max_distance_m=max(_REACH_M, 2.0 * off))
         found = icp_error(X_BC, verification)
         return np.asarray(found.value * _TO_MM), found.X_CpC
 
     def share(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[float, float, float]:
         """Share of a known shift along x, y and z that the registration of this frame reports."""
-        x, y, z = sight(X_BC, make_verification(self.face(id), _rigid(X_BF), self._standard)).share[3:]
+        x, y, z = sight(X_BC, replace(self.model(id), X_BR=_rigid(X_BF))).share[3:]
         return float(x), float(y), float(z)
 
     def errors(
