@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+import tempfile
 from functools import cache
 from pathlib import Path
 
@@ -14,9 +17,9 @@ from pydrake.systems.primitives import ConstantValueSource
 
 from tests.systems.cells import Q_HOME, the_arm
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
+from weldcal.calibration.data.results import load_result
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.errors import InputError
-from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner
 from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
@@ -26,11 +29,13 @@ from weldcal.systems.jobs.motion.job import AddedMotion, plan_corners
 from weldcal.systems.jobs.motion.recorder import MotionRecorder
 from weldcal.systems.jobs.weld.flange_estimator import believed_capture
 from weldcal.systems.messages import FlangeEstimate, ScanStream, StreamedScan
-from weldcal.systems.runner import Run, run_cell
+from weldcal.systems.runner import Run, no_progress
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.commands.motion_live import MotionOutcome, follower_delay, run_motion_live
+from weldcal.tools.outcomes.options import RunOptions
 
 
 def scenario(frames: int = 45) -> Scenario:
@@ -44,8 +49,31 @@ def scenario(frames: int = 45) -> Scenario:
 
 
 @cache
+def an_outcome() -> MotionOutcome:
+    """A run by its command, which writes the results too."""
+    folder = Path(tempfile.mkdtemp())
+    return run_motion_live(scenario(), RunOptions("motion", folder, 3, recording=False), no_progress)
+
+
 def a_run() -> Run[AddedMotion]:
-    return run_cell(build_cell(scenario(), 3))
+    return an_outcome().run
+
+
+def test_the_command_writes_the_result_with_its_clock() -> None:
+    outcome = an_outcome()
+    said, folder = outcome.summary(), outcome.folder
+    truth = said["truth"]
+    assert isinstance(truth, dict)
+    assert (said["state"], said["dropped"], said["clock"]) == ("done", 0, "device")
+    assert abs(truth["clock_offset_error_ms"]) < 2.0
+    assert truth["error_mm"] < 0.6
+    assert json.loads((folder / "run.json").read_text())["n_seen"] == said["n_seen"]
+    written = load_result(folder)
+    assert outcome.estimate is not None
+    assert written.X_BC.IsNearlyEqualTo(outcome.estimate.X_BC, 1e-6)
+    assert written.clock is not None
+    assert written.clock.offset_s == pytest.approx(outcome.estimate.clock.offset_s, abs=1e-6)
+    shutil.rmtree(folder)
 
 
 def test_the_job_finds_the_scanner_and_its_clock() -> None:
@@ -65,6 +93,15 @@ def test_the_job_finds_the_scanner_and_its_clock() -> None:
     delays = [f.arrival - captures[int(f.id)] for f, _ in record.seen]
     assert min(delays) > 0.118
     assert np.mean(delays) == pytest.approx(0.14, abs=0.01)
+
+
+def test_the_drawn_arm_is_where_the_stream_says_and_a_late_one_is_noticed() -> None:
+    run = a_run()
+    record, log = run.cell.job.record(run.root), run.cell.logs["joints"].FindLog(run.root)
+    t, q = log.sample_times() - 0.002, log.data()[:6].T  # at a tick the plant's last step shows
+    here = follower_delay(t, q, record)
+    assert abs(here) < 3e-4
+    assert follower_delay(t + 0.005, q, record) - here == pytest.approx(0.005, abs=2e-4)
 
 
 def test_no_frame_is_dropped_in_simulation() -> None:
