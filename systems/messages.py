@@ -105,6 +105,7 @@ class JobCommand(Message):
     mode: str = "hold"  # hold: zero velocity; move: the FlangeMover drives; weld: the servo drives
     goal_id: int = 0
     q_goal: NDArray[np.float64] | None = None  # (6,) rad
+    speed_share: float = 1.0  # of the mover's speed, 0 to 1
     scan_sequence: int = 0  # number of the newest requested scan
     scan_purpose: str = ""  # calibrate, verify or workpiece: whose scan_sequence it is
     scan_label: str = ""

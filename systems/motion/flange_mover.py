@@ -77,10 +77,6 @@ class FlangeMover(LeafSystem):
         self.DeclareVectorOutputPort("settled_goal", 1, self._settled_out, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
-    def limit(self, speed: float) -> None:
-        """Lower the speed (rad/s) of the fastest joint, before the run."""
-        self._speed = min(self._speed, speed)
-
     def _update(self, context: Context, state: State) -> None:
         job: JobCommand = self._job.Eval(context)
         move: _Move = context.get_abstract_state(self._move).get_value()
@@ -89,7 +85,7 @@ class FlangeMover(LeafSystem):
         if job.mode == "move" and job.q_goal is not None:
             now, q = context.get_time(), self._position.Eval(context)
             if job.goal_id != move.goal_id:
-                duration = move_duration(q, job.q_goal, self._speed, self._acceleration)
+                duration = move_duration(q, job.q_goal, job.speed_share * self._speed, self._acceleration)
                 move = _Move(job.goal_id, now, duration, np.array(q), np.array(job.q_goal))
                 state.get_mutable_abstract_state(self._move).set_value(move)
             u = min((now - move.t_start) / move.duration, 1.0)

@@ -8,6 +8,7 @@ import pkgutil
 import textwrap
 from collections.abc import Callable
 from concurrent.futures import Future
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ import weldcal.systems
 from tests.systems.cells import Q_HOME, TOOL, plain_station, the_arm
 from tests.systems.drivers.still_link import StillLink
 from weldcal.models.flanges import get_flange
+from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.background_system import BackgroundSystem
@@ -38,9 +40,15 @@ from weldcal.systems.drivers.simulated.rendered_profiler import (
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
+from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, StreamingScanner
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
 from weldcal.systems.drivers.ur.rtde import UrRtdeArm
+from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
+from weldcal.systems.jobs.motion.collector import MotionCollector
+from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord, MotionState
+from weldcal.systems.jobs.motion.procedure import MotionProcedure
+from weldcal.systems.jobs.motion.recorder import MotionRecorder
 from weldcal.systems.jobs.mounting.calibrator import MountingCalibrator, MountingFitConfig
 from weldcal.systems.jobs.mounting.job import mounting_scene
 from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
@@ -68,11 +76,14 @@ from weldcal.systems.messages import (
     PlannedSeam,
     ProfileScan,
     Scan,
+    ScanStream,
+    StreamedScan,
     TorchTouch,
     UrStatus,
 )
 from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.flange_mover import FlangeMover
+from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.operator_panel import OperatorPanel
 from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.motion.process_switch import ProcessSwitch
@@ -114,6 +125,12 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     StreamingColourCamera: lambda: StreamingColourCamera(
         RenderedFingerCamera(), 0, 0.002, lambda poses, finish: Future()
     ),
+    DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
+    FrameQueue: FrameQueue,
+    MotionProcedure: lambda: MotionProcedure((Q_HOME, Q_HOME), Q_HOME, 40),
+    MotionCollector: MotionCollector,
+    MotionCalibrator: lambda: MotionCalibrator(the_arm()),
+    MotionRecorder: lambda: MotionRecorder(Path("unused")),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
     IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, get_flange("tool-ring-63"), CALIBRATOR),
@@ -228,6 +245,33 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     DepthSensor: {"trigger": 1, "depth_image": ImageDepth32F, "color_image": ImageRgba8U, "scan": Scan},
     StreamingColourCamera: {"streaming": 1, "frame_poses": FramePoseVector, "image": Image, "capture_time": 1},
+    DepthStream: {
+        "streaming": 1,
+        "depth_image": ImageDepth32F,
+        "color_image": ImageRgba8U,
+        "stream": ScanStream,
+        "newest_capture": 2,
+    },
+    FrameQueue: {"stream": ScanStream, "flange_estimate": FlangeEstimate, "scan": StreamedScan, "counts": 3},
+    MotionProcedure: {
+        "settled_goal": 1,
+        "robot_status": UrStatus,
+        "record": MotionRecord,
+        "calibration": MotionCalibration,
+        "hold": 1,
+        "job": JobCommand,
+        "streaming": 1,
+        "state": MotionState,
+    },
+    MotionCollector: {
+        "flange_estimate": FlangeEstimate,
+        "position_measured": 6,
+        "sample_time": 1,
+        "state": MotionState,
+        "record": MotionRecord,
+    },
+    MotionCalibrator: {"record": MotionRecord, "state": MotionState, "calibration": MotionCalibration},
+    MotionRecorder: {"stream": ScanStream},
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {
         "scan": Scan,

@@ -10,6 +10,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.commands.any_job import run_any
 from weldcal.tools.commands.demo import run_calibration_live, run_scenario
+from weldcal.tools.commands.motion_live import run_motion_live
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
@@ -32,6 +33,7 @@ RUNNERS: dict[str, Runner] = {
     "": run_scenario,
     "tablet": run_tablet_demo,
     "mounting": run_mounting_live,
+    "motion": run_motion_live,
     "profiler_job": run_profiler_live,
 }
 
@@ -52,8 +54,10 @@ def run_procedure(options: RunOptions, progress: Progress) -> Outcome:
 
 
 def calibrate_live(options: RunOptions, progress: Progress) -> dict[str, object]:
-    """Run `calibrate --scenario` and return its JSON object: the mounting job, or only the calibration of the weld job."""
+    """Run `calibrate --scenario` and return its JSON object: the mounting or motion job, or only the calibration of the weld job."""
     scenario = load_scenario(options.scenario)
     if kind_of(scenario) == "mounting":
         return run_mounting_live(scenario, options, progress).summary()
+    if kind_of(scenario) == "motion":
+        return run_motion_live(scenario, options, progress).summary()
     return run_calibration_live(options, progress).calibration_summary()

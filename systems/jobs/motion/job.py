@@ -116,13 +116,13 @@ class Motion(Job[MotionPlanned]):
         scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
         job, standard = scenario.part(MotionJob), get_flange(scenario.flange)
         assert job is not None
-        # the mover's limit is the fastest joint's: what moves the flange at the wanted speed on the fastest leg
         factor = scenario.job.speed_factor
-        spine.arm.mover.limit(factor * joint_speed(station.arm, plan.corners, job.speed_m_s))
         maximum_time_s = scenario.job.maximum_time_s / factor
+        # legs between corners are slower than the other moves: what moves the flange at the wanted speed on the fastest leg
+        share = min(joint_speed(station.arm, plan.corners, job.speed_m_s) / self.move_speed, 1.0)
         procedure = wiring.add(
             "motion_procedure",
-            MotionProcedure(plan.corners, plan.q_home, job.frames, maximum_time_s=maximum_time_s),
+            MotionProcedure(plan.corners, plan.q_home, job.frames, share, maximum_time_s=maximum_time_s),
         )
         queue = wiring.add("frame_queue", FrameQueue(job.queue, _POLL_S))
         estimator = wiring.add(

@@ -41,12 +41,13 @@ class MotionProcedure(LeafSystem):
         corners: Sequence[Array],
         q_home: Array,
         frames: int,
+        speed_share: float = 1.0,
         timeout_s: float = 60.0,
         maximum_time_s: float = np.inf,
         period_s: float = 0.008,
     ) -> None:
         super().__init__()
-        self._corners, self._home, self._frames = tuple(corners), q_home, frames
+        self._corners, self._home, self._frames, self._speed_share = tuple(corners), q_home, frames, speed_share
         self._timeout_s, self._maximum_time_s = timeout_s, maximum_time_s
         self._settled = self.DeclareVectorInputPort("settled_goal", 1)
         self._robot = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
@@ -117,6 +118,7 @@ class MotionProcedure(LeafSystem):
                 "move" if moving else "hold",
                 s.goal_id,
                 s.q_goal if moving else None,
+                speed_share=self._speed_share if s.phase == "collect" else 1.0,
                 finished=s.phase in ENDS,
                 held=s.phase == "held",
                 reason=s.reason or None,

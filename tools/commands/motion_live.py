@@ -1,0 +1,160 @@
+"""Runs the motion job: calibrates a streaming scanner and its clock live, writes the result, and compares it with the truth."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump_typed
+
+from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.motion.estimate import MotionEstimate
+from weldcal.models.arrays import Array
+from weldcal.systems.jobs.motion.calibrator import posed_stream
+from weldcal.systems.jobs.motion.config import MotionJob
+from weldcal.systems.jobs.motion.job import AddedMotion
+from weldcal.systems.jobs.motion.messages import MotionRecord
+from weldcal.systems.runner import Progress, Run
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.run import JobRun, run_job
+from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.report.render import write_atomic
+
+
+@dataclass(frozen=True, eq=False)
+class MotionOutcome:
+    """The run of a motion job, its estimate (None: there is none) and what was collected."""
+
+    options: RunOptions
+    finished: JobRun
+    record: MotionRecord
+    estimate: MotionEstimate | None
+
+    @property
+    def run(self) -> Run[AddedMotion]:
+        """The run of the cell."""
+        return self.finished.run
+
+    @property
+    def folder(self) -> Path:
+        """The result folder."""
+        return self.options.out
+
+    def true_captures(self) -> dict[int, float]:
+        """True capture times (s) of the frames by number; empty where no simulation knows them."""
+        log = self.run.cell.logs.get("scanner_capture")
+        if log is None:
+            return {}
+        numbers, times = log.FindLog(self.run.root).data()
+        return {int(n): float(t) for n, t in zip(numbers, times, strict=True) if n}
+
+    def truth(self) -> dict[str, object]:
+        """Errors against the simulation: X_BC at the cube's centre, and the clock's offset (mean over the frames)."""
+        X_BC, captures, e = self.run.cell.station.truth.X_BC, self.true_captures(), self.estimate
+        job = self.run.cell.scenario.part(MotionJob)
+        if X_BC is None or e is None or job is None:
+            return {}
+        p_C = X_BC.inverse() @ np.array(job.centre_m)
+        turn = (X_BC.inverse() @ e.X_BC).rotation().ToAngleAxis().angle()
+        found: dict[str, object] = {
+            "error_mm": 1e3 * float(np.linalg.norm(e.X_BC @ p_C - X_BC @ p_C)),
+            "error_deg": float(np.degrees(turn)),
+        }
+        seen = [(f, captures[int(f.id)]) for f, _ in self.record.seen if int(f.id) in captures]
+        if seen and e.clock.offset_s is not None:
+            device = e.clock.kind == "device"
+            base = np.array([f.device if device else f.arrival for f, _ in seen], dtype=float)
+            true = np.array([t for _, t in seen])
+            true_offset = float(np.mean(true - base if device else base - true))
+            found |= {
+                "clock_offset_ms": 1e3 * true_offset,
+                "clock_offset_error_ms": 1e3 * (e.clock.offset_s - true_offset),
+            }
+        return found
+
+    def summary(self) -> dict[str, object]:
+        """The JSON object."""
+        run, e = self.run, self.estimate
+        taken, dropped = run.cell.job.counts(run.root)
+        found: dict[str, object] = {
+            "state": "held" if run.held else "done", "mode": "motion", "scenario": self.options.scenario,
+            "seed": self.options.seed, "robot": self.finished.robot, "frames": taken, "dropped": dropped,
+            "n_seen": len(self.record.seen),
+            "refused": [{"id": i, "reason": t} for i, t in self.record.refused],
+            "wait_ms": {"median": _ms(self.record.waits_s, 50), "p95": _ms(self.record.waits_s, 95)},
+        }  # fmt: skip
+        if run.reason:
+            found["reason"] = run.reason
+        if e is not None:
+            c = e.clock
+            found |= {
+                "X_BC": e.X_BC.GetAsMatrix4().tolist(), "covariance": e.covariance.tolist(), "clock": c.kind,
+                "clock_offset_ms": None if c.offset_s is None else 1e3 * c.offset_s,
+                "clock_offset_sigma_ms": None if c.sigma_s is None else 1e3 * c.sigma_s,
+                "held_out_mm": error_summary(1e3 * e.held_out_m[e.inliers]),
+                "rms_mm": 1e3 * float(np.sqrt(np.mean(e.residual_m[e.inliers] ** 2))),
+                "truth": self.truth(),
+            }  # fmt: skip
+        return found | run.timing()
+
+
+def _ms(values: tuple[float, ...], percentile: float) -> float | None:
+    return 1e3 * float(np.percentile(values, percentile)) if values else None
+
+
+def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MotionOutcome:
+    """Run the job; write calibration.yaml with its exports, run.json and the recordings. Raises as run_job."""
+    job = scenario.part(MotionJob)
+    if job is not None and job.record:
+        job.recording_folder = str(options.out / "recording")
+    finished = run_job(scenario, options, progress, "motion")
+    run, added = finished.run, finished.cell.job
+    record, calibration = added.record(run.root), added.calibration(run.root)
+    outcome = MotionOutcome(options, finished, record, calibration.estimate)
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_atomic(options.out / "scenario.yaml", yaml_dump_typed(scenario))
+    if calibration.estimate is not None:
+        result = calibration_result(outcome, calibration.estimate)
+        export_all(result, options.out)
+        save_result(result, options.out)
+    if added.recorder is not None:
+        stream, scanner = posed_stream(record, finished.cell.station.arm), scenario.scanner_config()
+        assert scanner is not None
+        added.recorder.finish(stream, scenario.arm, scenario.flange, scanner.scanner())
+    write_atomic(options.out / "run.json", json.dumps(outcome.summary(), indent=1) + "\n")
+    finished.write_recording(options.out)
+    return outcome
+
+
+def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> CalibrationResult:
+    """The estimate as a result folder holds it."""
+    scenario, used = outcome.run.cell.scenario, e.inliers
+    scanner = scenario.scanner_config()
+    tilt = error_summary(np.degrees(e.held_out_tilt_rad[used]))
+    values: list[Array] = [
+        1e3 * e.residual_m, 1e3 * e.held_out_m, np.degrees(e.tilt_rad), np.degrees(e.held_out_tilt_rad)
+    ]  # fmt: skip
+    poses = [
+        PoseRecord(f.id, bool(used[k]), "", *(float(v[k]) if np.isfinite(v[k]) else None for v in values))
+        for k, (f, _) in enumerate(outcome.record.seen)
+    ]
+    return CalibrationResult(
+        X_BC=e.X_BC,
+        covariance=e.covariance,
+        held_out_mm=error_summary(1e3 * e.held_out_m[used]),
+        tilt_deg={k: tilt[k] if np.isfinite(tilt[k]) else None for k in ("median", "p95")},
+        poses=(*poses, *(PoseRecord(id, False, text) for id, text in outcome.record.refused)),
+        unobservable=e.unobservable,
+        warnings=e.warnings,
+        robot=scenario.arm,
+        flange=scenario.flange,
+        scanner="" if scanner is None else scanner.scanner().name,
+        sigma_position_mm=1e3 * e.sigma_position_m,
+        sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),
+        seed=outcome.options.seed,
+        data_hashes={},
+        software=software_version(),
+        clock=e.clock,
+        clock_covariance=e.joint,
+    )
