@@ -82,6 +82,7 @@ from weldcal.systems.messages import (
     UrStatus,
 )
 from weldcal.systems.motion.command_arbiter import CommandArbiter
+from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.operator_panel import OperatorPanel
@@ -141,6 +142,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
+    DriftMonitor: lambda: DriftMonitor(the_arm(), X, MonitoredCalibration(X, np.eye(6))),
     ProcessSwitch: ProcessSwitch,
     CommandArbiter: CommandArbiter,
     FlangeMover: FlangeMover,
@@ -335,6 +337,13 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "velocity": 6,
         "settled_goal": 1,
     },
+    DriftMonitor: {
+        "flange_estimate": FlangeEstimate,
+        "history": PoseHistory,
+        "recalibrate": 1,
+        "drift": DriftStatus,
+        "moved": 1,
+    },
     SlewLimiter: {"velocity_wanted": 6, "velocity_command": 6},
     JobSequencer: {
         "robot_status": UrStatus,
@@ -346,6 +355,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "servo_report": ServoReport,
         "hold": 1,
         "arm_stopped": 1,
+        "drift": DriftStatus,
         "job": JobCommand,
         "job_state": JobState,
         "scan_trigger": 1,
