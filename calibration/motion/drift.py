@@ -237,7 +237,8 @@ class DriftTest:
         if len(ramps):
             r = int(ramps[np.argmax(gain_scaled[ramps])])
             better = float(gain_scaled[r] - gain[k]) / left[k]
-            if better > _CLEARLY:
+            warming = bool(self.events) and self.events[-1].kind == WARM_UP
+            if better > (-_REFUSED if warming else _CLEARLY):  # what has begun as a warm-up goes on as one
                 return [self._warm_up(r, scaled[r], C_scaled[r], found, float(T[k]))]
             if better > -_REFUSED:
                 if t < found + self.config.slow_s and not last:  # what comes slowly may be looked at for a while
