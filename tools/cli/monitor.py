@@ -22,6 +22,13 @@ def monitor(
         Path, option("--calibration", "RESULT", "The calibration: its folder, or its calibration.yaml.")
     ],
     flange: FlangeOption = None,
+    body: Annotated[
+        str | None,
+        option(
+            "--body", "LINK", "Track a link instead of the flange, such as wrist_1_link.", show_default="the flange"
+        ),
+    ] = None,
+    fused: Annotated[bool, switch("--fused", "With --body: fuse its surface from the scans, without a mesh.")] = False,
     false_alarms: Annotated[float, option("--false-alarms", "N", "False alarms per hour that are accepted.")] = 1e-3,
     recalibrate: Annotated[
         bool, switch("--recalibrate", "Write the scanner's pose after the last change to recalibrated/.")
@@ -40,6 +47,8 @@ def monitor(
         flange=flange,
         false_alarms_per_hour=false_alarms,
         recalibrate=recalibrate,
+        body=body,
+        fused=fused,
         seed=call.seed,
         progress=call.progress,
     )
