@@ -6,14 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult, export_all, load_result, save_result, software_version
-from weldcal.calibration.motion.drift import DriftConfig
+from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.motion.background import background_move
+from weldcal.calibration.motion.drift import MOVED, DriftConfig, DriftEvent
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.watch import Watched, watch
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.monitor_body import see_link
@@ -22,6 +26,8 @@ from weldcal.tools.outcomes.monitor import MonitorReport
 from weldcal.tools.report.monitor import monitor_page
 from weldcal.tools.report.render import write_atomic
 
+_STILLS = 15  # frames before and after a change that show what stands still
+_APART_S = 0.3  # from a change and the frames that are compared
 _FEW = 40  # frames: fewer leave the noise, and so small changes, open
 
 
@@ -74,6 +80,7 @@ def monitor_recording(
     tell("testing for drift", 0.85)
     config = DriftConfig(false_alarms_per_hour=false_alarms_per_hour)
     watched = watch(result, frames, motion, X_FR=X_FR, dropped=refused, config=config)
+    watched = replace(watched, events=tuple(_told_apart(e, watched, data, result) for e in watched.events))
     recalibrated = _recalibrated(result, watched, data, standard.designation, seed) if recalibrate else None
     report = MonitorReport(
         watched, result, recalibrated, _cause(watched), false_alarms_per_hour,
@@ -111,6 +118,27 @@ def _recalibrated(
         clock_covariance=None,
         software=software_version(),
     )
+
+
+def _told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
+    """The event with its cause, where what stands still in the scans before and after it tells."""
+    if e.kind != MOVED or e.since_start:
+        return e
+    t = watched.rows.times
+    others = [o.time_s for o in watched.events if o is not e]
+    low = max((o for o in others if o < e.time_s), default=-np.inf)
+    high = min((o for o in others if o > e.time_s), default=np.inf)
+    parts: list[list[Array]] = []
+    for near in ((t > low + _APART_S) & (t < e.time_s - _APART_S), (t > e.time_s + _APART_S) & (t < high - _APART_S)):
+        index = np.flatnonzero(near)
+        chosen = index[np.unique(np.linspace(0, len(index) - 1, min(len(index), _STILLS)).astype(int))]
+        parts.append([data.cloud(watched.ids[k]) for k in chosen])
+    # what the flange says of the move: from the pose before it to the pose after
+    turn = RotationMatrix(exp_rotation(e.rotation_rad))
+    R = result.X_BC.rotation()
+    moved = RigidTransform(turn @ R, result.X_BC.translation() + e.translation_m)
+    found = background_move(parts[0], parts[1], moved.InvertAndCompose(result.X_BC))
+    return e if found is None or found.cause is None else replace(e, cause=found.cause)
 
 
 def _cause(watched: Watched) -> str:
