@@ -16,7 +16,9 @@ _SAMPLES_PER_M2 = 6e5  # one in 1.3 mm
 _INSIDE_M = 1e-4
 _VOXEL_M = 0.0015
 _LEAST_SHARE, _LEAST_FRAMES = 0.25, 4  # of the frames a voxel must be seen in: what moves otherwise is not of the body
-_NORMAL_M = 0.006
+_PITCHES = 1.5
+_NORMAL_VOXELS = 4.0  # radius of the neighbours that tell a normal
+_SAMPLE = 2000
 _FEWEST = 300
 
 
@@ -64,20 +66,23 @@ def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, r
     """Fuse scans to the surface of what moves with a frame L: ``frames`` are clouds (N, 3) or (H, W, 3) m in C with the pose X_LC by
     calibration and robot. Only points within ``radius_m`` of ``middle`` (3,) m in L count.
 
-    A surfel is the mean of all points in a voxel of 1.5 mm that a quarter of the frames saw: what stands still or belongs to
+    A surfel is the mean of all points in a voxel of 1.5 mm (or 1.5 pixels) that a quarter of the frames saw: what stands still or belongs to
     another link sweeps through the voxels. Raises InputError where too little is left.
     """
     keys, sums = [], []
-    eyes, count = [], 0
+    eyes, count, voxel = [], 0, _VOXEL_M
     for cloud, X_LC in frames:
         p = cloud.reshape(-1, 3)
         p = p[np.isfinite(p).all(axis=1)] @ X_LC.rotation().matrix().T + X_LC.translation()
         p = p[np.linalg.norm(p - middle, axis=1) < radius_m]
         count += 1
         eyes.append(X_LC.translation())
-        if len(p):
+        if len(p) > 1:
+            if not keys:  # wider than the pixels are apart, or voxels stay empty
+                apart = np.asarray(cKDTree(p).query(p[:: 1 + len(p) // _SAMPLE], [2])[0])
+                voxel = max(_VOXEL_M, _PITCHES * float(np.median(apart)))
             cell, index, size = np.unique(
-                np.floor(p / _VOXEL_M).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+                np.floor(p / voxel).astype(np.int64), axis=0, return_inverse=True, return_counts=True
             )
             mean = np.stack([np.bincount(index.ravel(), p[:, k]) for k in range(3)], axis=1) / size[:, None]
             keys.append(cell)
@@ -91,11 +96,11 @@ def fused_model(frames: Iterable[tuple[Array, RigidTransform]], middle: Array, r
     if len(points) < _FEWEST:
         raise InputError(f"Only {len(points)} surface points move with this body; show more of it, or another body.")
     surface = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    surface.estimate_normals(o3d.geometry.KDTreeSearchParamRadius(_NORMAL_M))
+    surface.estimate_normals(o3d.geometry.KDTreeSearchParamRadius(_NORMAL_VOXELS * voxel))
     surface.orient_normals_towards_camera_location(np.mean(eyes, axis=0))
     normals = np.asarray(surface.normals)
     # a lone point has no neighbours to tell its plane from
-    near = np.asarray(cKDTree(points).query(points, [8])[0])[:, 0] < _NORMAL_M
+    near = np.asarray(cKDTree(points).query(points, [8])[0])[:, 0] < _NORMAL_VOXELS * voxel
     return BodyModel(points[near], normals[near])
 
 

@@ -21,6 +21,15 @@ from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.motion.clock import FrameClock
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.motion.variances import (
+    FREE_S2,
+    Linearised,
+    Variances,
+    frame_weights,
+    new_variances,
+    noise_covariances,
+    total_variances,
+)
 from weldcal.models.arrays import Array
 
 Flags = NDArray[np.bool_]
@@ -30,38 +39,20 @@ _LATE = 8.0  # robust deviations of a frame's time: beyond, it says nothing of t
 _LATE_FLOOR_S = 1e-3
 _GUARD = 4.0  # jitters that a frame must lie within the stream's data
 _STEPS = 60
-_FLOOR = np.array([1e-6, 1e-14, 1e-14, 1e-14])  # factor, m^2, rad^2, s^2
 _GRID = np.linspace(-6.0, 6.0, 25)
 _WIDEST = np.array(
-    [10.0] * 3 + [10.0] * 3 + [1.0, 1.0, 1.0]
+    [10.0] * 3 + [10.0] * 3 + [1.0, 1.0, 1.0, 1e3]
 )  # steps in directions without information stay within: rad, m, s, s/s, s
-_TOLD = 0.5  # residuals that a variance explains: with fewer it is not estimated
-_MOST_JITTER_S = 0.2
-_FREE_S2 = 1.0  # variance of the time of a frame that is grossly late
 
-OFFSET, DRIFT, ROLLING = 6, 7, 8
-"""Indices of the clock's unknowns behind X_BC's six."""
-
-
-@dataclass(frozen=True, eq=False)
-class Variances:
-    """``factor`` of the fits' own covariances; ``spread`` m^2 and ``lean`` rad^2 beyond them, an axis; ``jitter`` s^2."""
-
-    factor: float
-    spread: float
-    lean: float
-    jitter: float
-
-    @property
-    def array(self) -> Array:
-        """The four as an array."""
-        return np.array([self.factor, self.spread, self.lean, self.jitter])
+OFFSET, DRIFT, ROLLING, EDGE = 6, 7, 8, 9
+"""Indices of the clock's unknowns behind X_BC's six, and of the height of the edges found (in noises of the face)."""
+_PRIOR = np.array([0.0] * 9 + [1.0 / 3.0**2])  # information: edges lie within some noises of the face
 
 
 @dataclass(frozen=True, eq=False)
 class ClockFit:
-    """Result of the joint fit of N frames. ``X_BC``; ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s;
-    ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then translation on the base side about ``pivot``);
+    """Result of the joint fit of N frames. ``X_BC``; ``offset`` s and ``drift`` of the FrameClock's nominal times, ``rolling`` s, ``edge`` height of the
+    edges found over the face's noise; ``free`` indices of the unknowns that were estimated (0..5: X_BC, rotation then translation on the base side about ``pivot``);
     ``information`` (K, K) of those; ``keep`` (N,) frames used; ``late`` (N,) frames whose time was left free; ``capture`` (N,) s most
     probable capture times and ``nominal`` (N,) s; ``centre`` (N, 3) m residuals at the capture times and ``lean`` (N, 2) rad those of
     the normals; ``rates`` (N, 3) m/s of the centre; ``jitters`` (N,) s as each frame alone tells it, and their variances
@@ -71,6 +62,7 @@ class ClockFit:
     offset: float
     drift: float
     rolling: float
+    edge: float
     free: tuple[int, ...]
     pivot: Array
     information: Array
@@ -88,18 +80,6 @@ class ClockFit:
     weights: Array
 
 
-@dataclass(eq=False)
-class _Linear:
-    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5), Jacobians J (N, 5, 9),
-    rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
-
-    y: Array
-    J: Array
-    g: Array
-    own: Array
-    own_lean: Array
-
-
 class _Problem:
     """Frames, clock and motion of one fit, with the state that it moves."""
 
@@ -108,16 +88,19 @@ class _Problem:
     ) -> None:
         self.frames, self.clock, self.motion, self.X_FR = frames, clock, motion, X_FR
         self.row = frames.p_C[:, 1] / frames.p_C[:, 2]
+        self.slide = np.zeros_like(frames.p_C) if frames.slide is None else frames.slide
 
     def nominal(self, offset: float, drift: float, rolling: float) -> Array:
         return self.clock.nominal(offset, drift) + rolling * self.row
 
-    def residuals(self, X: RigidTransform, t: Array, rolling: float) -> tuple[Array, Array, Array, Array, Array]:
+    def residuals(
+        self, X: RigidTransform, t: Array, rolling: float, edge: float
+    ) -> tuple[Array, Array, Array, Array, Array]:
         """Residuals e (N, 3), m (N, 2) and rates v (N, 3), turn (N, 2) at times t, and the tangents A (N, 3, 2) of the normal."""
         f = self.frames
         at = self.motion.feature(t, self.X_FR)
         R = X.rotation().matrix()
-        e = f.p_C @ R.T + X.translation() - at.p
+        e = (f.p_C + edge * self.slide) @ R.T + X.translation() - at.p
         n = f.n_C @ R.T
         if rolling:
             # rows exposed at different times shear the face and lean its normal
@@ -147,14 +130,14 @@ def fit_clock(
     """
     problem = _Problem(frames, clock, motion, X_FR)
     allowed = np.isfinite(clock.base) if keep is None else keep & np.isfinite(clock.base)
-    drift, rolling = (0.0, 0.0) if after is None else (after.drift, after.rolling)
+    drift, rolling, edge = (0.0, 0.0, 0.0) if after is None else (after.drift, after.rolling, after.edge)
     nominal = problem.nominal(offset, drift, rolling)
     allowed = allowed & motion.known(nominal)
     if after is None:
         variances, first = _first_variances(problem, X_BC, nominal, allowed)
         kept = allowed & first
         late = np.zeros(len(frames), dtype=bool)
-        capture = _searched_capture(problem, X_BC, nominal, variances, rolling, allowed)
+        capture = _searched_capture(problem, X_BC, nominal, variances, rolling, edge, allowed)
     else:
         variances, kept, late, capture = after.variances, allowed & after.keep, after.late.copy(), after.capture
     if np.count_nonzero(kept) < 4:
@@ -163,54 +146,48 @@ def fit_clock(
     index = np.array(free)
     linear, information, W = None, np.eye(len(free)), np.zeros((len(frames), 5, 5))
     for step_number in range(_STEPS):
-        capture = _polished_capture(problem, X_BC, nominal, capture, variances, rolling, late)
-        linear = _linearised(problem, X_BC, nominal, capture, rolling, pivot)
+        capture = _polished_capture(problem, X_BC, nominal, capture, variances, rolling, edge, late)
+        linear = _linearised(problem, X_BC, nominal, capture, rolling, edge, pivot)
         reach = _GUARD * float(np.sqrt(variances.jitter))
         inside = motion.known(nominal - reach) & motion.known(nominal + reach) & np.isfinite(linear.y[:, 0])
-        W = _weights(linear, variances, late)
+        W = frame_weights(linear, variances, late)
         kept, late, settled_sets = _sorted_frames(linear, variances, W, allowed & inside, kept, late, step_number)
-        W = _weights(linear, variances, late)
+        W = frame_weights(linear, variances, late)
         J = linear.J[kept][:, :, index]
         WJ = W[kept] @ J
-        information = np.einsum("nij,nik->jk", J, WJ)
+        information = np.einsum("nij,nik->jk", J, WJ) + np.diag(_PRIOR[index])
         score = np.einsum("nij,ni->j", WJ, linear.y[kept])
-        delta = np.zeros(9)
+        score += np.where(index == EDGE, edge * _PRIOR[index], 0.0)
+        delta = np.zeros(10)
         delta[index] = -_solved(information + np.diag(1.0 / _WIDEST[index] ** 2), score)
         R = exp_rotation(delta[:3]) @ X_BC.rotation().matrix()
         p = exp_rotation(delta[:3]) @ (X_BC.translation() - pivot) + pivot + delta[3:6]
         X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
-        offset, drift, rolling = offset + delta[OFFSET], drift + delta[DRIFT], rolling + delta[ROLLING]
+        offset, drift = offset + delta[OFFSET], drift + delta[DRIFT]
+        rolling, edge = rolling + delta[ROLLING], edge + delta[EDGE]
         nominal = problem.nominal(offset, drift, rolling)
         linear.y[kept] += linear.J[kept] @ delta
-        new = _new_variances(linear, variances, W, information, kept, late, index)
-        change = float(np.abs(np.log(_totals(linear, new, kept) / _totals(linear, variances, kept))).max())
+        new = new_variances(linear, variances, W, information, kept, late, index)
+        change = float(
+            np.abs(np.log(total_variances(linear, new, kept) / total_variances(linear, variances, kept))).max()
+        )
         variances = new
         if step_number == 3 and after is None:
-            capture = _searched_capture(problem, X_BC, nominal, variances, rolling, allowed)
+            capture = _searched_capture(problem, X_BC, nominal, variances, rolling, edge, allowed)
         small = np.sqrt(np.maximum(delta[index] @ information @ delta[index], 0.0)) < 1e-2
         if step_number > (6 if after is None else 3) and small and change < 3e-3 and settled_sets:
             break
     assert linear is not None
     g = linear.g
-    P = _noise(linear, variances)
+    P = noise_covariances(linear, variances)
     Pg = np.linalg.solve(P, g[:, :, None])[:, :, 0]
     a = np.maximum((g * Pg).sum(axis=1), 1e-12)
     jitters = (Pg * linear.y).sum(axis=1) / a
-    e, m, v, _, _ = problem.residuals(X_BC, capture, rolling)
+    e, m, v, _, _ = problem.residuals(X_BC, capture, rolling, edge)
     return ClockFit(
-        X_BC, float(offset), float(drift), float(rolling), free, pivot, information, variances, kept, late, capture, nominal,
+        X_BC, float(offset), float(drift), float(rolling), float(edge), free, pivot, information, variances, kept, late, capture, nominal,
         e, m, v, jitters, 1.0 / a, linear.J[:, :, index], W,
     )  # fmt: skip
-
-
-def _totals(linear: _Linear, variances: Variances, keep: Flags) -> Array:
-    """Mean variances of a centre and a normal, an axis, and of the time: what the weights follow from. The share of the fits' own noise
-    in them converges slowly, and matters little."""
-    own = np.einsum("nii->", linear.own[keep]) / (3.0 * np.count_nonzero(keep))
-    lean = np.einsum("nii->", linear.own_lean[keep]) / (2.0 * np.count_nonzero(keep))
-    return np.array(
-        [variances.factor * own + variances.spread, variances.factor * lean + variances.lean, variances.jitter]
-    )
 
 
 def _solved(N: Array, b: Array) -> Array:
@@ -229,7 +206,7 @@ def _tangents(n: Array) -> Array:
 
 def _first_variances(problem: _Problem, X: RigidTransform, nominal: Array, allowed: Flags) -> tuple[Variances, Flags]:
     """Variances from medians of the start's residuals, across and along the motion, and the frames that agree with them."""
-    e, m, v, _, _ = problem.residuals(X, nominal, 0.0)
+    e, m, v, _, _ = problem.residuals(X, nominal, 0.0, 0.0)
     speed = np.linalg.norm(v, axis=1)
     fast = allowed & (speed > 0.3 * float(np.nanmax(np.where(allowed, speed, 0.0), initial=0.0))) & (speed > 1e-3)
     u = v / np.maximum(speed, 1e-9)[:, None]
@@ -242,22 +219,6 @@ def _first_variances(problem: _Problem, X: RigidTransform, nominal: Array, allow
     return Variances(1.0, s_p**2, s_n**2, s_j**2), allowed & agree
 
 
-def _noise(linear: _Linear, variances: Variances) -> Array:
-    """Covariances (N, 5, 5) without the jitter."""
-    P = variances.factor * (linear.own + linear.own_lean)
-    P[:, range(3), range(3)] += variances.spread
-    P[:, range(3, 5), range(3, 5)] += variances.lean
-    return P
-
-
-def _weights(linear: _Linear, variances: Variances, late: Flags) -> Array:
-    """Inverse covariances (N, 5, 5) with the jitter."""
-    j = np.where(late, _FREE_S2, variances.jitter)
-    V = _noise(linear, variances) + j[:, None, None] * linear.g[:, :, None] * linear.g[:, None, :]
-    V[~np.isfinite(V[:, 0, 0])] = np.eye(5)
-    return np.asarray(np.linalg.inv(V))
-
-
 def _precision(problem: _Problem, X: RigidTransform, variances: Variances) -> tuple[Array, Array]:
     """Inverse covariances (N, 3, 3) of centres in the base frame, and (N,) of normals."""
     R = X.rotation().matrix()
@@ -267,7 +228,13 @@ def _precision(problem: _Problem, X: RigidTransform, variances: Variances) -> tu
 
 
 def _searched_capture(
-    problem: _Problem, X: RigidTransform, nominal: Array, variances: Variances, rolling: float, allowed: Flags
+    problem: _Problem,
+    X: RigidTransform,
+    nominal: Array,
+    variances: Variances,
+    rolling: float,
+    edge: float,
+    allowed: Flags,
 ) -> Array:
     """Most probable capture times (N,) on a grid: a move's end or a turn gives more than one local optimum."""
     s = float(np.sqrt(variances.jitter))
@@ -275,7 +242,7 @@ def _searched_capture(
     best, chosen = np.full(len(nominal), np.inf), nominal.copy()
     for k in _GRID:
         t = nominal + k * s
-        e, m, _, _, _ = problem.residuals(X, t, rolling)
+        e, m, _, _, _ = problem.residuals(X, t, rolling, edge)
         cost = np.einsum("ni,nij,nj->n", e, Wp, e) + wn * (m * m).sum(axis=1) + k * k
         better = np.where(np.isfinite(cost), cost, np.inf) < best
         best, chosen = np.where(better, cost, best), np.where(better, t, chosen)
@@ -289,14 +256,15 @@ def _polished_capture(
     capture: Array,
     variances: Variances,
     rolling: float,
+    edge: float,
     late: Flags,
 ) -> Array:
     """Capture times (N,) after two Gauss-Newton steps on each frame's own time."""
-    prior = 1.0 / np.where(late, _FREE_S2, variances.jitter)
+    prior = 1.0 / np.where(late, FREE_S2, variances.jitter)
     Wp, wn = _precision(problem, X, variances)
     limit = 3.0 * float(np.sqrt(variances.jitter)) + 1e-4
     for _ in range(2):
-        e, m, v, turn, _ = problem.residuals(X, capture, rolling)
+        e, m, v, turn, _ = problem.residuals(X, capture, rolling, edge)
         Wv = np.einsum("nij,nj->ni", Wp, v)
         slope = (Wv * e).sum(axis=1) + wn * (turn * m).sum(axis=1) - prior * (capture - nominal)
         bend = (Wv * v).sum(axis=1) + wn * (turn * turn).sum(axis=1) + prior
@@ -307,23 +275,24 @@ def _polished_capture(
 
 
 def _linearised(
-    problem: _Problem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, pivot: Array
-) -> _Linear:
+    problem: _Problem, X: RigidTransform, nominal: Array, capture: Array, rolling: float, edge: float, pivot: Array
+) -> Linearised:
     f = problem.frames
-    e, m, v, turn, A = problem.residuals(X, capture, rolling)
+    e, m, v, turn, A = problem.residuals(X, capture, rolling, edge)
     R = X.rotation().matrix()
     n = len(f)
     g = np.concatenate([v, turn], axis=1)
     y = np.concatenate([e, m], axis=1) + g * (capture - nominal)[:, None]
-    J = np.zeros((n, 5, 9))
-    J[:, :3, :3] = -skew(f.p_C @ R.T + X.translation() - pivot)
+    J = np.zeros((n, 5, 10))
+    J[:, :3, :3] = -skew((f.p_C + edge * problem.slide) @ R.T + X.translation() - pivot)
     J[:, :3, 3:6] = np.eye(3)
     At = np.swapaxes(A, 1, 2)
     J[:, 3:, :3] = -At @ skew(f.n_C @ R.T)
     clock = problem.clock
     times = np.stack([np.full(n, clock.sign), clock.base - clock.reference, problem.row], axis=1)
-    J[:, :, 6:] = -g[:, :, None] * times[:, None, :]
+    J[:, :, OFFSET:EDGE] = -g[:, :, None] * times[:, None, :]
     leaning = (v * problem.motion.feature(capture, problem.X_FR).n).sum(axis=1) / f.p_C[:, 2]
+    J[:, :3, EDGE] = problem.slide @ R.T
     J[:, 3:, ROLLING] += leaning[:, None] * (At @ R[:, 1])
     own, own_lean = np.zeros((n, 5, 5)), np.zeros((n, 5, 5))
     own[:, :3, :3] = R @ f.covariance @ R.T
@@ -331,16 +300,16 @@ def _linearised(
     bad = ~np.isfinite(y).all(axis=1)
     for array in (y, J, g):
         array[bad] = np.nan
-    return _Linear(y, J, g, own, own_lean)
+    return Linearised(y, J, g, own, own_lean)
 
 
 def _sorted_frames(
-    linear: _Linear, variances: Variances, W: Array, allowed: Flags, kept: Flags, late: Flags, step: int
+    linear: Linearised, variances: Variances, W: Array, allowed: Flags, kept: Flags, late: Flags, step: int
 ) -> tuple[Flags, Flags, bool]:
     """Frames to use and frames whose time is grossly late, from the present residuals; whether both sets stayed."""
     if step < 2 or step > 25:
         return kept & allowed, late & allowed, step > 25 and bool((kept <= allowed).all())
-    P = _noise(linear, variances)
+    P = noise_covariances(linear, variances)
     Wy = np.einsum("nij,nj->ni", W, np.nan_to_num(linear.y))
     geometric = np.einsum("ni,nij,nj->n", Wy, np.nan_to_num(P), Wy)
     new = allowed & (geometric < _GATE**2)
@@ -355,40 +324,3 @@ def _sorted_frames(
         low, middle, high = np.percentile(j[told], [15.87, 50.0, 84.13])
         new_late = told & (np.abs(j - middle) > _LATE * max(0.5 * (high - low), _LATE_FLOOR_S))
     return new, new_late, bool((new == kept).all() and (new_late == late).all())
-
-
-def _new_variances(
-    linear: _Linear,
-    variances: Variances,
-    W: Array,
-    information: Array,
-    keep: Flags,
-    late: Flags,
-    index: NDArray[np.int64],
-) -> Variances:
-    """One step of the equations q_g = tr(P V_g) of restricted maximum likelihood (Patterson and Thompson 1971)."""
-    w, J = W[keep], linear.J[keep][:, :, index]
-    y = linear.y[keep]
-    wy = np.einsum("nij,nj->ni", w, y)
-    wJ = w @ J
-    d = np.sqrt(np.maximum(np.diag(information), 1e-30))
-    inverse = np.linalg.pinv(information / np.outer(d, d), rcond=1e-11, hermitian=True) / np.outer(d, d)
-    g = linear.g[keep] * np.where(late[keep], 0.0, 1.0)[:, None]
-    kinds = [
-        linear.own[keep] + linear.own_lean[keep],
-        np.broadcast_to(np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), (len(y), 5, 5)),
-        np.broadcast_to(np.diag([0.0, 0.0, 0.0, 1.0, 1.0]), (len(y), 5, 5)),
-        g[:, :, None] * g[:, None, :],
-    ]
-    values = variances.array
-    for k, V in enumerate(kinds):
-        q = float(np.einsum("ni,nij,nj->", wy, V, wy))
-        t = float(np.einsum("nij,nji->", w, V)) - float(
-            np.einsum("jk,nij,nil,nlk->", inverse, wJ, V, wJ, optimize=True)
-        )
-        # what no frame tells stays as it is: an arm at rest says nothing of the jitter
-        if t * values[k] > _TOLD:
-            values[k] *= np.clip(q / t, 0.05, 20.0)
-    factor, spread, lean, jitter = np.maximum(values, _FLOOR)
-    # the fit's own covariance and the common spread are told apart only where it differs from frame to frame
-    return Variances(min(float(factor), 1.0), float(spread), float(lean), min(float(jitter), _MOST_JITTER_S**2))

@@ -10,7 +10,7 @@ from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
 from weldcal.calibration.errors import InconsistentPoses, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.clock import FrameClock, arrival_clock, choose_clock
-from weldcal.calibration.motion.clock_fit import DRIFT, OFFSET, ROLLING, ClockFit, fit_clock
+from weldcal.calibration.motion.clock_fit import DRIFT, EDGE, OFFSET, ROLLING, ClockFit, fit_clock
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.place_errors import PlaceErrors, find_place_errors
 from weldcal.calibration.motion.start import Start, search_start
@@ -25,7 +25,7 @@ _ROLLING_SIGMAS = 4.0  # beyond which a rolling shutter counts as seen
 _LEAST_SHARE = 0.5  # of the frames must agree on one pose
 _WORST_M = 0.02  # spread of the residuals across the motion: beyond, nothing fits
 # what an unknown may vary by (one sigma) and still count as determined: rad, m, s, s/s, s
-_OPEN = np.array([1e-2] * 3 + [5e-3] * 3 + [2e-2, 1e-3, 2e-2])
+_OPEN = np.array([1e-2] * 3 + [5e-3] * 3 + [2e-2, 1e-3, 2e-2, 1e2])
 _WEAK = 0.2  # of that: worth a sentence
 _UNEVEN_S = 0.005  # a device's clock that jitters by more may be worse than the arrivals
 _NAMES = (
@@ -38,6 +38,7 @@ _NAMES = (
     "clock offset",
     "clock drift",
     "rolling time",
+    "edge",
 )
 
 
@@ -110,15 +111,19 @@ def estimate_in_motion(
             clock, start, fit = other, other_start, other_fit
     _check(fit, frames)
     places = find_place_errors(fit, frames)
-    names = tuple(_NAMES[k] for k in fit.free)
     inverse, open_names, weak = _determined(fit, places)
     if OFFSET in fit.free and "clock offset" in open_names:
         fit = fit_clock(
-            frames, clock, motion, fit.X_BC, -clock.sign * start.delay_s, X_FR=X_FR, free=(0, 1, 2, 3, 4, 5)
+            frames,
+            clock,
+            motion,
+            fit.X_BC,
+            -clock.sign * start.delay_s,
+            X_FR=X_FR,
+            free=(0, 1, 2, 3, 4, 5, *(() if frames.slide is None else (EDGE,))),
         )
         places = find_place_errors(fit, frames)
         inverse, open_names, weak = _determined(fit, places)
-        names = _NAMES[:6]
         told = [
             "The motion does not show the clock's offset: the arm hardly moves, or all of it can as well be a shift of the scanner."
         ]
@@ -146,7 +151,9 @@ def estimate_in_motion(
     T = np.eye(len(inverse))
     T[3:6, :3] = -skew(np.asarray(fit.X_BC.translation()) - fit.pivot)
     joint = T @ inverse @ T.T
-    joint = 0.5 * (joint + joint.T)
+    kept = [k for k, name in enumerate(fit.free) if name != EDGE]
+    joint = 0.5 * (joint + joint.T)[np.ix_(kept, kept)]
+    names = tuple(_NAMES[fit.free[k]] for k in kept)
     held = _held_out(frames, clock, motion, fit, X_FR) if held_out else (np.full(len(frames), np.nan),) * 3
     before, speed, along = _along(frames, clock, motion, fit, start, X_FR)
     return MotionEstimate(
@@ -154,7 +161,7 @@ def estimate_in_motion(
         covariance=joint[:6, :6],
         joint=joint,
         names=names,
-        clock=_scanner_clock(fit, clock, frames, joint),
+        clock=_scanner_clock(fit, clock, frames, dict(zip(names, np.sqrt(np.diag(joint)), strict=True))),
         fit=fit,
         start=start,
         places=places,
@@ -183,15 +190,24 @@ def _fitted(
         raise InconsistentPoses(
             f"Too few frames were taken within the robot's stream ({begin:.3f} to {end:.3f} s); record both over the same time."
         )
-    free = (0, 1, 2, 3, 4, 5, OFFSET) + ((DRIFT,) if clock.kind == DEVICE else ())
+    edge = () if frames.slide is None else (EDGE,)
+    plain = (0, 1, 2, 3, 4, 5, OFFSET, *((DRIFT,) if clock.kind == DEVICE else ()))
+    free = (*plain, *edge)
     fit = fit_clock(frames, clock, motion, start.X_BC, -clock.sign * start.delay_s, X_FR=X_FR, free=free)
-    rolling = fit_clock(frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=(*free, ROLLING), after=fit)
+    rolling = fit_clock(
+        frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=(*plain, ROLLING, *edge), after=fit
+    )
     covariance, _ = _inverse(rolling.information, rolling.free)
-    sigma = float(np.sqrt(covariance[-1, -1]))
+    sigma = float(np.sqrt(covariance[len(plain), len(plain)]))
     if abs(rolling.rolling) > _ROLLING_SIGMAS * sigma and sigma < _OPEN[ROLLING]:
-        again = fit_clock(frames, clock, motion, rolling.X_BC, rolling.offset, X_FR=X_FR, free=(*free, ROLLING))
+        again = fit_clock(frames, clock, motion, rolling.X_BC, rolling.offset, X_FR=X_FR, free=(*plain, ROLLING, *edge))
         return start, again
     return start, fit
+
+
+def _corrected(frames: ObservedFrames, fit: ClockFit) -> Array:
+    """Centres (N, 3) m in the camera frame, with the edges at the height that the fit found."""
+    return frames.p_C if frames.slide is None else frames.p_C + fit.edge * frames.slide
 
 
 def _check(fit: ClockFit, frames: ObservedFrames) -> None:
@@ -232,21 +248,21 @@ def _determined(fit: ClockFit, places: PlaceErrors) -> tuple[Array, tuple[str, .
     return inverse, opened, weak
 
 
-def _scanner_clock(fit: ClockFit, clock: FrameClock, frames: ObservedFrames, joint: Array) -> ScannerClock:
-    sigma = dict(zip(fit.free, np.sqrt(np.diag(joint)), strict=True))
-    known = OFFSET in sigma
+def _scanner_clock(fit: ClockFit, clock: FrameClock, frames: ObservedFrames, sigma: dict[str, float]) -> ScannerClock:
+    offset, drift, rolling = (_NAMES[k] for k in (OFFSET, DRIFT, ROLLING))
+    known = offset in sigma
     device = clock.kind == DEVICE
     return ScannerClock(
         kind=clock.kind,
         offset_s=fit.offset + clock.shift if known else None,
-        sigma_s=float(sigma[OFFSET]) if known else None,
+        sigma_s=float(sigma[offset]) if known else None,
         jitter_s=float(np.sqrt(fit.variances.jitter)) if known else None,
         # the device's own time
         reference_s=clock.reference - clock.shift,
-        drift=fit.drift if device and DRIFT in sigma else None,
-        drift_sigma=float(sigma[DRIFT]) if device and DRIFT in sigma else None,
-        rolling_s=fit.rolling if ROLLING in sigma else None,
-        rolling_sigma_s=float(sigma[ROLLING]) if ROLLING in sigma else None,
+        drift=fit.drift if device and drift in sigma else None,
+        drift_sigma=float(sigma[drift]) if device and drift in sigma else None,
+        rolling_s=fit.rolling if rolling in sigma else None,
+        rolling_sigma_s=float(sigma[rolling]) if rolling in sigma else None,
         late=tuple(id for id, late in zip(frames.ids, fit.late, strict=True) if late),
         reason=clock.reason,
     )
@@ -268,7 +284,7 @@ def _along(
         (fit.X_BC, fit.nominal),
     ):
         at = motion.feature(t, X_FR)
-        e = frames.p_C @ X.rotation().matrix().T + X.translation() - at.p
+        e = _corrected(frames, fit) @ X.rotation().matrix().T + X.translation() - at.p
         speed = np.linalg.norm(at.v, axis=1)
         out.append(np.where(speed > 1e-3, (e * at.v).sum(axis=1) / np.maximum(speed, 1e-3), np.nan))
     return out[0], speed, out[1]
@@ -298,7 +314,7 @@ def _held_out(
             continue  # this block alone shows what the others leave open
         at = motion.feature(without.nominal[block], X_FR)
         R = without.X_BC.rotation().matrix()
-        e = frames.p_C[block] @ R.T + without.X_BC.translation() - at.p
+        e = _corrected(frames, without)[block] @ R.T + without.X_BC.translation() - at.p
         speed = np.linalg.norm(at.v, axis=1)
         position[block] = np.linalg.norm(without.centre[block], axis=1)
         along[block] = np.where(speed > 1e-3, (e * at.v).sum(axis=1) / np.maximum(speed, 1e-3), np.nan)

@@ -8,7 +8,11 @@ import typer
 from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 FileArgument = Annotated[
-    Path, typer.Argument(help="npz, CSV, JSON, or a sample file of easy_handeye2 or MoveIt.", show_default=False)
+    Path,
+    typer.Argument(
+        help="npz (pairs, or streams hand and eye), CSV, JSON, or a sample file of easy_handeye2 or MoveIt.",
+        show_default=False,
+    ),
 ]
 MountingOption = Annotated[
     str | None, option("--mounting", "NAME", "eye_in_hand, eye_on_base ..., if the file does not name it.")

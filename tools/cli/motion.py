@@ -1,9 +1,9 @@
-"""weldcal reproduce motion-data: calibration in motion, simulated."""
+"""weldcal reproduce motion, reproduce motion-data and benchmark motion: calibration in motion, simulated."""
 
 from collections.abc import Mapping
 from typing import Annotated
 
-from weldcal.tools.cli.options import Call, command, option, switch
+from weldcal.tools.cli.options import Call, Outcome, command, option, switch
 
 
 @command("reproduce motion-data")
@@ -56,4 +56,38 @@ def motion_data(
     return write_motion_data(request, call.progress)
 
 
-COMMANDS = (motion_data,)
+@command("reproduce motion")
+def motion(
+    call: Call,
+    quick: Annotated[bool, switch("--quick", "A quarter of the pixels and 90 frames; decides nothing.")] = False,
+    frames: Annotated[int | None, option("--frames", "N", "Frames in motion.", min=40, show_default="600")] = None,
+) -> Outcome:
+    """Repeat the flange paper on motion: Table 1, Eq. 21, Fig. 5, 6 and 9; the recording and its truth are kept. 15 min."""
+    from functools import partial
+
+    from weldcal.tools.studies.motion.reproduce import run_motion_study
+    from weldcal.tools.studies.motion.results import MotionStudyOptions
+    from weldcal.tools.studies.targets import print_targets
+
+    options = MotionStudyOptions(call.folder("reproduce", "motion"), call.seed, quick, frames)
+    study = run_motion_study(options, call.progress)
+    text = partial(print_targets, "calibration in motion", study.targets)
+    missed = "" if study.met else "Some targets were missed; see the table."
+    return Outcome(study.summary(), {}, {}, text, problem=missed)
+
+
+@command("benchmark motion")
+def throughput(
+    call: Call, seconds: Annotated[float, option("--seconds", "S", "Length of the stream.", min=2.0)] = 30.0
+) -> Outcome:
+    """Fit half-megapixel frames at 20 per second beside an arm's control: frames per second, and arrival to estimate."""
+    from functools import partial
+
+    from weldcal.tools.studies.motion.throughput import run_throughput
+    from weldcal.tools.studies.targets import print_targets
+
+    found = run_throughput(call.folder("benchmark", "motion"), seconds, call.seed, call.progress)
+    return Outcome(found.summary(), text=partial(print_targets, "streamed scans", found.targets))
+
+
+COMMANDS = (motion_data, motion, throughput)

@@ -20,6 +20,7 @@ from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, MOST_COMPARED, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
+from weldcal.calibration.motion.pose_streams import is_stream_file, read_streams, synchronise
 from weldcal.calibration.planning.next_pose import next_pose
 from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
@@ -62,7 +63,13 @@ def run_hand_eye(
     scanner = None if camera is None else get_scanner(camera)
     if refine is not None and arm is None:
         raise InputError("Robot errors (--refine) need the robot's name. Add --robot, for example ur10e.")
-    pairs = read_pairs(file, mounting=mounting, length=unit)
+    streams = None
+    if is_stream_file(file):
+        if unit not in (None, "m") or motions:
+            raise InputError("Two streams of poses are in metres; omit --unit and --motions.")
+        streams = synchronise(read_streams(file), mounting=mounting or "eye_in_hand", source=file.name)
+        say(streams.sentence)
+    pairs = read_pairs(file, mounting=mounting, length=unit) if streams is None else streams.pairs
     found = get_mounting(pairs.mode)
     if (equation == "axb-ycz") != (found.name == "co_manipulation"):
         right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
@@ -107,7 +114,7 @@ def run_hand_eye(
     provenance = Provenance(file.name, sha256(_file(file).read_bytes()).hexdigest())
     files = export_hand_eye(result, found, out, provenance)
     seconds = time.perf_counter() - begin
-    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), sentence)
+    return HandEyeReport(result, found, comparison, advice, files, seconds, " ".join(said), sentence, streams)
 
 
 def _refined(pairs: PosePairs, config: HandEyeConfig, said: list[str], *, optional: bool) -> CornerRefinement | None:

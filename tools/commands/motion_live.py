@@ -42,12 +42,22 @@ class MotionOutcome:
         return self.options.out
 
     def true_captures(self) -> dict[int, float]:
-        """True capture times (s) of the frames by number; empty where no simulation knows them."""
-        log = self.run.cell.logs.get("scanner_capture")
-        if log is None:
+        """True capture times (s) of the frames by number, on the clock of the robot's stream; empty where no simulation knows them.
+
+        A drawn arm that follows an emulated controller is behind it: a frame then shows where that arm was before.
+        """
+        logs, root = self.run.cell.logs, self.run.root
+        if "scanner_capture" not in logs:
             return {}
-        numbers, times = log.FindLog(self.run.root).data()
-        return {int(n): float(t) for n, t in zip(numbers, times, strict=True) if n}
+        numbers, times = logs["scanner_capture"].FindLog(root).data()
+        behind = 0.0
+        world = self.run.cell.station.world
+        if "joints" in logs and self.record.blocks and world is not None:
+            log = logs["joints"].FindLog(root)
+            # as in a picture, at a tick the plant's last step shows
+            stepped = log.sample_times() - world.plant.time_step()
+            behind = follower_delay(stepped, log.data()[:6].T, self.record)
+        return {int(n): float(t) - behind for n, t in zip(numbers, times, strict=True) if n}
 
     def truth(self) -> dict[str, object]:
         """Errors against the simulation: X_BC at the cube's centre, and the clock's offset (mean over the frames)."""
@@ -101,6 +111,16 @@ class MotionOutcome:
 
 def _ms(values: tuple[float, ...], percentile: float) -> float | None:
     return 1e3 * float(np.percentile(values, percentile)) if values else None
+
+
+def follower_delay(t: Array, joints: Array, record: MotionRecord) -> float:
+    """How long (s) after the robot's stream an arm (n, 6) rad at times (n,) s is where that says, from all joints in motion."""
+    stream = record.stream("")
+    assert stream.joints is not None
+    inside = (t > stream.time[0]) & (t < stream.time[-1])
+    reported = np.column_stack([np.interp(t[inside], stream.time, q) for q in stream.joints.T])
+    rate = np.gradient(reported, t[inside], axis=0)
+    return -float(((joints[inside] - reported) * rate).sum() / (rate**2).sum())
 
 
 def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress) -> MotionOutcome:

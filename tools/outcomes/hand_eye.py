@@ -9,6 +9,7 @@ from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import MOST_COMPARED
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
+from weldcal.calibration.motion.pose_streams import Synchronised
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
 
@@ -25,7 +26,7 @@ class MethodRow:
 @dataclass(frozen=True)
 class HandEyeReport:
     """A finished calibration: the result, the comparison, the next pose (``advice``: as a sentence) and the files;
-    ``corners``: sentences on corners and robot errors."""
+    ``corners``: sentences on corners and robot errors; ``streams``: the synchronisation where two streams were given."""
 
     result: HandEyeResult
     mounting: Mounting
@@ -35,6 +36,7 @@ class HandEyeReport:
     seconds: float
     corners: str = ""
     advice: str = ""
+    streams: Synchronised | None = None
 
     def summary(self) -> dict[str, object]:
         """The JSON object of the command."""
@@ -42,6 +44,11 @@ class HandEyeReport:
         out: dict[str, object] = {"state": "done", "configuration": self.mounting.name}
         for k, X in r.poses.items():
             out |= {k: X, f"{k}_is": self.mounting.unknowns[k].sentence, f"covariance_{k}": r.covariance[k]}
+        if self.streams is not None:
+            out |= {
+                "clock_offset_ms": 1e3 * self.streams.offset_s,
+                "clock_offset_sigma_ms": 1e3 * self.streams.sigma_s,
+            }
         return out | {
             "held_out_deg": r.held_out.rms_deg,
             "held_out_mm": 1e3 * r.held_out.rms_translation,
@@ -86,6 +93,8 @@ class HandEyeReport:
             lines += [f"             {_held_out(kept, 'without outliers, ')}"]
         lines += [f"weighting    {r.method}"]
         lines += [f"unobservable {s}" for s in r.unobservable] + [f"warning      {s}" for s in r.warnings]
+        if self.streams is not None:
+            lines += [f"clocks       {self.streams.sentence}"]
         if self.corners:
             lines += ["", self.corners]
         if self.comparison:

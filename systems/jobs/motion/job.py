@@ -159,8 +159,9 @@ class Motion(Job[MotionPlanned]):
             recorder = wiring.add("motion_recorder", MotionRecorder(Path(job.recording_folder)))
             wiring.connect(recorder, stream=wiring.out("scanner.stream"))
         logged = {"frame_counts": queue.GetOutputPort("counts")}
-        if station.diagram.HasOutputPort("cheat.scanner_capture"):
-            logged["scanner_capture"] = wiring.out("cheat.scanner_capture")
+        for name in ("scanner_capture", "joints"):  # for reports only
+            if station.diagram.HasOutputPort(f"cheat.{name}"):
+                logged[name] = wiring.out(f"cheat.{name}")
         ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged)
         return AddedMotion(plan, procedure, collector, calibrator, queue, recorder, job.frames, ports, maximum_time_s)
 

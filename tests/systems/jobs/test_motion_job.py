@@ -31,6 +31,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
+from weldcal.tools.commands.motion_live import follower_delay
 
 
 def scenario(frames: int = 45) -> Scenario:
@@ -65,6 +66,15 @@ def test_the_job_finds_the_scanner_and_its_clock() -> None:
     delays = [f.arrival - captures[int(f.id)] for f, _ in record.seen]
     assert min(delays) > 0.118
     assert np.mean(delays) == pytest.approx(0.14, abs=0.01)
+
+
+def test_the_drawn_arm_is_where_the_stream_says_and_a_late_one_is_noticed() -> None:
+    run = a_run()
+    record, log = run.cell.job.record(run.root), run.cell.logs["joints"].FindLog(run.root)
+    t, q = log.sample_times() - 0.002, log.data()[:6].T  # at a tick the plant's last step shows
+    here = follower_delay(t, q, record)
+    assert abs(here) < 3e-4
+    assert follower_delay(t + 0.005, q, record) - here == pytest.approx(0.005, abs=2e-4)
 
 
 def test_no_frame_is_dropped_in_simulation() -> None:

@@ -161,4 +161,5 @@ def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTra
     build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
     build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
     build.outputs["cheat.scanner_capture"] = stream.GetOutputPort("newest_capture")
+    build.outputs["cheat.joints"] = world.plant.get_state_output_port(world.arm)
     return mounted.X_LC

@@ -1,0 +1,259 @@
+"""Repeats the experiments of the second flange paper on a simulated cell: static and motion mode, tracking, compensation, quality."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.geometry.rigid import fit_rigid
+from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
+from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
+from weldcal.calibration.motion.frames import see_frames
+from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.published.icp import face_cloud, icp_error, make_verification, sight
+from weldcal.models.arrays import Array
+from weldcal.models.flanges import FlangeStandard
+from weldcal.tools.console import Progress
+from weldcal.tools.report.files import write_json
+from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.motion.report import motion_report
+from weldcal.tools.studies.motion.results import MotionStudy, MotionStudyOptions, Quality, Row, Track
+from weldcal.tools.studies.motion.static_mode import Look, StaticMode, noise_of_face
+from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
+
+_ICP_FRAMES, _QUICK_FRAMES = 120, 24  # for Table 1 and Fig. 6
+_REACH_M = 0.06
+_TO_MM = np.array([*[np.degrees(1.0)] * 3, *[1e3] * 3])
+
+
+def run_motion_study(options: MotionStudyOptions, progress: Progress) -> MotionStudy:
+    """Run the study; write `dataset` with truth.json, table.json and report.html."""
+    start = time.monotonic()
+    frames = options.frames or (90 if options.quick else 600)
+    world = MotionWorld(
+        MotionOptions(frames=frames, size=(534, 400) if options.quick else None, surroundings=False, seed=options.seed)
+    )
+    folder, truth_file = options.folder / "dataset", options.folder / "truth.json"
+    write_motion_dataset(world, folder, truth_file, lambda stage, f: progress(stage, 0.6 * f))
+    study = _evaluated(world, folder, truth_file, options, progress, start)
+    write_json(options.folder / "table.json", study.summary())
+    write_atomic(options.folder / "report.html", motion_report(study))
+    return study
+
+
+def _evaluated(
+    world: MotionWorld, folder: Path, truth_file: Path, options: MotionStudyOptions, progress: Progress, start: float
+) -> MotionStudy:
+    data = load_motion_dataset(folder)
+    motion = ContinuousMotion(data.stream)
+    begun = time.monotonic()
+    seen = see_frames(data, world.flange, motion, seed=options.seed, tell=lambda f: progress("fits", 0.6 + 0.15 * f))
+    fit_ms = 1e3 * (time.monotonic() - begun) / len(data.frames)
+    observed = seen.observed
+    progress("calibration in motion", 0.76)
+    found = estimate_in_motion(observed, motion)
+    by_arrival = estimate_in_motion(
+        ObservedFrames(
+            observed.ids, observed.arrival, None, observed.p_C, observed.n_C, observed.covariance, observed.normal_sigma
+        ),
+        motion,
+        held_out=False,
+    )
+    static = StaticMode(world, 840 if options.quick else None)
+    looks = static.grid(options.seed, lambda stage, f: progress(stage, 0.78 + 0.08 * f))
+    X_static = fit_rigid(np.array([k.X_BF.translation() for k in looks]), np.array([k.fit.center_C for k in looks]))
+    at_arrival = motion.poses(observed.arrival)
+    both = np.isfinite(at_arrival[:, 0, 0]) & found.inliers
+    X_raw = fit_rigid(
+        at_arrival[both, :3, 3], observed.p_C[both]
+    )  # the paper's method in motion: SVD, no synchronisation
+    progress("ICP of the flange mesh", 0.88)
+    verify = _Verifier(data, seen.fits, world.flange)
+    at_capture = motion.poses(found.capture)
+    chosen = _spread(np.flatnonzero(both), _QUICK_FRAMES if options.quick else _ICP_FRAMES)
+    before, kept = verify.errors(observed.ids, chosen, at_arrival, X_raw)
+    after, kept_after = verify.errors(observed.ids, chosen, at_capture, found.X_BC)
+    rows = (
+        Row("static mode, SVD", _static_errors(looks, X_static, world.flange)),
+        Row("motion mode, SVD, poses at arrival", before),
+        Row("motion mode, joint estimate", after),
+    )
+    truth = json.loads(truth_file.read_text(encoding="utf-8"))
+    captures = np.array([truth["capture_s"][id] for id in observed.ids])
+    offset = found.clock.offset_s
+    used = found.inliers
+    p_robot, p_arrival = at_capture[:, :3, 3], at_arrival[:, :3, 3]
+    t0 = float(observed.arrival[0])
+    p_seen = (found.X_BC @ observed.p_C.T).T
+    raw_seen = (X_raw @ observed.p_C.T).T
+    quality, faces = _quality(world, static, data, observed.ids, seen.fits, found)
+    return MotionStudy(
+        options=options,
+        rows=rows,
+        icp_share=verify.share(observed.ids[chosen[0]], at_capture[chosen[0]], found.X_BC),
+        history_t=np.asarray(observed.arrival[kept_after] - t0),
+        history_before=_matching(before, kept, kept_after),
+        history_after=after,
+        track=Track(observed.arrival[used] - t0, p_robot[used], p_arrival[used], p_seen[used]),
+        tracking_rms_mm=_rms(found.held_out_m[used]),
+        tracking_before_mm=_rms(np.linalg.norm(raw_seen[both] - p_arrival[both], axis=1)),
+        offset_ms=float("nan") if offset is None else 1e3 * offset,
+        offset_sigma_ms=None if found.clock.sigma_s is None else 1e3 * found.clock.sigma_s,
+        offset_error_ms=_offset_error(found, observed, captures),
+        clock=found.clock.kind,
+        delay_ms=1e3 * float(np.mean(observed.arrival - captures)),
+        arrival_offset_error_ms=_offset_error(by_arrival, observed, captures),
+        X_errors={
+            "static, SVD": _X_error(X_static, world),
+            "motion, SVD, poses at arrival": _X_error(X_raw, world),
+            "motion, synchronised": _X_error(found.X_BC, world),
+            "motion, arrivals only": _X_error(by_arrival.X_BC, world),
+        },
+        compensation=_compensation(verify, observed.ids, chosen, at_arrival, at_capture, X_raw, found.X_BC),
+        quality=quality,
+        faces=faces,
+        throughput={
+            "pixels": float(world.scanner.width * world.scanner.height),
+            "fit_ms_per_frame_with_reading": fit_ms,
+            "frames_per_second_from_files": 1e3 / fit_ms,
+        },
+        n_frames=len(data.frames),
+        n_seen=len(observed),
+        wall_seconds=time.monotonic() - start,
+    )
+
+
+class _Verifier:
+    """ICP errors of the flange mesh in frames of a recording."""
+
+    def __init__(self, data: MotionDataset, fits: dict[str, FlangeFit], standard: FlangeStandard) -> None:
+        self._data, self._fits, self._standard = data, fits, standard
+        self._clouds: dict[str, Array] = {}
+
+    def face(self, id: str) -> Array:
+        """The points of the flange's face in one frame."""
+        if id not in self._clouds:
+            self._clouds[id] = face_cloud(self._data.cloud(id), self._fits[id], self._standard)
+        return self._clouds[id]
+
+    def one(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[Array, RigidTransform | None]:
+        """Error (6,) deg and mm, and the correction of Eq. 21, None where the registration failed."""
+        # some 30 mm of unsynchronised error must be within reach
+        verification = replace(make_verification(self.face(id), _rigid(X_BF), self._standard), max_distance_m=_REACH_M)
+        reach = icp_error(X_BC, verification)
+        return np.asarray(reach.value * _TO_MM), reach.X_CpC
+
+    def share(self, id: str, X_BF: Array, X_BC: RigidTransform) -> tuple[float, float, float]:
+        """Share of a known shift along x, y and z that the registration of this frame reports."""
+        x, y, z = sight(X_BC, make_verification(self.face(id), _rigid(X_BF), self._standard)).share[3:]
+        return float(x), float(y), float(z)
+
+    def errors(
+        self, ids: tuple[str, ...], which: NDArray[np.intp], poses: Array, X_BC: RigidTransform
+    ) -> tuple[Array, Array]:
+        """Errors (N, 6) deg and mm of the frames with a registration, and their indices (N,)."""
+        found, kept = [], []
+        for k in which:
+            value, correction = self.one(ids[k], poses[k], X_BC)
+            if correction is not None:
+                found.append(value)
+                kept.append(int(k))
+        return np.array(found).reshape(-1, 6), np.array(kept, dtype=int)
+
+
+def _static_errors(looks: list[Look], X_BC: RigidTransform, standard: FlangeStandard) -> Array:
+    """ICP errors (N, 6) deg and mm at the poses of the grid."""
+    out = []
+    for look in looks:
+        cloud = face_cloud(look.points_C, look.fit, standard)
+        out.append(icp_error(X_BC, make_verification(cloud, look.X_BF, standard)).value * _TO_MM)
+    return np.array(out)
+
+
+def _compensation(
+    verify: _Verifier, ids: tuple[str, ...], chosen: NDArray[np.intp], at_arrival: Array, at_capture: Array,
+    X_raw: RigidTransform, X_found: RigidTransform,
+) -> dict[str, tuple[float, float]]:  # fmt: skip
+    """Rms ICP displacement (mm) before and after X_BC is right-multiplied by the mean error matrix (Eq. 21); the matrix comes
+    from every other frame, the errors from the frames between."""
+    out = {}
+    for name, X, poses in (
+        ("SVD, poses at arrival", X_raw, at_arrival),
+        ("SVD, poses at the capture", X_raw, at_capture),
+        ("joint estimate", X_found, at_capture),
+    ):
+        corrections = [c for _, c in (verify.one(ids[k], poses[k], X) for k in chosen[::2]) if c is not None]
+        turn = np.mean([rotation_vector(c.rotation()) for c in corrections], axis=0)
+        shift = np.mean([c.translation() for c in corrections], axis=0)
+        better = X @ RigidTransform(RotationMatrix(exp_rotation(turn)), shift)
+        before, after = (Row("", verify.errors(ids, chosen[1::2], poses, Y)[0]).rms_mm for Y in (X, better))
+        out[name] = (before, after)
+    return out
+
+
+def _quality(
+    world: MotionWorld, static: StaticMode, data: MotionDataset, ids: tuple[str, ...], fits: dict[str, FlangeFit],
+    found: MotionEstimate,
+) -> tuple[dict[str, Quality], dict[str, Array]]:  # fmt: skip
+    """Fig. 9: the fastest frame that the estimate used, and a static scan at the same place; faces (N, 3) mm in the flange's axes."""
+    k = int(np.argmax(np.where(found.inliers, found.speed, -np.inf)))
+    q = world.joints(float(found.capture[k]) - world.options.robot_start_s)
+    still = static.look(q, np.random.default_rng(9))
+    quality, faces = {}, {}
+    moving = data.cloud(ids[k])
+    for name, points, fit in (("static", still.points_C, still.fit), ("in motion", moving, fits[ids[k]])):
+        plane, edge, count = noise_of_face(points, fit, world)
+        quality[name] = Quality(count, plane, edge)
+        flat = points.reshape(-1, 3)
+        d = flat[np.isfinite(flat[:, 2])] - fit.center_C
+        d = d[np.linalg.norm(d, axis=1) < 0.04]
+        x = np.cross(fit.normal_C, [0.0, 1.0, 0.0])
+        x /= np.linalg.norm(x)
+        faces[name] = 1e3 * d @ np.column_stack([x, np.cross(fit.normal_C, x), fit.normal_C])
+    return quality, faces
+
+
+def _X_error(X_BC: RigidTransform, world: MotionWorld) -> tuple[float, float, float]:
+    """Error of X_BC: mm at the cube's centre, mm at the camera's origin, degrees."""
+    p_C = world.X_BC.inverse() @ world.centre
+    turn = (world.X_BC.inverse() @ X_BC).rotation().ToAngleAxis().angle()
+    origin = np.linalg.norm(X_BC.translation() - world.X_BC.translation())
+    return 1e3 * float(np.linalg.norm(X_BC @ p_C - world.centre)), 1e3 * float(origin), float(np.degrees(turn))
+
+
+def _offset_error(found: MotionEstimate, observed: ObservedFrames, captures: Array) -> float:
+    """Error of the clock's offset, ms: mean over the frames of the stated capture time less the true one."""
+    clock = found.clock
+    if clock.offset_s is None:
+        return float("nan")
+    if clock.kind == "device" and observed.device is not None:
+        drift = (clock.drift or 0.0) * (observed.device - (clock.reference_s or 0.0))
+        return 1e3 * float(np.mean(observed.device + clock.offset_s + drift - captures))
+    return 1e3 * float(np.mean(observed.arrival - clock.offset_s - captures))
+
+
+def _matching(errors: Array, kept: Array, wanted: Array) -> Array:
+    """Rows of ``errors`` (of frames ``kept``) for the frames ``wanted``, NaN where there is none."""
+    row = {int(k): e for k, e in zip(kept, errors, strict=True)}
+    return np.array([row.get(int(k), np.full(6, np.nan)) for k in wanted])
+
+
+def _spread(index: NDArray[np.intp], n: int) -> NDArray[np.intp]:
+    """At most ``n`` of the indices, evenly spread."""
+    return np.asarray(index[np.unique(np.linspace(0, len(index) - 1, min(n, len(index))).astype(int))])
+
+
+def _rigid(X: Array) -> RigidTransform:
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
+
+
+def _rms(values: Array) -> float:
+    values = values[np.isfinite(values)]
+    return 1e3 * float(np.sqrt(np.mean(values**2)))
