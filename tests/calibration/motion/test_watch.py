@@ -108,3 +108,12 @@ def _rest(motion: ContinuousMotion) -> RobotStream:
 def _cut(motion: ContinuousMotion, begin: float) -> RobotStream:
     t = np.arange(begin, motion.span[1] - 0.01, 0.002)
     return RobotStream(t, motion.poses(t))
+
+
+def test_a_handful_of_frames_gives_finite_figures_and_no_alarm() -> None:
+    result, frames, motion = recording(5, device=False)
+    few = frames.pick(np.arange(len(frames)) < 6)
+    w = watch(result, few, motion)
+    assert len(w.ids) == 6
+    assert w.events == ()
+    assert 0.0 < w.rms_m < 1e-3
