@@ -12,11 +12,11 @@ from weldcal.calibration.data.checks import read_header
 from weldcal.calibration.data.motion_dataset import MotionDataset, load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult, export_all, load_result, save_result, software_version
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.motion.background import background_move
-from weldcal.calibration.motion.drift import MOVED, DriftConfig, DriftEvent
+from weldcal.calibration.motion.drift.background import background_move
+from weldcal.calibration.motion.drift.sequential import MOVED, DriftConfig, DriftEvent
+from weldcal.calibration.motion.drift.watch import Watched, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.motion.watch import Watched, watch
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
-from weldcal.calibration.motion.drift import WARM_UP, DriftEvent
-from weldcal.calibration.motion.watch import Watched
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
+from weldcal.calibration.motion.drift.watch import Watched
 from weldcal.models.arrays import Array
 
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"

@@ -10,10 +10,10 @@ from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import ARRIVAL, ScannerClock
 from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.motion.drift.watch import watch
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
-from weldcal.calibration.motion.watch import watch
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.motion.moves import cube_moves, observed_frames, recorded_stream
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from weldcal.calibration.data.motion_dataset import load_motion_dataset
 from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.motion.drift.watch import Watched, watch
 from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.stream import ContinuousMotion
-from weldcal.calibration.motion.watch import Watched, watch
 from weldcal.tools.commands.monitor_body import see_link
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import write_json

@@ -8,9 +8,9 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
 from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.motion.drift_filter import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
-from weldcal.calibration.motion.drift_noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift_rows import CLOCK, MOVE, SCALE, SIZE, Rows, about, moved_about
+from weldcal.calibration.motion.drift.hypotheses import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
+from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
+from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows, about, moved_about
 from weldcal.models.arrays import Array
 
 MOVED, CREEP, WARM_UP = "moved", "creep", "warm-up"

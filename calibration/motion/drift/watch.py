@@ -10,10 +10,10 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.data.scanner_correction import correction_from_document
-from weldcal.calibration.motion.drift import WARM_UP, DriftConfig, DriftEvent, DriftTest
-from weldcal.calibration.motion.drift_filter import FilterConfig
-from weldcal.calibration.motion.drift_noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift_rows import CLOCK, Rows, rows_of
+from weldcal.calibration.motion.drift.hypotheses import FilterConfig
+from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
+from weldcal.calibration.motion.drift.residuals import CLOCK, Rows, rows_of
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import Synchronised, synchronise
