@@ -11,8 +11,8 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
 from weldcal.calibration.data.scanner_clock import ScannerClock
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.motion.drift import WARM_UP, DriftConfig, DriftEvent, DriftTest
-from weldcal.calibration.motion.drift_rows import TrackedFrame, tracked_rows
+from weldcal.calibration.motion.drift.residuals import TrackedFrame, tracked_rows
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.systems.messages import FlangeEstimate, Message

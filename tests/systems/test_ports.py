@@ -131,7 +131,6 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     MotionCollector: MotionCollector,
     MotionCalibrator: lambda: MotionCalibrator(the_arm()),
     MotionRecorder: lambda: MotionRecorder(Path("unused")),
-    DriftMonitor: lambda: DriftMonitor(the_arm(), X, MonitoredCalibration(X, 1e-8 * np.eye(6))),
     PoseRecorder: PoseRecorder,
     FlangeEstimator: lambda: FlangeEstimator(the_arm(), X, get_flange("tool-ring-63"), X, 0.06),
     IterativeCalibrator: lambda: IterativeCalibrator(the_arm(), X, get_flange("tool-ring-63"), CALIBRATOR),
@@ -142,6 +141,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
+    DriftMonitor: lambda: DriftMonitor(the_arm(), X, MonitoredCalibration(X, np.eye(6))),
     ProcessSwitch: ProcessSwitch,
     CommandArbiter: CommandArbiter,
     FlangeMover: FlangeMover,
@@ -273,13 +273,6 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     MotionCalibrator: {"record": MotionRecord, "state": MotionState, "calibration": MotionCalibration},
     MotionRecorder: {"stream": ScanStream},
-    DriftMonitor: {
-        "flange_estimate": FlangeEstimate,
-        "history": PoseHistory,
-        "recalibrate": 1,
-        "drift": DriftStatus,
-        "moved": 1,
-    },
     PoseRecorder: {"position_measured": 6, "sample_time": 1, "history": PoseHistory},
     FlangeEstimator: {
         "scan": Scan,
@@ -342,6 +335,13 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "velocity_measured": 6,
         "velocity": 6,
         "settled_goal": 1,
+    },
+    DriftMonitor: {
+        "flange_estimate": FlangeEstimate,
+        "history": PoseHistory,
+        "recalibrate": 1,
+        "drift": DriftStatus,
+        "moved": 1,
     },
     SlewLimiter: {"velocity_wanted": 6, "velocity_command": 6},
     JobSequencer: {

@@ -22,6 +22,13 @@ def monitor(
         Path, option("--calibration", "RESULT", "The calibration: its folder, or its calibration.yaml.")
     ],
     flange: FlangeOption = None,
+    body: Annotated[
+        str | None,
+        option(
+            "--body", "LINK", "Track a link instead of the flange, such as wrist_1_link.", show_default="the flange"
+        ),
+    ] = None,
+    fused: Annotated[bool, switch("--fused", "With --body: fuse its surface from the scans, without a mesh.")] = False,
     false_alarms: Annotated[float, option("--false-alarms", "N", "False alarms per hour that are accepted.")] = 1e-3,
     recalibrate: Annotated[
         bool, switch("--recalibrate", "Write the scanner's pose after the last change to recalibrated/.")
@@ -40,6 +47,8 @@ def monitor(
         flange=flange,
         false_alarms_per_hour=false_alarms,
         recalibrate=recalibrate,
+        body=body,
+        fused=fused,
         seed=call.seed,
         progress=call.progress,
     )
@@ -78,4 +87,26 @@ def benchmark_drift(
     return Outcome(result, text=lambda: print_targets("Drift", targets))
 
 
-COMMANDS = (benchmark_drift,)
+@command("benchmark whole-body")
+def benchmark_whole_body(
+    call: Call,
+    frames: Annotated[int, option("--frames", "N", "Frames of the recording.", min=12)] = 200,
+    width: Annotated[int, option("--width", "PX", "Width of the scanner's image.", min=64)] = 1068,
+    noise_mm: Annotated[
+        float | None, option("--noise-mm", "MM", "Noise of one pixel.", show_default="the scanner's")
+    ] = None,
+    body: Annotated[str, option("--body", "LINK", "The link that is tracked.")] = "wrist_1_link",
+) -> Outcome:
+    """Compare the tracking error of the flange with that of a link, by its mesh and by a model fused from the scans."""
+    from weldcal.tools.studies.motion.whole_body import run_whole_body
+    from weldcal.tools.studies.motion.world import MotionOptions
+    from weldcal.tools.studies.targets import print_targets
+
+    options = MotionOptions(
+        frames=frames, size=(width, round(0.749 * width)), noise_mm=noise_mm, seed=call.seed, surroundings=False
+    )
+    summary, targets = run_whole_body(call.folder("benchmark", "whole-body"), options, body, call.progress)
+    return Outcome(summary, text=lambda: print_targets("Whole body", targets))
+
+
+COMMANDS = (benchmark_drift, benchmark_whole_body)

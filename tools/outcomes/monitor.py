@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
-from weldcal.calibration.motion.drift import WARM_UP, DriftEvent
-from weldcal.calibration.motion.watch import Watched
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftEvent
+from weldcal.calibration.motion.drift.watch import Watched
+from weldcal.models.arrays import Array
 
 CALM, DRIFTED, WARMED = "no drift found", "the scanner has moved", "the scanner warms up"
 
@@ -101,6 +102,6 @@ def _kind(reason: str) -> str:
     return re.split(r"[:;]|\s-?\d", reason)[0].rstrip(". ") + "."
 
 
-def _rms_mm(residuals: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+def _rms_mm(residuals: Array) -> float | None:
     known = residuals[np.isfinite(residuals).all(axis=1)]
-    return 1e3 * float(np.sqrt((known**2).sum(axis=1).mean())) if len(known) else float("nan")
+    return 1e3 * float(np.sqrt((known**2).sum(axis=1).mean())) if len(known) else None

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from weldcal.calibration.motion.drift import DriftEvent
+from weldcal.calibration.motion.drift.sequential import DriftEvent
 from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.monitor import CALM, MonitorReport, drift_document
 from weldcal.tools.report.pictures import GREY, OURS, THEIRS, TRUTH, plain, svg

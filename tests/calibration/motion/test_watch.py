@@ -10,10 +10,10 @@ from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_clock import ARRIVAL, ScannerClock
 from weldcal.calibration.geometry.se3 import exp_rotation
+from weldcal.calibration.motion.drift.watch import watch
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
-from weldcal.calibration.motion.watch import watch
 from weldcal.models.errors import InputError
 from weldcal.tools.studies.motion.moves import cube_moves, observed_frames, recorded_stream
 
@@ -108,3 +108,12 @@ def _rest(motion: ContinuousMotion) -> RobotStream:
 def _cut(motion: ContinuousMotion, begin: float) -> RobotStream:
     t = np.arange(begin, motion.span[1] - 0.01, 0.002)
     return RobotStream(t, motion.poses(t))
+
+
+def test_a_handful_of_frames_gives_finite_figures_and_no_alarm() -> None:
+    result, frames, motion = recording(5, device=False)
+    few = frames.pick(np.arange(len(frames)) < 6)
+    w = watch(result, few, motion)
+    assert len(w.ids) == 6
+    assert w.events == ()
+    assert 0.0 < w.rms_m < 1e-3

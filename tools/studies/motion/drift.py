@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from weldcal.calibration.motion.drift import DriftConfig, DriftEvent, DriftTest
+from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import records_csv, write_json

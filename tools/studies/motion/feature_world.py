@@ -8,7 +8,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.rigid import fit_rigid
 from weldcal.calibration.geometry.se3 import exp_rotation, rotation_vector
-from weldcal.calibration.motion.drift_rows import Rows, rows_of
+from weldcal.calibration.motion.drift.residuals import Rows, rows_of
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array

@@ -8,9 +8,9 @@ from pydrake.math import RigidTransform
 from scipy.stats import chi2
 
 from weldcal.calibration.geometry.se3 import skew
-from weldcal.calibration.motion.drift_filter import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
-from weldcal.calibration.motion.drift_noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift_rows import CLOCK, MOVE, SCALE, SIZE, Rows, about, moved_about
+from weldcal.calibration.motion.drift.hypotheses import RAMP, RAMP_S, STEP, DriftFilter, FilterConfig
+from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
+from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows, about, moved_about
 from weldcal.models.arrays import Array
 
 MOVED, CREEP, WARM_UP = "moved", "creep", "warm-up"
@@ -100,7 +100,12 @@ class DriftTest:
         self._last_s = 0.0
         self.events: list[DriftEvent] = []
         tests = 3600.0 * frame_rate_hz * len(self.filter.kind)
-        self.threshold = float(chi2.isf(min(self.config.false_alarms_per_hour / tests, 0.5), 6))
+        level = min(self.config.false_alarms_per_hour / tests / 3.0, 0.3)
+        self.threshold, self._threshold_3 = float(chi2.isf(level, 6)), float(chi2.isf(level, 3))
+        turned = np.vstack(
+            [np.eye(3), -skew(self._lever)]
+        )  # about the scanner's origin: it moves the pivot by rotation x lever
+        self._simple = (np.vstack([np.zeros((3, 3)), np.eye(3)]), turned)
 
     @property
     def alarmed(self) -> bool:
@@ -180,7 +185,7 @@ class DriftTest:
         return theta, C, gain, np.maximum(left, 1.0)
 
     def _statistics(self, now: float) -> tuple[Array, Array, Array, Array]:
-        """Test statistic (k,) of a move of every hypothesis, its estimate (k, 7), covariance (k, 7, 7) and variance factor."""
+        """Test statistic (k,) of a move of every hypothesis, in terms of one with six unknowns, its estimate (k, 7), covariance (k, 7, 7) and variance factor."""
         f, c = self.filter, self.config
         theta, C, _, left = self._changes(_RIGID)
         C = C * left[:, None, None]
@@ -192,7 +197,14 @@ class DriftTest:
         floors[ramps] *= (RAMP_S / np.maximum(now - f.start_time[ramps], 1.0))[:, None] ** 2
         S = C[:, :6, :6] + floors[:, :, None] * np.eye(6)
         a = theta[:, :6]
-        T = np.einsum("ki,ki->k", a, np.linalg.solve(S, a[:, :, None])[:, :, 0])
+        W = np.linalg.inv(S)
+        Wa = np.einsum("kij,kj->ki", W, a)
+        T = np.einsum("ki,ki->k", a, Wa)
+        for E in self._simple:  # a pure translation or rotation has three unknowns, and so a lower threshold
+            z = Wa @ E
+            N = np.einsum("ia,kij,jb->kab", E, W, E)
+            T3 = np.einsum("ka,ka->k", z, np.linalg.solve(N, z[:, :, None])[:, :, 0])
+            T = np.maximum(T, T3 * (self.threshold / self._threshold_3))
         least = np.where(f.kind == RAMP, c.creep_frames, c.least_frames)
         return np.where(f.used & (f.frames >= least), T, 0.0), theta, C, left
 
@@ -215,7 +227,6 @@ class DriftTest:
         T, theta, C, left = self._statistics(t)
         k = int(np.argmax(T))
         if T[k] < self.threshold:
-            f.clear()
             return []
         scaled, C_scaled, gain_scaled, _ = self._changes(_SCALED)
         _, _, gain, _ = self._changes(_RIGID)
@@ -226,7 +237,8 @@ class DriftTest:
         if len(ramps):
             r = int(ramps[np.argmax(gain_scaled[ramps])])
             better = float(gain_scaled[r] - gain[k]) / left[k]
-            if better > _CLEARLY:
+            warming = bool(self.events) and self.events[-1].kind == WARM_UP
+            if better > (-_REFUSED if warming else _CLEARLY):  # what has begun as a warm-up goes on as one
                 return [self._warm_up(r, scaled[r], C_scaled[r], found, float(T[k]))]
             if better > -_REFUSED:
                 if t < found + self.config.slow_s and not last:  # what comes slowly may be looked at for a while
@@ -280,9 +292,8 @@ class DriftTest:
         S = cov + np.diag(np.repeat([c.floor_rad**2, c.floor_m**2], 3))
         W = np.linalg.inv(S)
         limit = float(chi2.isf(_PARSIMONY, 3))
-        about_origin = np.vstack([np.eye(3), -skew(self._lever)])  # its translation at the pivot: rotation x lever
         best: tuple[float, str, Array, Array] | None = None
-        for name, E in (("translation", np.vstack([np.zeros((3, 3)), np.eye(3)])), ("rotation", about_origin)):
+        for name, E in zip(("translation", "rotation"), self._simple, strict=True):
             N = np.linalg.inv(E.T @ W @ E)
             fit = E @ (N @ (E.T @ W @ move))
             misfit = float((move - fit) @ W @ (move - fit))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from weldcal.calibration.geometry.robust import MAD
-from weldcal.calibration.motion.drift_rows import CLOCK, Rows
+from weldcal.calibration.motion.drift.residuals import CLOCK, Rows
 from weldcal.models.arrays import Array
 
 LEAST = 20

@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.data.scanner_clock import DEVICE
 from weldcal.calibration.data.scanner_correction import correction_from_document
-from weldcal.calibration.motion.drift import WARM_UP, DriftConfig, DriftEvent, DriftTest
-from weldcal.calibration.motion.drift_filter import FilterConfig
-from weldcal.calibration.motion.drift_noise import FrameNoise, measured_noise
-from weldcal.calibration.motion.drift_rows import CLOCK, Rows, rows_of
+from weldcal.calibration.motion.drift.hypotheses import FilterConfig
+from weldcal.calibration.motion.drift.noise import FrameNoise, measured_noise
+from weldcal.calibration.motion.drift.residuals import CLOCK, Rows, rows_of
+from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import Synchronised, synchronise
@@ -23,6 +24,7 @@ _GROSS = 60.0  # chi-square with 5 of a frame that shows something else
 _LARGE_M, _LARGE_RAD = 1e-3, 2e-3  # a move that may have disturbed the clock's fit
 _CLOCK_S = 2e-3
 _MOST_SPREAD_M = 5e-4
+_ARRIVAL_JITTER_S, _DEVICE_JITTER_S = 0.015, 3e-4  # where too few frames show it
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +60,12 @@ class Watched:
     @property
     def rms_m(self) -> float:
         """Root mean square distance (m) between flange and robot, against the calibration as it was given."""
-        return _rms(self.residuals[~self.gross])
+        return _rms(self.residuals, self.gross)
 
     @property
     def rms_after_m(self) -> float:
         """The same against the pose that held at each time."""
-        return _rms(self.after[~self.gross])
+        return _rms(self.after, self.gross)
 
 
 def watch(
@@ -120,7 +122,8 @@ def _tested(
         result.X_BC, pivot, clock.times[order], at.p[order], at.n[order], at.v[order], at.turn[order], frames.p_C[order],
         frames.n_C[order], frames.covariance[order], frames.normal_sigma[order],
     )  # fmt: skip
-    noise = measured_noise(rows) or FrameNoise(jitter_s=clock.jitter_s)
+    usual = clock.jitter_s or (_DEVICE_JITTER_S if clock.clock.kind == DEVICE else _ARRIVAL_JITTER_S)
+    noise = measured_noise(rows) or FrameNoise(jitter_s=usual)
     interval = float(np.median(np.diff(rows.times))) if len(rows) > 1 else 0.05
     test = DriftTest(
         result.X_BC,
@@ -193,5 +196,7 @@ def _corrected(result: CalibrationResult, frames: ObservedFrames) -> ObservedFra
     return replace(frames, p_C=correction.points(frames.p_C), n_C=correction.normals(frames.p_C, frames.n_C))
 
 
-def _rms(residuals: Array) -> float:
-    return float(np.sqrt((residuals**2).sum(axis=1).mean())) if len(residuals) else float("nan")
+def _rms(residuals: Array, gross: NDArray[np.bool_]) -> float:
+    """Root mean square length of residuals (N, 3), without gross frames unless all are."""
+    used = residuals if gross.all() else residuals[~gross]
+    return float(np.sqrt((used**2).sum(axis=1).mean()))

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from weldcal.calibration.motion.drift_noise import FrameNoise
-from weldcal.calibration.motion.drift_rows import CLOCK, MOVE, SCALE, SIZE, Rows
-from weldcal.calibration.motion.pose_field import FieldConfig, PoseField
+from weldcal.calibration.motion.drift.noise import FrameNoise
+from weldcal.calibration.motion.drift.pose_field import FieldConfig, PoseField
+from weldcal.calibration.motion.drift.residuals import CLOCK, MOVE, SCALE, SIZE, Rows
 from weldcal.models.arrays import Array
 
 STEP, RAMP = 0, 1

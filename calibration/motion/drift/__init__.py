@@ -1,0 +1,1 @@
+"""Watching a calibration in motion: residuals, their noise, the sequential test, what can be told of the cause."""
