@@ -91,6 +91,7 @@ class Limits:
             late_s=max(self.late_s, PATIENCE_S),
             lost_s=max(self.lost_s, PATIENCE_S),
             deaf_s=max(self.deaf_s, PATIENCE_S),
+            jump_s=max(self.jump_s, PATIENCE_S),
             hold_s=HELD_S / self.pace,
         )
 

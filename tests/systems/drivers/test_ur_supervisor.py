@@ -132,6 +132,18 @@ def test_a_sample_that_is_not_as_it_must_be_is_a_fault(rig: Rig, changes: dict[s
     assert decision.action is ACTIONS[fault]
 
 
+def test_in_lockstep_a_controller_that_waited_has_not_jumped(rig: Rig) -> None:
+    """Its time stood still for 0.7 s of the host's; a time that goes back is a fault even so."""
+    patient = Supervisor(LIMITS.in_lockstep())
+    for supervisor, fault in ((rig.supervisor, Fault.CLOCK_JUMPED), (patient, Fault.NONE)):
+        resting = Command(rig.command.number, rig.now, np.zeros(6))
+        supervisor.step(rig.now, rig.robot, resting)
+        later = replace(rig.robot, robot_time=rig.robot.robot_time + 0.002, fresh_at=rig.now + 0.7)
+        assert supervisor.step(rig.now + 0.7, later, replace(resting, given_at=rig.now + 0.7)).fault is fault
+    earlier = replace(later, robot_time=rig.robot.robot_time - 1.0, fresh_at=rig.now + 0.71)
+    assert patient.step(rig.now + 0.71, earlier, resting).fault is Fault.CLOCK_JUMPED
+
+
 COMMANDS = [
     (np.full(6, np.nan), Fault.COMMAND_NOT_FINITE),
     (np.array([np.inf, 0, 0, 0, 0, 0]), Fault.COMMAND_NOT_FINITE),
