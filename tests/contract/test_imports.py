@@ -24,7 +24,11 @@ FILES = {
 # Where the simulation's truth may be spoken of: where it is made, and where it is handed on to reports.
 TRUTH_IS_KNOWN = (
     *("systems/drivers/", "systems/station.py", "tools/"),
-    *("systems/jobs/weld/job.py", "systems/jobs/profiler/job.py"),  # what the log may show
+    *(
+        "systems/jobs/weld/job.py",
+        "systems/jobs/profiler/job.py",
+        "systems/jobs/motion/job.py",
+    ),  # what the log may show
     *("systems/jobs/mounting/job.py", "systems/jobs/tablet/job.py"),  # what a report compares with
     "systems/jobs/tablet/messages.py",  # what it is made of
 )

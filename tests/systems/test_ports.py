@@ -39,6 +39,7 @@ from weldcal.systems.drivers.simulated.rendered_profiler import (
 )
 from weldcal.systems.drivers.simulated.rendered_scanner import DepthSensor
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera, WristCamera
+from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
 from weldcal.systems.drivers.simulated.streaming.scanner import DepthStream, StreamingScanner
 from weldcal.systems.drivers.simulated.tablet import SimulatedTablet, TabletDigitizer
 from weldcal.systems.drivers.simulated.ur import SimulatedUr, SpeedJointServo
@@ -127,6 +128,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
     FrameQueue: FrameQueue,
+    FrameReplay: lambda: FrameReplay([np.zeros((2, 2, 3), np.float32)], lambda time: Q_HOME, 20.0, 0.1),
     MotionProcedure: lambda: MotionProcedure((Q_HOME, Q_HOME), Q_HOME, 40),
     MotionCollector: MotionCollector,
     MotionCalibrator: lambda: MotionCalibrator(the_arm()),
@@ -253,6 +255,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "stream": ScanStream,
         "newest_capture": 2,
     },
+    FrameReplay: {"stream": ScanStream, "joints": 6, "time": 1},
     FrameQueue: {"stream": ScanStream, "flange_estimate": FlangeEstimate, "scan": StreamedScan, "counts": 3},
     MotionProcedure: {
         "settled_goal": 1,

@@ -15,14 +15,15 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import BasicVector, Context, DiagramBuilder, LeafSystem
+from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from weldcal.calibration.flange.warm_up import warm_up
 from weldcal.models.scanners import depth_to_points
 from weldcal.systems.background import OwnProcess
+from weldcal.systems.drivers.simulated.streaming.replay import FrameReplay
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
-from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand, ScanStream, StreamedScan
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, JobCommand
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.pose_recorder import PoseRecorder
 from weldcal.systems.scenario.loading import load_scenario
@@ -80,40 +81,6 @@ class Throughput:
         }  # fmt: skip
 
 
-class Replay(LeafSystem):
-    """Outputs rendered frames at the scanner's rate and the joints of the arm that they show.
-
-    .. pydrake_system::
-
-        name: Replay
-        output_ports:
-        - stream
-        - joints
-        - time
-
-    Frames go round; they arrive ``delay_s`` after their capture.
-    """
-
-    def __init__(self, world: MotionWorld, clouds: list[np.ndarray], delay_s: float) -> None:
-        super().__init__()
-        self._world, self._clouds, self._delay_s = world, clouds, delay_s
-        self.DeclareAbstractOutputPort("stream", lambda: AbstractValue.Make(ScanStream()), self._stream)
-        self.DeclareVectorOutputPort("joints", 6, self._joints)
-        self.DeclareVectorOutputPort("time", 1, lambda c, o: o.SetAtIndex(0, c.get_time()))
-
-    def _stream(self, context: Context, output: Any) -> None:
-        newest = int((context.get_time() - self._delay_s) * _FPS + 1e-9)
-        frames = []
-        for n in range(max(1, newest - 3), newest + 1):
-            capture = n / _FPS
-            points = self._clouds[n % len(self._clouds)]
-            frames.append(StreamedScan(n, points_C=points, arrival_time=capture + self._delay_s, device_time=capture))
-        output.set_value(ScanStream(tuple(frames)))
-
-    def _joints(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._world.joints(float(np.mod(context.get_time(), len(self._clouds) / _FPS))))
-
-
 def run_throughput(folder: Path, seconds: float, seed: int, progress: Progress, *, rendered: int = 40) -> Throughput:
     """Render, replay for ``seconds`` in real time, and write benchmark.json."""
     world = MotionWorld(MotionOptions(scanner="motioncam_3d_stream_half", frames=1, surroundings=True, seed=seed))
@@ -146,7 +113,7 @@ def _replayed(
         still = builder.AddSystem(ConstantVectorSource(values))
         builder.Connect(still.get_output_port(), station.diagram.GetInputPort(name))
     delay_s = 0.14
-    replay = builder.AddSystem(Replay(world, clouds, delay_s))
+    replay = builder.AddSystem(FrameReplay(clouds, world.joints, _FPS, delay_s))
     recorder, queue = builder.AddSystem(PoseRecorder()), builder.AddSystem(FrameQueue(2, _POLL_S))
     estimator = builder.AddSystem(
         FlangeEstimator(
