@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arrays import Array
-from weldcal.models.compiled import compiled
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.limits import LARGEST_NUMBER
@@ -192,10 +191,16 @@ def kinematics_and_jacobian(arm: ArmModel, q: Array, p_FP: Array = _ORIGIN) -> t
     (Siciliano et al., Robotics, 2009, Eq. 3.30, with rotation first as Drake orders spatial vectors).
     """
     X = _chain(arm.stack, q)
-    p = np.empty(3)
+    R = X[5, :3, :3]
+    p = R @ p_FP + X[5, :3, 3]
+    z0, z1, z2 = z = X[:, :3, 2].T
+    r0, r1, r2 = p[:, None] - X[:, :3, 3].T
     J = np.empty((6, 6))
-    _jacobian(X, np.array(p_FP), p, J)
-    return X[5, :3, :3], p, J
+    J[:3] = z
+    J[3] = z1 * r2 - z2 * r1
+    J[4] = z2 * r0 - z0 * r2
+    J[5] = z0 * r1 - z1 * r0
+    return R, p, J
 
 
 def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
@@ -211,38 +216,14 @@ def sigma_min(J: ArrayLike, length: float = 1.0) -> float:
 
 def _chain(stack: Array, q: Array) -> Array:
     """Poses (6, 4, 4) of the six links in B."""
-    X = np.empty((6, 4, 4))
-    _link_poses(stack, np.array(q, dtype=np.float64), X)  # a copy: the code is compiled anew for each kind of view
-    return X
-
-
-@compiled()
-def _link_poses(stack: Array, q: Array, X: Array) -> None:
-    """Fill X (6, 4, 4): the product of link transforms and turned joints, q (6,) rad, from the base on."""
-    for i in range(6):
-        c, s = np.cos(q[i]), np.sin(q[i])
-        for r in range(4):
-            for k in range(4):
-                if i == 0:
-                    X[i, r, k] = stack[i, r, k]
-                else:
-                    X[i, r, k] = 0.0
-                    for m in range(4):
-                        X[i, r, k] += X[i - 1, r, m] * stack[i, m, k]
-            x, y = X[i, r, 0], X[i, r, 1]
-            X[i, r, 0], X[i, r, 1] = x * c + y * s, y * c - x * s
-
-
-@compiled()
-def _jacobian(X: Array, p_FP: Array, p: Array, J: Array) -> None:
-    """Fill p (3,) m, the point P in B, and its geometric Jacobian J (6, 6), from the link poses X (6, 4, 4)."""
-    for r in range(3):
-        p[r] = X[5, r, 3] + X[5, r, 0] * p_FP[0] + X[5, r, 1] * p_FP[1] + X[5, r, 2] * p_FP[2]
-    for i in range(6):
-        z0, z1, z2 = X[i, 0, 2], X[i, 1, 2], X[i, 2, 2]
-        r0, r1, r2 = p[0] - X[i, 0, 3], p[1] - X[i, 1, 3], p[2] - X[i, 2, 3]
-        J[0, i], J[1, i], J[2, i] = z0, z1, z2
-        J[3, i], J[4, i], J[5, i] = z1 * r2 - z2 * r1, z2 * r0 - z0 * r2, z0 * r1 - z1 * r0
+    c, s = np.cos(q)[:, None], np.sin(q)[:, None]
+    x, y = stack[:, :, 0], stack[:, :, 1]
+    step = stack.copy()
+    step[:, :, 0] = x * c + y * s
+    step[:, :, 1] = y * c - x * s
+    for i in range(1, 6):
+        step[i] = step[i - 1] @ step[i]
+    return step
 
 
 def _slide_to_nominal(stack: Array, nominal: Array) -> Array:

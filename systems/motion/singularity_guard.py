@@ -33,6 +33,9 @@ class SingularityGuard(LeafSystem):
         super().__init__()
         self._arm, self._p_FT = arm, np.array(X_FT.translation())
         self._config, self._limit = config or ArmGuardConfig(), speed_share * arm.velocity_limit
+        # the first call loads machine code, which no tick has time for
+        _, _, J = kinematics_and_jacobian(arm, np.zeros(6), self._p_FT)
+        guarded_joint_velocity(J, np.zeros(6), self._limit, self._config)
         self._V = self.DeclareVectorInputPort("V_BT", 6)
         self._q = self.DeclareVectorInputPort("position_measured", 6)
         ticket = {self._V.ticket(), self._q.ticket()}
