@@ -20,7 +20,6 @@ from weldcal.systems.drivers.ur.precedence import CELL_PRIORITY, LOOP_PRIORITY
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.messages import UrStatus
 from weldcal.systems.station import make_station
-from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
 SPEEDS = "ur10e.velocity_command"
@@ -37,10 +36,10 @@ class PacedDrive(Drive):
 
     def keep_time(self) -> None:
         """From now on."""
-        if self.station.pace is None:
+        clock = self.station.robot.clock
+        if clock is None:
             self.simulator.clear_monitor()
             return
-        clock = WallClock(self.station.pace)
 
         def wait(root: Context) -> EventStatus:
             clock.wait_for(root.get_time(), moving=True)
