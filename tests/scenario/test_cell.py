@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses as dc
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import FinishedRun, run_weldcal
+from tests.short_job import ShortJob
 from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
@@ -51,9 +51,9 @@ def run(scenario: Scenario, folder: Path, seed: int = 0) -> DemoResult:
 
 
 @pytest.fixture(scope="module")
-def short_job(short_jobs: Callable[[str], DemoResult]) -> DemoResult:
-    """The demo's cell on a 30 mm seam, with a noisy scanner; the job on both robots has a perfect one."""
-    return short_jobs("phoxi_m")
+def short_job(finished_demo: ShortJob) -> DemoResult:
+    """The demo's cell on a 30 mm seam."""
+    return finished_demo.result
 
 
 def test_the_job_runs_from_calibration_to_the_end_of_the_seam(short_job: DemoResult) -> None:
