@@ -136,21 +136,16 @@ def workers() -> list[Path]:
     return [folder for folder in folders if b"weldcal.systems.drivers.ur.worker" in (folder / "cmdline").read_bytes()]
 
 
-def test_only_the_loop_of_a_worker_runs_before_the_cell_not_the_threads_that_poll(
-    backend: Backend, drive: PacedDrive
-) -> None:
+def test_a_worker_is_one_thread_that_runs_before_the_cell(backend: Backend, drive: PacedDrive) -> None:
     if backend.name == "simulated":
         assert workers() == []
         return
     (worker,) = workers()
+    assert [task.name for task in (worker / "task").iterdir()] == [worker.name]
     loop = int(worker.name)
-    polling = [int(task.name) for task in (worker / "task").iterdir() if int(task.name) != loop]
-    assert len(polling) >= 2, "one for each connection of ur_rtde"
     if os.sched_getscheduler(loop) != os.SCHED_RR:
         pytest.skip("this system gives no real-time priority to this user")
     assert os.sched_getparam(loop).sched_priority == LOOP_PRIORITY > CELL_PRIORITY
-    expected = CELL_PRIORITY if len(os.sched_getaffinity(loop)) > 1 else LOOP_PRIORITY
-    assert [os.sched_getparam(thread).sched_priority for thread in polling] == [expected] * len(polling)
 
 
 def test_the_position_is_held_from_the_start_and_zero_moves_nothing(drive: PacedDrive) -> None:
