@@ -16,7 +16,6 @@ from tests.browser import browser
 from tests.places import SHARED_DATA, require_data
 from tests.scheduling import Scheduling, order, processes
 from tests.short_job import finished_demo, short_jobs
-from tests.ur_rtde import NEEDS_UR_RTDE
 
 __all__ = ["browser", "finished_demo", "short_jobs"]
 
@@ -49,13 +48,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files are dealt to the processes one by one, in this order.
-
-    The tests on the emulated robot need its client library.
-    """
-    for item in items:
-        if item.path.parent.name == "hardware":
-            item.add_marker(NEEDS_UR_RTDE)
+    """Files are dealt to the processes one by one, in this order."""
     items.sort(key=order)
 
 

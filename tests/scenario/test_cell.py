@@ -12,7 +12,6 @@ import pytest
 
 from tests.conftest import FinishedRun, run_weldcal
 from tests.short_job import ShortJob
-from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
@@ -362,7 +361,7 @@ def test_an_error_in_the_run_lets_go_of_the_robot() -> None:
         ({"robot": "simulated", "pace": 0.5}, "--dry-run and --pace need a controller"),
         ({"robot": "192.0.2.1", "pace": 0.5}, "runs in real time"),
         ({"robot": "emulated", "pace": 3.0}, "--pace must be from 0.05 to 1, and it is 3"),
-        pytest.param({"robot": "127.0.0.9"}, "127.0.0.9", marks=NEEDS_UR_RTDE),
+        ({"robot": "127.0.0.9"}, "127.0.0.9"),
         ({"speed_factor": 7.0}, "job.speed_factor"),
     ],
 )

@@ -16,6 +16,7 @@ from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.line import Line
 from weldcal.systems.drivers.ur.off_switch import OffSwitch
+from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, UPPER_OFFSET, register_names
 from weldcal.systems.drivers.ur.rtde_stream import RtdeStream
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
@@ -23,7 +24,6 @@ from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, Robot
 # of the guard: commands in the integer register, with at most eight numbers; what it answers
 NO_COMMAND, VELOCITY, SPEED_STOP, SET_PAYLOAD, STOP_SCRIPT = 0, 9, 15, 17, 255
 READY, DONE = 1, 2
-ARGUMENTS = 8
 OUTPUTS = "actual_digital_output_bits"
 LINE_LIMIT_S = 2.0
 FIRST_LIMIT_S = 2.0
@@ -74,7 +74,7 @@ class Robot:
 
     def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel, output: int | None = None) -> None:
         self._host = host
-        base = 24 if upper else 0
+        base = UPPER_OFFSET if upper else 0
         self._output, self._arm, self._pace = output, arm, pace
         self._script = guard_script(upper, output)
         self.clock = ClockMap(pace)
@@ -83,9 +83,8 @@ class Robot:
         self._told = tuple(f"output_double_register_{base + 12 + i}" for i in range(3))
         names = [*ALWAYS, "actual_TCP_pose", self._answer, self._latch, *self._told]
         names += [] if output is None else [OUTPUTS]
-        inputs = [f"input_int_register_{base}", *(f"input_double_register_{base + i}" for i in range(ARGUMENTS))]
         try:
-            self._stream = RtdeStream(host, names, inputs)
+            self._stream = RtdeStream(host, names, register_names(base))
             self._stream.first(FIRST_LIMIT_S)
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
@@ -116,9 +115,13 @@ class Robot:
             while time.monotonic() < until:
                 self._stream.wait(0.01)
                 line.drain()
-                if self._stream[self._latch] == STALE_REGISTER:
+                if self._stream.number(self._latch) == STALE_REGISTER:
                     raise Refused(Fault.GUARD_REFUSED)
-                if self._playing and self._stream[self._latch] == 1 and self._stream[self._answer] == READY:
+                if (
+                    self._playing
+                    and self._stream.number(self._latch) == 1
+                    and self._stream.number(self._answer) == READY
+                ):
                     return
         raise Refused(Fault.UPLOAD_REFUSED)
 
@@ -144,19 +147,19 @@ class Robot:
         while self._stream.connected and self._playing and time.monotonic() < until:
             self._write(command, *arguments)
             self._stream.wait(0.01)
-            if self._stream[self._answer] == DONE:
+            if self._stream.number(self._answer) == DONE:
                 break
         else:
             return False
         while self._stream.connected and self._playing and time.monotonic() < until:
             self.forget()
             self._stream.wait(0.01)
-            if self._stream[self._answer] == READY:
+            if self._stream.number(self._answer) == READY:
                 return True
         return False
 
     def _write(self, command: int, *arguments: float) -> None:
-        self._stream.send(command, *arguments, *[0.0] * (ARGUMENTS - len(arguments)))
+        self._stream.send(command, *arguments, *[0.0] * (DOUBLES - len(arguments)))
 
     def _read_back(self, found: dict[str, Value], mass_kg: float, cog_m: list[float]) -> None:
         """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
@@ -174,9 +177,9 @@ class Robot:
         """The newest sample, all fields of one package."""
         stream = self._stream
         stream.poll()
-        robot_time = float(stream["timestamp"])
-        echo, lost_s, passes = (float(stream[name]) for name in self._told)
-        q = np.array(stream["actual_q"])
+        robot_time = stream.number("timestamp")
+        echo, lost_s, passes = (stream.number(name) for name in self._told)
+        q = np.array(stream.vector("actual_q"))
         if robot_time != self._robot_time:
             self._robot_time, self._fresh_at, self._excused = robot_time, now, 0.0
             self.clock.update(robot_time, now)
@@ -187,15 +190,19 @@ class Robot:
             robot_time,
             self._fresh_at,
             q,
-            np.array(stream["actual_qd"]),
-            int(stream["robot_mode"]),
-            int(stream["safety_mode"]),
-            int(stream["runtime_state"]),
+            np.array(stream.vector("actual_qd")),
+            int(stream.number("robot_mode")),
+            int(stream.number("safety_mode")),
+            int(stream.number("runtime_state")),
             # the slider is in the second one; the first is the limiter's
-            float(stream["speed_scaling"]) * float(stream["target_speed_fraction"]),
-            int(stream[self._latch]),
+            stream.number("speed_scaling") * stream.number("target_speed_fraction"),
+            int(stream.number(self._latch)),
             stream.connected,
-            float(np.linalg.norm(kinematics_and_jacobian(self._arm, q)[1] - np.array(stream["actual_TCP_pose"][:3]))),
+            float(
+                np.linalg.norm(
+                    kinematics_and_jacobian(self._arm, q)[1] - np.array(stream.vector("actual_TCP_pose")[:3])
+                )
+            ),
             now - self._first_unheard if self._sent else 0.0,
             lost_s,
             robot_time - self._passed_at,
@@ -212,7 +219,7 @@ class Robot:
 
     @property
     def _playing(self) -> bool:
-        return self._stream["runtime_state"] == PLAYING
+        return self._stream.number("runtime_state") == PLAYING
 
     def _listen(self, echo: float, now: float) -> None:
         if echo in self._sent:
@@ -243,13 +250,13 @@ class Robot:
     @property
     def process_on(self) -> bool:
         """The state of the process output as reported by the controller."""
-        return self._output is not None and bool(int(self._stream[OUTPUTS]) >> self._output & 1)
+        return self._output is not None and bool(int(self._stream.number(OUTPUTS)) >> self._output & 1)
 
     @property
     def numbers(self) -> tuple[float, float, float]:
         """Number of the newest command sent, its time, and the newest number that the guard has read."""
         sent_at = self._sent.get(self._number, 0.0)
-        return abs(self._number), sent_at, abs(float(self._stream[self._told[0]]))
+        return abs(self._number), sent_at, abs(self._stream.number(self._told[0]))
 
     def forget(self) -> None:
         """Clear the command register."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.rtde_wire import CODES, IN_USE, NOT_FOUND, RtdeProbe, Value
+from weldcal.systems.drivers.ur.rtde_wire import CODES, IN_USE, NOT_FOUND, RtdeProbe
 
 E_SERIES, FASTEST_HZ, CB3_HZ = 5, 500.0, 125.0
 DATA = ord("U")
@@ -84,11 +84,23 @@ class RtdeStream:
                 raise RobotUnreachable("The controller accepts the recipe and sends no data.")
             self.wait(0.01)
 
-    def __getitem__(self, name: str) -> Value:
+    def number(self, name: str) -> float:
         """An output in the newest package."""
+        at = self._at[name]
+        assert isinstance(at, int)
+        return self._package_now[at]
+
+    def vector(self, name: str) -> tuple[float, ...]:
+        """An output of several numbers in the newest package."""
+        at = self._at[name]
+        assert isinstance(at, slice)
+        return self._package_now[at]
+
+    @property
+    def _package_now(self) -> tuple[float, ...]:
         if self._newest is None:
             raise RobotUnreachable("The controller has sent no data yet.")
-        return self._newest[self._at[name]]
+        return self._newest
 
     def send(self, *values: float) -> None:
         """Write the inputs, in the order in which they were claimed."""
