@@ -9,10 +9,12 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.calibration.data.scanner_clock import ScannerClock
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.motion.drift.residuals import TrackedFrame, tracked_rows
+from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
+from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
+from weldcal.calibration.motion.drift.watch import drift_config
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.systems.messages import FlangeEstimate, Message
@@ -20,6 +22,7 @@ from weldcal.systems.motion.pose_recorder import PoseHistory
 
 _HALF_S = 0.01  # about a capture: its velocity
 _RECENT = 400  # frames that the view shows
+_CLOCKS_APART_S = 0.5  # a device time that is this far from the arrival is one of a clock that was set anew
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -32,11 +35,21 @@ class MonitoredCalibration:
     correction: ScannerCorrection = dc.field(default_factory=ScannerCorrection)
     clock: ScannerClock | None = None
     delay_s: float = 0.0
+    config: DriftConfig | None = None
+
+    @staticmethod
+    def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
+        """What a result says; ``delay_s`` is the usual delay of the scanner, where the result does not know its clock."""
+        clock = result.clock
+        sigma = None if clock is None or clock.offset_s is None else clock.sigma_s
+        config = drift_config(result, sigma, DriftConfig(false_alarms_per_hour=false_alarms_per_hour))
+        correction = correction_from_document(result.scanner_correction) or ScannerCorrection()
+        return MonitoredCalibration(result.X_BC, result.covariance, correction, clock, delay_s, config)
 
 
 @dc.dataclass(frozen=True, eq=False)
 class DriftStatus(Message):
-    """The state of the watch after its newest frame. ``recent`` (n, 5): time s, error (3) m, offset of the frame's time s.
+    """The state of the watch after its newest frame. ``recent`` (n, 6): time s, error (3) m at the time by the clock, offset of the clock s, test statistic.
 
     ``X_BC`` with its ``covariance`` (6, 6) is the scanner's pose by all frames since the last change: the recalibration.
     ``alarmed``: a change is being measured; ``events``: those that were measured.
@@ -45,7 +58,7 @@ class DriftStatus(Message):
     sequence: int = 0
     frames: int = 0
     dropped: int = 0
-    recent: Array = dc.field(default_factory=lambda: np.empty((0, 5)))
+    recent: Array = dc.field(default_factory=lambda: np.empty((0, 6)))
     statistic: float = 0.0
     threshold: float = np.inf
     alarmed: bool = False
@@ -152,11 +165,14 @@ def watched_frame(
         return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
     pivot = frame.p_BR if watch.pivot is None else watch.pivot
     c = watch.watched
-    test = DriftTest(c.X_BC, c.covariance, pivot, config) if watch.test is None else copy.deepcopy(watch.test)
+    test = (
+        DriftTest(c.X_BC, c.covariance, pivot, config or c.config) if watch.test is None else copy.deepcopy(watch.test)
+    )
     rows = tracked_rows(c.X_BC, pivot, [frame])
     events = test.update(rows)
     X, covariance = test.current()
-    row = np.concatenate([[frame.time], rows.residuals[0, :3], [test.clock_s]])
+    error = rows.residuals[0, :3] - test.clock_s * rows.derivatives[0, :3, CLOCK]
+    row = np.array([frame.time, *error, test.clock_s, test.statistic])
     status = dc.replace(
         status, frames=status.frames + 1, recent=np.vstack([status.recent[1 - _RECENT :], row]), statistic=test.statistic,
         threshold=test.threshold, alarmed=test.alarmed, events=(*status.events, *events), X_BC=X, covariance=covariance,
@@ -183,8 +199,7 @@ def _tracked(
         return None
     time: float | None = estimate.capture_time
     if np.isfinite(estimate.arrival_time):  # streamed: when it was captured is not known
-        time = None if c.clock is None else c.clock.capture(estimate.arrival_time, estimate.device_time)
-        time = estimate.arrival_time - c.delay_s if time is None else time
+        time = _captured(c, estimate)
     assert time is not None
     X = [history.pose_at(arm, t) for t in (time - _HALF_S, time, time + _HALF_S)]
     before, now, after = (None if x is None else (x @ X_FR).GetAsMatrix4() for x in X)
@@ -196,3 +211,15 @@ def _tracked(
         str(estimate.sequence), time, now[:3, 3], now[:3, 2], rates[:3, 3], rates[:3, 2], p_C, n_C,
         fit.center_covariance, fit.normal_sigma,
     )  # fmt: skip
+
+
+def _captured(c: MonitoredCalibration, estimate: FlangeEstimate) -> float:
+    """When a streamed frame was captured (s), by the calibration's clock; where that is not known or was set anew since, as it
+    was believed when the frame was fitted."""
+    usual = estimate.arrival_time - c.delay_s
+    if c.clock is None:
+        return usual
+    time = c.clock.capture(estimate.arrival_time, estimate.device_time)
+    if time is None or (c.clock.kind == DEVICE and abs(time - usual) > _CLOCKS_APART_S):
+        return estimate.capture_time if np.isfinite(estimate.capture_time) else usual
+    return time
