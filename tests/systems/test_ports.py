@@ -348,6 +348,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "flange_estimate": FlangeEstimate,
         "history": PoseHistory,
         "recalibrate": 1,
+        "calibration_status": CalibrationStatus,
         "drift": DriftStatus,
         "moved": 1,
     },
@@ -367,6 +368,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "job_state": JobState,
         "scan_trigger": 1,
         "streaming": 1,
+        "scanner_streaming": 1,
     },
     CellVisualizer: {
         "job_state": JobState,

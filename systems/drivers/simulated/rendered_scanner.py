@@ -122,7 +122,7 @@ class DepthSensor(LeafSystem):
         output_ports:
         - scan
 
-    `trigger` (1) is the sequence number of the newest requested scan. When it increases, the depth image is rendered and the
+    `trigger` (1) is the sequence number of the newest requested scan (open: none). When it increases, the depth image is rendered and the
     scanner's noise is added from the seed and the sequence number. The cloud appears on `scan` after the exposure.
     """
 
@@ -149,7 +149,7 @@ class DepthSensor(LeafSystem):
         now = context.get_time()
         if pending.sequence > shown.sequence and now >= pending.capture_time + self._exposure_s - 1e-9:
             state.get_mutable_abstract_state(self._shown).set_value(pending)
-        wanted = int(self._trigger.Eval(context)[0])
+        wanted = int(self._trigger.Eval(context)[0]) if self._trigger.HasValue(context) else 0
         if wanted > pending.sequence:
             depth = np.array(self._depth.Eval(context).data[:, :, 0])
             rng = np.random.default_rng([self._seed, wanted])

@@ -102,8 +102,12 @@ class Motion(Job[MotionPlanned]):
         """See Job."""
         job, streams = scenario.part(MotionJob), isinstance(scenario.scanner, StreamingScanner)
         if job is None:
-            if streams:
-                raise InputError("A !StreamingScanner belongs to a motion job: write motion: {} or another scanner.")
+            if streams and any(
+                getattr(scenario, key, None) is not None for key in ("mounting", "profiler_job", "tablet")
+            ):
+                raise InputError(
+                    "A !StreamingScanner belongs to a motion job or to the weld job: write motion: {} or another scanner."
+                )
             return
         check_motion(job)
         if not streams:
