@@ -10,6 +10,7 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.checks import (
+    IN_HAND,
     UNITS,
     check_reach,
     digest,
@@ -76,6 +77,11 @@ class MotionDataset:
         """Pose of the calibration feature in the flange frame."""
         f = self.header.feature_in_flange
         return RigidTransform(unit_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
+
+    @property
+    def in_hand(self) -> bool:
+        """Whether the scanner is on the flange and sees a fixed target."""
+        return self.header.configuration == IN_HAND
 
     @property
     def X_BC_guess(self) -> RigidTransform | None:

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
-from weldcal.calibration.geometry.se3 import pose
+from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arms.chain import Chain, chain_poses
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -44,11 +44,14 @@ class ContinuousMotion:
     Joints (or positions and quaternions) are smoothed by local parabolas; how wide is found by leave-one-out prediction of the
     stream itself, so that a clean stream is hardly touched, and jitter of its times and rounding are averaged. In between, cubic
     Hermite polynomials through the parabolas' values and slopes. No value is given across a gap or outside the stream.
+
+    ``inverted``: the poses are X_FB. A scanner on the flange sees the fixed world move so.
     """
 
-    def __init__(self, stream: RobotStream) -> None:
+    def __init__(self, stream: RobotStream, *, inverted: bool = False) -> None:
         """Raises InputError: fewer than ten samples, or a robot of the joints that is not known."""
         self._chain: Chain | None = None
+        self.inverted = inverted
         if stream.joints is not None:
             self._chain = get_robot(stream.robot).chain
             groups = [stream.joints]
@@ -92,10 +95,10 @@ class ContinuousMotion:
         return np.asarray((x >= self._begins[k]) & (x <= self._ends[k]))
 
     def poses(self, t: Array) -> Array:
-        """Flange poses X_BF (N, 4, 4) at times (N,) s; NaN where the stream has no data."""
+        """Flange poses X_BF (N, 4, 4), or X_FB where inverted, at times (N,) s; NaN where the stream has no data."""
         t = np.asarray(t, dtype=float)
         values = [spline(t - self._zero) for spline in self._splines]
-        X = self._compose(values)
+        X = inverse(self._compose(values)) if self.inverted else self._compose(values)
         X[~self.known(t)] = np.nan
         return X
 

@@ -60,6 +60,8 @@ def monitor_recording(
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
     result = load_result(Path(calibration))
     data = load_motion_dataset(Path(folder), robot=read_header(Path(folder) / "dataset.yaml").robot or result.robot)
+    if data.in_hand:
+        raise InputError(f"'{folder}' is of a scanner on the flange; monitor watches one that stands beside the robot.")
     standard = get_flange(flange or data.header.flange or result.flange)
     motion = ContinuousMotion(data.stream)
     X_FR = data.X_FR
