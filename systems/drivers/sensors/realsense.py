@@ -137,8 +137,10 @@ class RealSenseClouds(Source[Cloud]):
         depth = frame.as_depth_frame()
         if not depth:
             raise Garbage("it sent a frame that is no depth picture")
-        vertices = np.asanyarray(self._points.calculate(depth).get_vertices()).view(np.float32)
-        points = vertices.reshape(depth.get_height(), depth.get_width(), 3)
+        calculated = self._points.calculate(depth)  # its memory must live until the cloud is copied out of it
+        vertices = np.asanyarray(calculated.get_vertices()).view(np.float32)
+        points = vertices.reshape(depth.get_height(), depth.get_width(), 3).copy()
+        del calculated
         cloud = checked_cloud(points, 1.0, self._far_m)
         stamp, number = 1e-3 * float(depth.get_timestamp()), int(depth.get_frame_number())
         host = depth.frame_timestamp_domain != self._rs.timestamp_domain.hardware_clock
