@@ -23,7 +23,7 @@ from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
 from weldcal.systems.drivers.simulated.second_arm import SECOND, PlacedArm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
-from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
+from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
@@ -57,6 +57,7 @@ class Station:
     world: SimulatedWorld | None  # None where no device is simulated
     second: ArmModel | None = None
     background: Background = dc.field(default_factory=Inline)
+    devices: tuple[Closable, ...] = ()
 
     @property
     def arm(self) -> ArmModel:
@@ -81,6 +82,8 @@ class Station:
     def close(self) -> None:
         """Stop the arm, release the hardware and end the background; a second call has no effect."""
         self.robot.close()
+        for device in self.devices:
+            device.close()
         self.background.close()
 
 
@@ -168,20 +171,25 @@ def make_station(
     if robot is None:
         nominal = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
         robot = prepare_robot(scenario.robot, nominal, np.deg2rad(scenario.home_deg))
+    opened: list[Closable] = []
     try:
-        return _make_station(scenario, seed, robot, furnish)
+        return _make_station(scenario, seed, robot, furnish, opened)
     except BaseException:
         robot.close()
+        for device in opened:
+            device.close()
         raise
 
 
-def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: Furnish | None) -> Station:
+def _make_station(
+    scenario: Scenario, seed: int, robot: PreparedRobot, furnish: Furnish | None, opened: list[Closable]
+) -> Station:
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
     devices: dict[str, DriverConfig] = {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
-    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot)
+    build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot, closables=opened)
     furnishing = Furnishing()
     world, true_arm = None, robot.arm
     if any(config.SIMULATED for config in devices.values()):
@@ -233,7 +241,7 @@ def _make_station(scenario: Scenario, seed: int, robot: PreparedRobot, furnish: 
     second = None if furnishing.second is None else furnishing.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
-    return Station(diagram, robot, tool, cad, truth, world, second, background)
+    return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened))
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:

@@ -57,6 +57,7 @@ class StationBuild:
     present configuration.
 
     `parts` are further objects of the station, looked up by type: the simulated world, and the parts of a job's furnishing.
+    `closables` are closed with the station.
     """
 
     builder: DiagramBuilder
@@ -68,6 +69,7 @@ class StationBuild:
     parts: Sequence[object] = ()
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
+    closables: list[Closable] = field(default_factory=list)
 
     @property
     def may_wait(self) -> bool:

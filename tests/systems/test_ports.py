@@ -8,6 +8,7 @@ import pkgutil
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,12 +22,18 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 
 import weldcal.systems
 from tests.systems.cells import Q_HOME, TOOL, plain_station, the_arm
+from tests.systems.drivers.sensors.scripted import Scripted
 from tests.systems.drivers.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces import make_workpiece
 from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
+from weldcal.systems.drivers.sensors.watch import DeviceWatch
+from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
+from weldcal.systems.drivers.sensors.wired_profiler import WiredProfiles
+from weldcal.systems.drivers.sensors.wired_scanner import WiredScanSensor, WiredScanStream
 from weldcal.systems.drivers.simulated.picture_scene import KnockedStand, PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
@@ -120,6 +127,11 @@ def seam_planning() -> SeamPlanning:
     return SeamPlanning(the_arm(), TOOL, make_workpiece("straight"), X, ServoConfig(), Q_HOME, 0.025, None)
 
 
+def acquisition() -> Acquisition[Any]:
+    """Of a device that sends nothing."""
+    return Acquisition(Scripted(), Rules())
+
+
 MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SpeedJointServo: lambda: SpeedJointServo(the_arm(), SimulatedUr(), Q_HOME),
     UrRtdeArm: lambda: UrRtdeArm(the_arm(), StillLink(Q_HOME), WallClock(1.0)),
@@ -128,6 +140,11 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
         RenderedFingerCamera(), 0, 0.002, lambda poses: np.zeros((300, 400), np.uint8)
     ),
     DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
+    DeviceWatch: lambda: DeviceWatch(acquisition()),
+    WiredScanSensor: lambda: WiredScanSensor(acquisition()),
+    WiredScanStream: lambda: WiredScanStream(acquisition()),
+    WiredProfiles: lambda: WiredProfiles(acquisition()),
+    WiredPictures: lambda: WiredPictures(acquisition()),
     FrameQueue: FrameQueue,
     FrameReplay: lambda: FrameReplay([np.zeros((2, 2, 3), np.float32)], lambda time: Q_HOME, 20.0, 0.1),
     MotionProcedure: lambda: MotionProcedure((Q_HOME, Q_HOME), Q_HOME, 40),
@@ -258,6 +275,11 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "stream": ScanStream,
         "newest_capture": 2,
     },
+    DeviceWatch: {"robot_status": UrStatus, "status": UrStatus},
+    WiredScanSensor: {"trigger": 1, "scan": Scan},
+    WiredScanStream: {"streaming": 1, "stream": ScanStream},
+    WiredProfiles: {"trigger": 1, "profile": ProfileScan},
+    WiredPictures: {"streaming": 1, "image": Image, "capture_time": 1},
     FrameReplay: {"stream": ScanStream, "joints": 6, "time": 1},
     FrameQueue: {"stream": ScanStream, "flange_estimate": FlangeEstimate, "scan": StreamedScan, "counts": 3},
     MotionProcedure: {
@@ -385,6 +407,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
 # The only ways through which an output follows an input at once; everything else has at least a tick between.
 FEEDTHROUGH: dict[type[LeafSystem], set[tuple[str, str]]] = {
     SingularityGuard: {(i, o) for i in ("V_BT", "position_measured") for o in ("velocity", "margin", "guarded")},
+    DeviceWatch: {("robot_status", "status")},
     CommandArbiter: {(i, "velocity_wanted") for i in ("job", "robot_status", "mover_velocity", "servo_velocity")},
     # process and motion end in the very tick in which the job says so
     WeldingVelocityServo: {("job", "torch_on"), ("job", "V_BT")},

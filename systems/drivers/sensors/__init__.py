@@ -1,0 +1,1 @@
+"""Drivers of sensors by wire: files, video streams, GenICam and RealSense devices."""

@@ -1,0 +1,37 @@
+"""Scanner whose clouds another program writes into a folder: `!FolderScanner`."""
+
+import dataclasses as dc
+from pathlib import Path
+
+from weldcal.calibration.data.clouds import NO_NOTES, read_cloud
+from weldcal.systems.drivers.sensors.folder_source import FolderSource
+from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, add_scanner, checked_cloud
+from weldcal.systems.drivers.station_build import StationBuild
+
+
+@dc.dataclass
+class FolderScanner(WiredScanner):
+    """`!FolderScanner`: the folder, and how the program that writes into it is told to scan.
+
+    Files are ply, pcd, npz, npy or xyz as `calibrate` reads them. Beside NAME.ply a file NAME.json, written before it, may hold
+    `capture_time` (Unix time, s) and `request` (the number of the trigger that it answers).
+    """
+
+    folder: str = ""
+    trigger: str = ""  # tcp://HOST:PORT or file:PATH: the line `scan N`; empty: a person or the program scans by itself
+    settle_s: float = 0.1  # a file is complete when it has not changed for so long
+    remove_read: bool = False  # delete files that were read
+
+    def source(self) -> FolderSource[Cloud]:
+        """The folder as a source of clouds. Raises InputError for keys that cannot be used."""
+        metres, far_m = self.metres, self.scanner().far_m
+
+        def read(path: Path) -> Cloud:
+            return checked_cloud(read_cloud(path), metres, far_m)
+
+        return FolderSource("The scanner", self.folder, self.trigger, NO_NOTES, read, self.settle_s, self.remove_read)
+
+
+def ApplyDriverConfig(config: FolderScanner, build: StationBuild) -> None:
+    """Watch the folder from now on and add the scanner's ports."""
+    add_scanner(config, config.source(), build)

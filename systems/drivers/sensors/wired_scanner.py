@@ -1,0 +1,211 @@
+"""What all scanners by wire share: their configuration, the system that asks for scans, and the one that shows a stream."""
+
+import dataclasses as dc
+import time
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from weldcal.models.errors import InputError
+from weldcal.models.scanners import ScannerPreset, get_scanner
+from weldcal.systems.drivers.config import ScannerConfig
+from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.stamps import DiagramTime
+from weldcal.systems.drivers.sensors.watch import watch
+from weldcal.systems.drivers.station_build import StationBuild
+from weldcal.systems.messages import Scan, ScanStream, StreamedScan
+
+Cloud = NDArray[np.float32]
+PERIOD_S, STREAM_PERIOD_S = 0.02, 0.004
+SHOWN = 8  # frames of a stream on the port
+SCAN_TIMEOUTS_S = (0.1, 600.0)
+FAR = 1.5  # times the farthest distance of the preset: a cloud beyond it is in another unit
+FEWEST_POINTS = 30
+
+
+@dc.dataclass
+class WiredScanner(ScannerConfig):
+    """The keys of all scanners by wire. `preset` and its view are what poses are planned with."""
+
+    DEFAULT_FOR: ClassVar[tuple[str, ...]] = ()
+    preset: str = "phoxi_m"
+    width: int | None = None  # of the preset's picture; null: its full resolution
+    height: int | None = None
+    field_of_view_deg: float | None = None  # horizontal; null: the preset's
+    mounted_on: str = "base"  # or flange, or a link of the arm
+    unit: str = "m"  # of the points: m or mm
+    scan_timeout_s: float = 6.0  # from the trigger to the scan
+    latency_s: float = 0.0  # from the middle of the exposure to the arrival of the earliest frames
+    streams: bool = False  # the scanner runs freely: a scanner of a motion job
+
+    def scanner(self) -> ScannerPreset:
+        """The preset with the configured resolution and field of view."""
+        preset = get_scanner(self.preset, width=self.width, height=self.height)
+        if self.field_of_view_deg is None:
+            return preset
+        fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * self.field_of_view_deg))
+        return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
+
+    @property
+    def metres(self) -> float:
+        """Metres of one unit of the points. Raises InputError for an unknown unit."""
+        if self.unit not in ("m", "mm"):
+            raise InputError(f"scanner.unit must be m or mm, not '{self.unit}'.")
+        return 1.0 if self.unit == "m" else 1e-3
+
+    def rules(self) -> Rules:
+        """When this scanner is at fault. Raises InputError for a time that no scan takes."""
+        low, high = SCAN_TIMEOUTS_S
+        if not low <= self.scan_timeout_s <= high:
+            raise InputError(
+                f"scanner.scan_timeout_s must be from {low:g} to {high:g}, and it is {self.scan_timeout_s:g}."
+            )
+        if self.streams:
+            return Rules(silent_s=1.0, frozen_s=1.0, late_s=1.0)
+        return Rules(late_s=float("inf"), answer_s=self.scan_timeout_s)
+
+
+def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
+    """Points (H, W, 3) or (N, 3) of the camera frame in m, float32, as the cell uses them; zeros are missing pixels.
+
+    Raises:
+        Garbage: too few points, or they lie too far away for the scanner, as points in another unit do.
+    """
+    cloud = np.asarray(points, dtype=np.float32) * np.float32(metres)
+    if cloud.ndim not in (2, 3) or cloud.shape[-1] != 3:
+        raise Garbage(f"a cloud is (N, 3) or (H, W, 3), and this one is {cloud.shape}")
+    if cloud.ndim == 3:
+        missing = ~(np.abs(cloud[..., 2]) > 0.0)  # also of NaN
+        if missing.any():
+            cloud[missing] = np.nan
+    z = cloud[..., 2]
+    z = z[np.isfinite(z)]
+    if z.size < FEWEST_POINTS:
+        raise Garbage(f"the cloud has {z.size} points; look whether something is in the scanner's range")
+    middle = float(np.median(z))
+    if not 0.0 < middle <= FAR * far_m:
+        raise Garbage(
+            f"the middle of the cloud is {middle:.3g} m away, and the scanner sees {far_m:.3g} m far: set scanner.unit to "
+            "the unit of its points, and let it send them in the frame of its camera"
+        )
+    return cloud
+
+
+class WiredScanSensor(LeafSystem):
+    """Asks the scanner for one cloud per trigger.
+
+    .. pydrake_system::
+
+        name: WiredScanSensor
+        input_ports:
+        - trigger
+        output_ports:
+        - scan
+
+    Ports as those of the simulated scanner. The Diagram does not wait for the scan, unless it may (`waits`). The capture time
+    is that of the scan's stamp, and at the earliest that of its trigger: from then on the arm is at rest.
+    """
+
+    def __init__(self, acquisition: Acquisition[Cloud], waits: bool = False) -> None:
+        super().__init__()
+        self.acquisition, self._waits = acquisition, waits
+        self._times, self._shown = DiagramTime(), Scan()
+        self._trigger = self.DeclareVectorInputPort("trigger", 1)
+        state = self.DeclareDiscreteState([0.0, 0.0, 0.0])  # number asked for, its time, number shown
+        ticket = {self.discrete_state_ticket(state)}
+        self.DeclareAbstractOutputPort("scan", lambda: AbstractValue.Make(Scan()), self._output, ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD_S, 0.0, self._update)
+
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
+        now = context.get_time()
+        self._times.add(time.monotonic(), now)
+        asked, asked_at, shown = context.get_discrete_state_vector().value()
+        wanted = int(self._trigger.Eval(context)[0])
+        if wanted > asked:
+            asked, asked_at = float(wanted), now
+            self.acquisition.request(wanted)
+        if asked > shown:
+            number = int(asked)
+            found = self.acquisition.wait_for_answer(number) if self._waits else self.acquisition.answer(number)
+            if found is not None:
+                captured = max(self._times.at(found.stamp.captured), asked_at)
+                self._shown = Scan(number, captured, found.datum)
+                shown = asked
+        discrete.set_value([asked, asked_at, shown])
+
+    def _output(self, context: Context, output: Any) -> None:
+        shown = context.get_discrete_state_vector()[2] > 0.5
+        output.set_value(self._shown if shown else Scan())
+
+
+class WiredScanStream(LeafSystem):
+    """Shows the newest frames of a scanner that runs freely.
+
+    .. pydrake_system::
+
+        name: WiredScanStream
+        input_ports:
+        - streaming
+        output_ports:
+        - stream
+
+    Ports as those of the simulated streaming scanner: `arrival_time` on the arm's clock, `device_time` on the device's own.
+    """
+
+    def __init__(self, acquisition: Acquisition[Cloud]) -> None:
+        super().__init__()
+        self.acquisition = acquisition
+        self._times = DiagramTime()
+        self._shown: tuple[StreamedScan, ...] = ()
+        self._streaming = self.DeclareVectorInputPort("streaming", 1)
+        state = self.DeclareDiscreteState(1)
+        ticket = {self.discrete_state_ticket(state)}
+        self.DeclareAbstractOutputPort("stream", lambda: AbstractValue.Make(ScanStream()), self._output, ticket)
+        self.DeclarePeriodicDiscreteUpdateEvent(STREAM_PERIOD_S, 0.0, self._update)
+
+    def _update(self, context: Context, discrete: DiscreteValues) -> None:
+        self._times.add(time.monotonic(), context.get_time())
+        newest = int(context.get_discrete_state_vector()[0])
+        if self._streaming.Eval(context)[0] > 0.5:
+            new = [f for f in self.acquisition.frames() if f.number > newest]
+            if new:
+                self._shown = (*self._shown, *(self._streamed(f) for f in new))[-SHOWN:]
+                newest = new[-1].number
+        discrete.set_value([float(newest)])
+
+    def _streamed(self, frame: Frame[Cloud]) -> StreamedScan:
+        arrived = self._times.at(frame.arrived)
+        return StreamedScan(frame.number, points_C=frame.datum, arrival_time=arrived, device_time=frame.device_time)
+
+    def _output(self, context: Context, output: Any) -> None:
+        output.set_value(ScanStream(self._shown))
+
+
+def acquire(config: WiredScanner, source: Source[Cloud]) -> Acquisition[Cloud]:
+    """The acquisition of a scanner's clouds, not started yet."""
+    kept = SHOWN if config.streams else 2
+    return Acquisition(source, config.rules(), kept=kept, latency_s=config.latency_s)
+
+
+def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild, start_s: float = 10.0) -> None:
+    """Start the acquisition and add the scanner's system with its ports to the station.
+
+    Raises:
+        DeviceFault: the scanner does not answer.
+    """
+    acquisition = acquire(config, source)
+    acquisition.start(start_s, first_frame=config.streams)
+    watch(build, acquisition, "scanner")
+    if config.streams:
+        stream = build.builder.AddSystem(WiredScanStream(acquisition))
+        build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
+        build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
+        stream.set_name("scanner")
+        return
+    sensor = build.builder.AddSystem(WiredScanSensor(acquisition, build.may_wait))
+    sensor.set_name("scanner")
+    build.inputs["scanner.trigger"] = sensor.GetInputPort("trigger")
+    build.outputs["scanner.scan"] = sensor.GetOutputPort("scan")
