@@ -69,11 +69,6 @@ class StationBuild:
     inputs: dict[str, InputPort] = field(default_factory=dict)
     outputs: dict[str, OutputPort] = field(default_factory=dict)
 
-    @property
-    def may_wait(self) -> bool:
-        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait for it."""
-        return self.robot is None or self.robot.clock is None or self.robot.waits
-
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
