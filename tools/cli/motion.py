@@ -59,7 +59,7 @@ def motion_data(
 @command("reproduce motion")
 def motion(
     call: Call,
-    quick: Annotated[bool, switch("--quick", "A quarter of the pixels and 90 frames; decides nothing.")] = False,
+    quick: Annotated[bool, switch("--quick", "A seventh of the pixels and 90 frames; decides nothing.")] = False,
     frames: Annotated[int | None, option("--frames", "N", "Frames in motion.", min=40, show_default="600")] = None,
 ) -> Outcome:
     """Repeat the flange paper on motion: Table 1, Eq. 21, Fig. 5, 6 and 9; the recording and its truth are kept. 15 min."""

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context
 from weldcal.calibration.errors import FlangeNotFound
 from weldcal.calibration.flange.fit import FlangeFitConfig, FlangeGuess, fit_flange
 from weldcal.calibration.flange.warm_up import warm_up
+from weldcal.calibration.motion.frames import IN_MOTION
 from weldcal.calibration.published.icp import face_cloud
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.flanges import FlangeStandard
@@ -24,8 +25,7 @@ _COARSE = 8  # rows and columns of a scan between those that are looked at
 _NEAR_M = 0.03  # of a frame's flange from its prediction by the frame before
 # The poses are planned with the whole feature visible; otherwise an object occludes it and the rim's ends are wrong.
 LIVE_FIT = FlangeFitConfig(min_coverage=0.85)
-# 0.25 m/s over an exposure of 10 ms smears an edge by 2.5 mm, 0.7 mm rms, and pixel noise adds half a millimetre
-STREAM_FIT = FlangeFitConfig(min_coverage=0.6, max_rim_rms_m=0.0012)
+STREAM_FIT = dc.replace(IN_MOTION, min_coverage=0.6)  # at the edge of the view the rim's ends are wrong
 
 
 class FlangeEstimator(BackgroundSystem):

@@ -28,7 +28,7 @@ from weldcal.tools.studies.motion.results import MotionStudy, MotionStudyOptions
 from weldcal.tools.studies.motion.static_mode import Look, StaticMode, noise_of_face
 from weldcal.tools.studies.motion.world import MotionOptions, MotionWorld, write_motion_dataset
 
-_ICP_FRAMES, _QUICK_FRAMES = 120, 24  # for Table 1 and Fig. 6
+_ICP_FRAMES, _QUICK_FRAMES = 120, 10  # for Table 1 and Fig. 6
 _REACH_M = 0.01
 _TO_MM = np.array([*[np.degrees(1.0)] * 3, *[1e3] * 3])
 
@@ -38,7 +38,7 @@ def run_motion_study(options: MotionStudyOptions, progress: Progress) -> MotionS
     start = time.monotonic()
     frames = options.frames or (90 if options.quick else 600)
     world = MotionWorld(
-        MotionOptions(frames=frames, size=(534, 400) if options.quick else None, surroundings=False, seed=options.seed)
+        MotionOptions(frames=frames, size=(400, 300) if options.quick else None, surroundings=False, seed=options.seed)
     )
     folder, truth_file = options.folder / "dataset", options.folder / "truth.json"
     write_motion_dataset(world, folder, truth_file, lambda stage, f: progress(stage, 0.6 * f))
@@ -66,7 +66,7 @@ def _evaluated(
         motion,
         held_out=False,
     )
-    static = StaticMode(world, 840 if options.quick else None)
+    static = StaticMode(world, 630 if options.quick else None)
     looks = static.grid(options.seed, lambda stage, f: progress(stage, 0.78 + 0.08 * f))
     X_static = fit_rigid(np.array([k.X_BF.translation() for k in looks]), np.array([k.fit.center_C for k in looks]))
     at_arrival = motion.poses(observed.arrival)

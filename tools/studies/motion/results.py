@@ -13,7 +13,7 @@ COMPONENTS = ("roll", "pitch", "yaw", "x", "y", "z")
 
 @dataclass(frozen=True)
 class MotionStudyOptions:
-    """What is run: ``quick`` takes a quarter of the pixels and few frames."""
+    """What is run: ``quick`` takes a seventh of the pixels and few frames."""
 
     folder: Path
     seed: int = 0
