@@ -86,14 +86,26 @@ def run_emulator(
     if not 0.0 <= lockstep <= LONGEST_WAIT_S:
         raise InputError(f"Give a lockstep bound from 0 to {LONGEST_WAIT_S:.0f} s, not {lockstep}.")
     controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
-    _Emulator(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
+    Emulation(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
 
 
-class _Emulator:
+class Emulation:
+    """A controller's ports and its loop. `after_step` is called with the host's time (s) after every step of the controller,
+    before its frame is sent: what it does belongs to the same time, and the controller waits for it.
+    """
+
     def __init__(
-        self, controller: Controller, host: str, control_port: int, pace: float, lockstep: float, seed: int
+        self,
+        controller: Controller,
+        host: str,
+        control_port: int,
+        pace: float,
+        lockstep: float,
+        seed: int,
+        after_step: Callable[[float], None] | None = None,
     ) -> None:
         self._controller = controller
+        self._after_step = after_step
         self._pace = pace
         self._checker = Checker(controller)
         self._lockstep = Lockstep(controller, lockstep)
@@ -129,6 +141,8 @@ class _Emulator:
         self._lockstep.heard(connection, recipe, now)
 
     def run(self, parent: int | None, ready: Callable[[str], None] | None) -> None:
+        """Run until it is asked to quit, by signal or on the control channel, or until process `parent` is gone."""
+
         def stop(*_: object) -> None:
             self._world.quit = True
 
@@ -137,8 +151,9 @@ class _Emulator:
         if ready is not None:
             ready(self._sentence)
         gc.freeze()
-        with suppress(OSError):  # a controller has a computer of its own: run first, where that is allowed
-            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
+        if self._after_step is None:
+            with suppress(OSError):  # a controller has a computer of its own: run first, where that is allowed
+                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
         try:
             self._loop(parent)
         finally:
@@ -184,6 +199,8 @@ class _Emulator:
             world.unplugged_until = None
             network.plug()
         controller.step()
+        if self._after_step is not None:
+            self._after_step(now)
         self._checker.frame(now)
         if world.unplugged_until is None:
             for server in self._servers:
