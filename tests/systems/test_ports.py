@@ -32,6 +32,7 @@ from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
 from weldcal.systems.drivers.sensors.watch import DeviceWatch
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
+from weldcal.systems.drivers.sensors.wired_profiler import WiredProfiles
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanSensor, WiredScanStream
 from weldcal.systems.drivers.simulated.picture_scene import PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
@@ -141,6 +142,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     DeviceWatch: lambda: DeviceWatch(acquisition()),
     WiredScanSensor: lambda: WiredScanSensor(acquisition()),
     WiredScanStream: lambda: WiredScanStream(acquisition()),
+    WiredProfiles: lambda: WiredProfiles(acquisition()),
     WiredPictures: lambda: WiredPictures(acquisition()),
     FrameQueue: FrameQueue,
     FrameReplay: lambda: FrameReplay([np.zeros((2, 2, 3), np.float32)], lambda time: Q_HOME, 20.0, 0.1),
@@ -273,6 +275,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     DeviceWatch: {"robot_status": UrStatus, "status": UrStatus},
     WiredScanSensor: {"trigger": 1, "scan": Scan},
     WiredScanStream: {"streaming": 1, "stream": ScanStream},
+    WiredProfiles: {"trigger": 1, "profile": ProfileScan},
     WiredPictures: {"streaming": 1, "image": Image, "capture_time": 1},
     FrameReplay: {"stream": ScanStream, "joints": 6, "time": 1},
     FrameQueue: {"stream": ScanStream, "flange_estimate": FlangeEstimate, "scan": StreamedScan, "counts": 3},

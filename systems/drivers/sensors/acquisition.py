@@ -17,7 +17,8 @@ from weldcal.systems.drivers.sensors.stamps import DeviceClock, Stamp, unix_to_m
 Datum = TypeVar("Datum")
 POLL_S = 0.02  # longest time that a source is waited for before requests are looked at
 RETRY_S = (0.1, 1.0)  # first and longest pause before a lost device is opened again
-CLOSE_S = 2.0
+CLOSE_S = 5.0
+ATTEMPTS = 5  # to connect, or to read a frame, when a device is started
 
 
 class DeviceFault(WeldcalError):
@@ -67,6 +68,10 @@ class Source(Protocol[Datum]):
 
     def close(self) -> None:
         """Disconnect; a second call has no effect."""
+
+    def end(self) -> None:
+        """Disconnect and let everything go; the source is not used any more. A second call has no effect."""
+        self.close()
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +125,7 @@ class _Seen:
     same_since: float | None = None
     late_s: float = 0.0
     asked: int = 0
+    refused: int = 0  # attempts to connect in a row that failed
     latency: tuple[float, ...] = ()  # of the newest frames, from capture to arrival
 
 
@@ -174,13 +180,16 @@ class Acquisition(Generic[Datum]):
         # the thread must not keep its own object alive: a station that nobody closed ends its threads when it is forgotten
         self._thread = threading.Thread(target=_work, args=(weakref.ref(self), self._stop), daemon=True)
         self._thread.start()
-        until = time.monotonic() + wait_s
+
+        def here() -> bool:
+            return bool(self._frames) or (self._seen.connected and not first_frame)
+
+        def given_up() -> bool:
+            return self._seen.refused >= ATTEMPTS or self._seen.counts.garbled >= ATTEMPTS
+
         with self._news:
-            self._news.wait_for(
-                lambda: bool(self._frames) or (self._seen.connected and not first_frame),
-                max(until - time.monotonic(), 0.0),
-            )
-        if self._frames or (self._seen.connected and not first_frame):
+            self._news.wait_for(lambda: here() or given_up(), wait_s)
+        if here():
             return
         trouble = self._seen.trouble or f"it sent nothing within {wait_s:.0f} s"
         self.close()
@@ -189,7 +198,7 @@ class Acquisition(Generic[Datum]):
     def request(self, number: int) -> None:
         """Ask the device for a frame, once for each number; its frame carries this number. Never waits."""
         if number > self._wanted:
-            self._wanted_at, self._excused = time.monotonic(), 0.0
+            self._wanted_at = time.monotonic()
             self._wanted = number
 
     def frames(self) -> tuple[Frame[Datum], ...]:
@@ -235,7 +244,7 @@ class Acquisition(Generic[Datum]):
             return f"{self.name} is frozen: its frames were identical for {rules.frozen_s:g} s. Restart it."
         if seen.late_s > rules.late_s:
             return f"{self.name} is late: a frame came {seen.late_s:.1f} s after its time. Look at its connection."
-        waited = now - self._wanted_at - excused
+        waited = now - self._wanted_at
         if rules.answer_s is not None and self._find(self._wanted) is None and self._wanted and waited > rules.answer_s:
             return f"{self.name} did not deliver scan {self._wanted} within {rules.answer_s:g} s{trouble}."
         return None
@@ -273,7 +282,7 @@ class Acquisition(Generic[Datum]):
         try:
             if not seen.connected:
                 self.source.open()
-                seen.connected = True
+                seen.connected, seen.refused = True, 0
                 self.clock = DeviceClock(self._latency_s, self.rules.late_s)
                 self._device_number = None
                 seen.asked = min(seen.asked, max(self._wanted - 1, 0))  # an unanswered request is repeated
@@ -290,6 +299,7 @@ class Acquisition(Generic[Datum]):
         except Garbage as error:
             seen.trouble = str(error)
             seen.counts = replace(seen.counts, garbled=seen.counts.garbled + 1)
+            self._tell()
         except DeviceFault as error:
             self._lose(str(error))
             return (
@@ -310,7 +320,10 @@ class Acquisition(Generic[Datum]):
         if seen.connected:
             seen.lost_since = now
             seen.counts = replace(seen.counts, reconnects=seen.counts.reconnects + 1)
+        else:
+            seen.refused += 1
         seen.connected = False
+        self._tell()
 
     def _take(self, delivery: Delivery[Datum]) -> None:
         seen, d = self._seen, delivery
@@ -369,4 +382,4 @@ def _work(owner: "weakref.ref[Acquisition[Datum]]", stop: threading.Event) -> No
         stop.wait(pause)
     if source is not None:
         with suppress(Exception):
-            source.close()
+            source.end()

@@ -51,7 +51,7 @@ class VideoFingerCamera(WiredFingerCamera):
         return CaptureSource(self)
 
 
-class MjpegSource:
+class MjpegSource(Source[Picture]):
     """The pictures of an MJPEG stream, with the stamps of their parts."""
 
     def __init__(self, config: VideoFingerCamera) -> None:
@@ -93,7 +93,7 @@ class MjpegSource:
         self._stream.close()
 
 
-class CaptureSource:
+class CaptureSource(Source[Picture]):
     """A camera or a file that OpenCV reads."""
 
     def __init__(self, config: VideoFingerCamera) -> None:

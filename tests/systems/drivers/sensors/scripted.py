@@ -50,6 +50,9 @@ class Scripted:
     def close(self) -> None:
         self.closed += 1
 
+    def end(self) -> None:
+        self.close()
+
 
 class StatusSource(LeafSystem):
     """A robot that is ready."""

@@ -16,7 +16,7 @@ import pytest
 from tests.systems.drivers.sensors.scripted import wait_until
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault
-from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner, FolderSource
+from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, acquire
 
 Start = Callable[..., Acquisition[Cloud]]
@@ -51,7 +51,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
     def begin(wait_s: float = 2.0, **keys: object) -> Acquisition[Cloud]:
         config = FolderScanner(**{"folder": str(tmp_path), "settle_s": 0.05, "scan_timeout_s": 1.0, **keys})
-        acquisition = acquire(config, FolderSource(config))
+        acquisition = acquire(config, config.source())
         acquisition.start(wait_s, first_frame=False)
         running.append(acquisition)
         return acquisition
@@ -261,7 +261,7 @@ def test_what_the_program_says_is_in_the_fault(start: Start, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"folder": ""}, "Write the folder of the scans"),
+        ({"folder": ""}, "Write the folder of its files in the scenario: scanner: !FolderScanner"),
         ({"trigger": "http://here"}, "must be empty, file:PATH or tcp://HOST:PORT"),
         ({"unit": "inch"}, "must be m or mm"),
         ({"scan_timeout_s": 0.0}, "scanner.scan_timeout_s must be from 0.1 to 600"),

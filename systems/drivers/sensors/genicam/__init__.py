@@ -1,0 +1,1 @@
+"""Drivers of GenICam devices through harvesters: scanners, finger cameras and laser profilers."""

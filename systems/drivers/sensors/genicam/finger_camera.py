@@ -1,0 +1,72 @@
+"""Finger camera with GenICam: `!GenicamFingerCamera`, an industrial camera that runs freely."""
+
+import dataclasses as dc
+
+from weldcal.systems.drivers.sensors.acquisition import Delivery, Source
+from weldcal.systems.drivers.sensors.genicam.components import picture_of
+from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
+from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
+from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.wired_camera import Picture, WiredFingerCamera, add_camera, checked_picture
+from weldcal.systems.drivers.station_build import StationBuild
+
+
+@dc.dataclass
+class GenicamFingerCamera(WiredFingerCamera):
+    """`!GenicamFingerCamera`: the maker's GenTL producer, the device, and its features; `exposure_ms` sets ExposureTime."""
+
+    producer: str = ""
+    device: str = ""
+    profile: str = "generic"
+    settings: dict[str, str] = dc.field(default_factory=dict)
+
+    @property
+    def title(self) -> str:
+        """The device's name at the beginning of a sentence."""
+        return f"The finger camera {self.device or self.profile} (GenICam)"
+
+    def source(self) -> Source[Picture]:
+        """The device in a process of its own. Raises InputError for keys that cannot be used."""
+        GenicamPictures(self)  # the keys are checked here, not in the process
+        return OwnProcess(self.title, GenicamPictures, self)
+
+
+class GenicamPictures(Source[Picture]):
+    """The device as a source of grey pictures."""
+
+    def __init__(self, config: GenicamFingerCamera) -> None:
+        profile = get_profile(config.profile)
+        own = dict(config.settings)
+        if config.exposure_ms is not None:
+            own["ExposureTime"] = f"{1e3 * config.exposure_ms:.6g}"  # microseconds in the naming convention
+        if config.gain is not None:
+            own["Gain"] = f"{config.gain:.6g}"
+        self._config = config
+        self.device = GenicamDevice(
+            config.producer, config.device, profile.features(streams=True, own=own), profile.alive
+        )
+        self.name = config.title
+
+    def open(self) -> None:
+        """See Source."""
+        self.device.open()
+
+    def ask(self, request: int) -> None:
+        """See Source."""
+
+    def next(self, timeout_s: float) -> Delivery[Picture] | None:
+        """See Source."""
+        taken = self.device.take(timeout_s)
+        if taken is None:
+            return None
+        picture = checked_picture(picture_of(taken.components), self._config.width, self._config.height)
+        return Delivery(picture, taken.arrived, taken.device_time, number=taken.number)
+
+    def close(self) -> None:
+        """See Source."""
+        self.device.close()
+
+
+def ApplyDriverConfig(config: GenicamFingerCamera, build: StationBuild) -> None:
+    """Open the camera and add the finger camera's ports."""
+    add_camera(config, config.source(), build)

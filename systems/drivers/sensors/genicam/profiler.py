@@ -1,0 +1,98 @@
+"""Laser profiler with GenICam, such as a SICK Ranger3: `!GenicamProfiler`."""
+
+import dataclasses as dc
+import math
+
+from weldcal.systems.drivers.sensors.acquisition import Delivery, Source
+from weldcal.systems.drivers.sensors.genicam.components import UNIT_SCALING, profile_of
+from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
+from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
+from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.wired_profiler import Profile, WiredProfiler, add_profiler, checked_profile
+from weldcal.systems.drivers.station_build import StationBuild
+
+_METRES = {"m": 1.0, "mm": 1e-3}
+
+
+@dc.dataclass
+class GenicamProfiler(WiredProfiler):
+    """`!GenicamProfiler`: the maker's GenTL producer, the device, and its features.
+
+    The last line of a frame is the profile. A range picture (Coord3D_C16) is scaled by the device's Scan3dCoordinateScale and
+    Scan3dCoordinateOffset of its coordinates A and C.
+    """
+
+    producer: str = ""
+    device: str = ""
+    profile: str = "ranger3"
+    settings: dict[str, str] = dc.field(default_factory=dict)
+    unit: str = "device"
+
+    @property
+    def title(self) -> str:
+        """The device's name at the beginning of a sentence."""
+        return f"The profiler {self.device or self.profile} (GenICam)"
+
+    def source(self) -> Source[Profile]:
+        """The device in a process of its own. Raises InputError for keys that cannot be used."""
+        GenicamProfiles(self)  # the keys are checked here, not in the process
+        return OwnProcess(self.title, GenicamProfiles, self)
+
+
+class GenicamProfiles(Source[Profile]):
+    """The device as a source of profiles."""
+
+    def __init__(self, config: GenicamProfiler) -> None:
+        profile = get_profile(config.profile)
+        self._config, self._trigger = config, profile.trigger
+        self.device = GenicamDevice(
+            config.producer, config.device, profile.features(streams=False, own=config.settings), profile.alive
+        )
+        self.name = config.title
+        self._unit = profile.unit if config.unit == "device" else config.unit
+        self._metres, self._scaling = 1e-3, UNIT_SCALING
+        self._request, self._skip = 0, 0
+
+    def open(self) -> None:
+        """See Source."""
+        self.device.open()
+        self._metres = _METRES.get(self._unit, self.device.metres or 1e-3)
+        self._scaling = (self._read_scaling("CoordinateA"), self._read_scaling("CoordinateC"))
+
+    def _read_scaling(self, axis: str) -> tuple[float, float]:
+        """Scale and offset of a coordinate; 1 and 0 where the device has none."""
+        if self.device.read("Scan3dCoordinateSelector") is not None:
+            self.device.nodes.get_node("Scan3dCoordinateSelector").from_string(axis)
+        found = [self.device.read(f"Scan3dCoordinate{name}") for name in ("Scale", "Offset")]
+        scale, offset = (math.nan if value is None else float(value) for value in found)
+        return (1.0 if math.isnan(scale) else scale, 0.0 if math.isnan(offset) else offset)
+
+    def ask(self, request: int) -> None:
+        """See Source."""
+        while self.device.take(0.001) is not None:  # frames of before the request
+            pass
+        self._request = request
+        if self._trigger:
+            self.device.execute(self._trigger)
+        else:
+            self._skip = 1
+
+    def next(self, timeout_s: float) -> Delivery[Profile] | None:
+        """See Source."""
+        taken = self.device.take(timeout_s)
+        if taken is None:
+            return None
+        if self._skip:
+            self._skip -= 1
+            return None
+        points = checked_profile(profile_of(taken.components, self._scaling), self._metres, self._config)
+        return Delivery(points, taken.arrived, taken.device_time, number=taken.number, request=self._request)
+
+    def close(self) -> None:
+        """See Source."""
+        self.device.close()
+
+
+def ApplyDriverConfig(config: GenicamProfiler, build: StationBuild) -> None:
+    """Open the device and add the profiler's ports."""
+    add_profiler(config, config.source(), build)

@@ -1,0 +1,98 @@
+"""3D scanner with GenICam: `!GenicamScanner`, by software trigger or running freely."""
+
+import dataclasses as dc
+
+from weldcal.systems.drivers.sensors.acquisition import Delivery, Garbage, Source
+from weldcal.systems.drivers.sensors.genicam.components import cloud_of
+from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
+from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
+from weldcal.systems.drivers.sensors.own_process import OwnProcess
+from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, add_scanner, checked_cloud
+from weldcal.systems.drivers.station_build import StationBuild
+
+GENICAM_UNIT_M = 1e-3  # of a device that does not say its unit
+
+
+@dc.dataclass
+class GenicamScanner(WiredScanner):
+    """`!GenicamScanner`: the maker's GenTL producer, the device, and its features.
+
+    `unit: device` takes the unit of the profile, or of the device's Scan3dDistanceUnit.
+    """
+
+    producer: str = ""  # the .cti file; empty: the only one that GENICAM_GENTL64_PATH leads to
+    device: str = ""  # serial number, model, name or id; empty: the only one
+    profile: str = "generic"  # of profiles.yaml: phoxi, motioncam, genicam_3d, generic
+    settings: dict[str, str] = dc.field(default_factory=dict)  # features by name, over those of the profile
+    unit: str = "device"
+
+    @property
+    def metres(self) -> float:
+        """Metres of one unit of the points where it does not depend on the device."""
+        if self.unit != "device":
+            return super().metres
+        unit = get_profile(self.profile).unit
+        return {"m": 1.0, "mm": 1e-3}.get(unit, GENICAM_UNIT_M)
+
+    @property
+    def title(self) -> str:
+        """The device's name at the beginning of a sentence."""
+        return f"The scanner {self.device or self.profile} (GenICam)"
+
+    def source(self) -> Source[Cloud]:
+        """The device in a process of its own. Raises InputError for keys that cannot be used."""
+        GenicamClouds(self)  # the keys are checked here, not in the process
+        return OwnProcess(self.title, GenicamClouds, self)
+
+
+class GenicamClouds(Source[Cloud]):
+    """The device as a source of clouds."""
+
+    def __init__(self, config: GenicamScanner) -> None:
+        profile = get_profile(config.profile)
+        features = profile.features(streams=config.streams, own=config.settings)
+        self._config, self._trigger = config, "" if config.streams else profile.trigger
+        self._asks_device = config.unit == "device" and profile.unit == "device"
+        self._metres, self._far_m = config.metres, config.scanner().far_m
+        self.device = GenicamDevice(config.producer, config.device, features, profile.alive)
+        self.name = config.title
+        self._request, self._skip = 0, 0
+
+    def open(self) -> None:
+        """See Source."""
+        self.device.open()
+        if self._asks_device and self.device.metres is not None:
+            self._metres = self.device.metres
+
+    def ask(self, request: int) -> None:
+        """See Source."""
+        while self.device.take(0.001) is not None:  # frames of before the request
+            pass
+        self._request = request
+        if self._trigger:
+            self.device.execute(self._trigger)
+        else:
+            self._skip = 1  # the frame whose exposure was under way
+
+    def next(self, timeout_s: float) -> Delivery[Cloud] | None:
+        """See Source."""
+        taken = self.device.take(timeout_s)
+        if taken is None:
+            return None
+        if self._skip:
+            self._skip -= 1
+            return None
+        try:
+            cloud = checked_cloud(cloud_of(taken.components), self._metres, self._far_m)
+        except Garbage as error:
+            raise Garbage(f"in frame {taken.number}: {error}") from error
+        return Delivery(cloud, taken.arrived, taken.device_time, number=taken.number, request=self._request)
+
+    def close(self) -> None:
+        """See Source."""
+        self.device.close()
+
+
+def ApplyDriverConfig(config: GenicamScanner, build: StationBuild) -> None:
+    """Open the device and add the scanner's ports."""
+    add_scanner(config, config.source(), build)
