@@ -168,6 +168,12 @@ class UrLink:
         """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no sample."""
         return self._memory.ring.at(host_time)
 
+    def robot_time(self) -> float:
+        """The controller's time (s) of the newest sample; 0 before the first. Never blocks."""
+        with contextlib.suppress(TornRead):
+            self._last = self._memory.state.read() or self._last
+        return 0.0 if self._last is None else self._last[_AT["robot_time"]]
+
     def state(self) -> LinkState:
         """The newest state. Never blocks.
 

@@ -36,6 +36,9 @@ class UrRtde(DriverConfig):
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
     lockstep: bool = False  # only for the emulator: its time waits for this computer
+    follow: bool = (
+        False  # only for an emulator in lockstep: the cell's time waits for it too, as for a world of its own
+    )
     velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
     upper_registers: bool | None = None  # 24 to 47 (fieldbuses use the lower ones); null: where ur_rtde supports it
     payload_kg: float = 1.4  # of the welding tool
@@ -105,7 +108,8 @@ class UrRtdeArm(LeafSystem):
         found = self._link.state()
         old = context.get_discrete_state_vector().value()
         rate = self._clock.rate
-        sampled = max(context.get_time() - self._clock.pace * rate * found.age_s, float(old[12]))
+        age_s = 0.0 if self._clock.follows else self._clock.pace * rate * found.age_s
+        sampled = max(context.get_time() - age_s, float(old[12]))
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
@@ -155,6 +159,10 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise InputError("Only the emulator can run at another pace: leave pace at 1 for a robot.")
     if config.lockstep and not is_loopback(controller_address(config.host)):
         raise InputError("Only the emulator waits for this computer: leave lockstep at false for a robot.")
+    if config.follow and not config.lockstep:
+        raise InputError(
+            "robot.follow needs robot.lockstep: only an emulator that waits for this computer may be waited for."
+        )
     if config.process_output is not None and not 0 <= config.process_output < N_OUTPUTS:
         raise InputError(
             f"robot.process_output must be a standard digital output from 0 to 7, not {config.process_output}."
@@ -175,7 +183,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         payload_cog_m=(x, y, z),
         process_output=config.process_output,
     )
-    return PreparedRobot(arm, link.state().q, link, WallClock(config.pace), config.lockstep)
+    clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
+    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:

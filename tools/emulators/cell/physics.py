@@ -7,10 +7,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.planning.clearance import lowest_point, self_distance
-from weldcal.models.arms.kinematics import link_frames
+from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import PreparedRobot

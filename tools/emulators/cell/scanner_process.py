@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 from weldcal.systems.messages import Scan
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.emulators.cell.physics import still, true_station
 
 EXPOSED_S = 0.3  # of the copy's time: a little longer than the scanner's exposure
@@ -27,7 +28,7 @@ LONGEST_LINE = 4096
 class ScannerSetup:
     """What the scanner's process is started with. It listens at `host`:`port` and writes into `folder`."""
 
-    scenario: Scenario
+    scenario: str  # of the world, by name or path
     arm: ArmModel
     seed: int
     host: str
@@ -39,7 +40,7 @@ class Renderer:
     """A copy of the world that is posed as the world is when the scanner is triggered."""
 
     def __init__(self, setup: ScannerSetup) -> None:
-        self._station = true_station(setup.scenario, setup.arm, setup.seed)
+        self._station = true_station(load_scenario(setup.scenario), setup.arm, setup.seed)
         assert self._station.world is not None
         self._world = self._station.world
         self._scans = 0
@@ -63,11 +64,9 @@ class Renderer:
 def drop(folder: Path, number: int, points: Array, capture_time: float, request: int) -> Path:
     """Write a cloud as a program of a real scanner should: the note first, then the cloud under another name, then its name."""
     name = f"scan_{number:04d}"
-    note = json.dumps({"capture_time": capture_time, "request": request})
-    for path, content in ((folder / f"{name}.json", note),):
-        hidden = path.with_name(f".{path.name}.tmp")
-        hidden.write_text(content, encoding="ascii")
-        os.replace(hidden, path)
+    hidden, path = folder / f".{name}.json.tmp", folder / f"{name}.json"
+    hidden.write_text(json.dumps({"capture_time": capture_time, "request": request}), encoding="ascii")
+    os.replace(hidden, path)
     hidden, path = folder / f".{name}.npz.tmp", folder / f"{name}.npz"
     with hidden.open("wb") as file:
         np.savez(file, points=points)
@@ -92,7 +91,7 @@ def run_scanner(setup: ScannerSetup, world: Connection) -> None:
             _still_there(world)
 
 
-def _serve(client: socket.socket, renderer: Renderer, folder: Path, world: Connection, numbers: "object") -> None:
+def _serve(client: socket.socket, renderer: Renderer, folder: Path, world: Connection, numbers: Iterator[int]) -> None:
     """Answer the lines of one client until it leaves: `ok N` when the scan of `scan N` lies in the folder, or `error TEXT`."""
     client.settimeout(0.2)
     unread = b""
@@ -109,7 +108,7 @@ def _serve(client: socket.socket, renderer: Renderer, folder: Path, world: Conne
         *lines, unread = (unread + found).split(b"\n")
         unread = unread[-LONGEST_LINE:]
         for line in lines:
-            answer = _answer(line.decode("ascii", "replace").strip(), renderer, folder, world, next(numbers))  # type: ignore[call-overload]
+            answer = _answer(line.decode("ascii", "replace").strip(), renderer, folder, world, next(numbers))
             try:
                 client.sendall(answer.encode("ascii") + b"\n")
             except OSError:

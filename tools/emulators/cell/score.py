@@ -46,4 +46,3 @@ def score(physics: Physics, wanted_m: float | None, *, arc_burns: bool, at_rest:
         "state": state,
         "time_s": physics.time_s,
     }
-

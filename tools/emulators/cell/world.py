@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import loopback_address
@@ -22,6 +22,7 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.cell.arc import Arc
 from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_camera
@@ -63,9 +64,7 @@ def wires_of(cell: Scenario) -> Wires:
         InputError: a device of the scenario is not by wire, or not on loopback.
     """
     robot, scanner, camera = cell.robot, cell.scanner, cell.finger_camera
-    if not (
-        isinstance(robot, UrRtde) and isinstance(scanner, FolderScanner) and isinstance(camera, VideoFingerCamera)
-    ):
+    if not (isinstance(robot, UrRtde) and isinstance(scanner, FolderScanner) and isinstance(camera, VideoFingerCamera)):
         raise InputError(
             "The cell's scenario must have a robot !UrRtde, a scanner !FolderScanner and a finger_camera !VideoFingerCamera, "
             "such as wired_s_groove."
@@ -133,7 +132,7 @@ class _World:
         rests = float(np.abs(c.arm.qd).max()) < REST_RAD_S
         self._rests_s = self._rests_s + STEP_S if rests else 0.0
         self._dirty |= burned != self._arc.burns or not rests
-        if self._dirty and (burned and not self._arc.burns or self._rests_s > RESTS_S):
+        if self._dirty and ((burned and not self._arc.burns) or self._rests_s > RESTS_S):
             self.write()
 
     def write(self) -> None:
@@ -165,8 +164,8 @@ class _World:
 
 
 def run_world(
-    world: Scenario,
-    cell: Scenario,
+    world_name: str,
+    cell_name: str,
     seed: int,
     *,
     write: Callable[[Truth], None],
@@ -177,8 +176,8 @@ def run_world(
     """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT).
 
     Args:
-        world: what is true: a scenario with simulated devices; its deviations follow from `seed`.
-        cell: what the cell knows, and on which addresses it looks for its devices.
+        world_name: what is true: a scenario, by name or path, with simulated devices; its deviations follow from `seed`.
+        cell_name: the scenario with what the cell knows, and on which addresses it looks for its devices.
         seed: of everything random.
         write: called with the contents of the truth file whenever they have changed.
         ready: called once with a sentence when every device answers.
@@ -188,6 +187,7 @@ def run_world(
     Raises:
         InputError: the scenarios cannot be played, or an address is taken.
     """
+    world, cell = load_scenario(world_name), load_scenario(cell_name)
     wires = wires_of(cell)
     camera, device = world.finger_camera, world.robot
     if not isinstance(camera, RenderedFingerCamera):
@@ -198,7 +198,7 @@ def run_world(
     millimetres = device.repeatability_mm if isinstance(device, SimulatedUr) else 0.0
     context = get_context("spawn")
     with take_address(wires.host, 10.0), contextlib.ExitStack() as stack:
-        setup = ScannerSetup(world, arm, seed, *wires.trigger, wires.folder)
+        setup = ScannerSetup(world_name, arm, seed, *wires.trigger, wires.folder)
         scanner = _start(context, stack, run_scanner, setup)
         physics = Physics(world, arm, seed, millimetres)
         assert physics.station.tool is not None
@@ -209,7 +209,7 @@ def run_world(
             FingerSetup(physics.station.tool, camera.camera(), seed, *wires.stream),
         )
         controller = Controller(arm, q_home, parse_version("5.21"))
-        controller.set_payload(wires.payload_kg, list(wires.payload_cog_m))
+        controller.payload.mass, controller.payload.center = wires.payload_kg, list(wires.payload_cog_m)
         length = cell.welding.seam_length_mm
         inside = _World(
             controller,
