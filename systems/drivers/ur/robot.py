@@ -9,6 +9,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
@@ -38,6 +39,27 @@ def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[flo
         return False
     mass, cog = np.array(found["payload"]), np.array(found["payload_cog"])
     return bool(abs(mass - mass_kg) <= 0.0101 and np.abs(cog - np.array(cog_m)).max() <= 1.01e-3)
+
+
+@dataclass(frozen=True)
+class ArcInputs:
+    """Standard digital inputs of the power source: arc established, arc fault; None where one is not wired."""
+
+    established: int | None = None
+    arc_fault: int | None = None
+
+    @property
+    def wired(self) -> bool:
+        """Whether there is one."""
+        return self.established is not None or self.arc_fault is not None
+
+    def arc(self, bits: int) -> bool | None:
+        """Whether the arc is established; None where that is not wired."""
+        return None if self.established is None else bool(bits >> self.established & 1)
+
+    def fault(self, bits: int) -> bool:
+        """Whether the power source reports a fault."""
+        return self.arc_fault is not None and bool(bits >> self.arc_fault & 1)
 
 
 class Refused(Exception):
@@ -90,7 +112,16 @@ def _send_at_once(descriptors: Iterable[int]) -> None:
 class Robot:
     """Both ur_rtde interfaces, the clock map and the newest complete package."""
 
-    def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel, output: int | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        *,
+        upper: bool,
+        pace: float,
+        arm: ArmModel,
+        output: int | None = None,
+        arc_inputs: ArcInputs | None = None,
+    ) -> None:
         # Here and not above: the guard's text can be read where ur_rtde is not installed.
         from rtde_control import RTDEControlInterface
         from rtde_receive import RTDEReceiveInterface
@@ -99,6 +130,7 @@ class Robot:
         self._word = 36 if upper else 12
         self._script = guard_script(upper, output)
         self._output = output
+        self._arc_inputs = arc_inputs or ArcInputs()
         self._arm = arm
         self._pace = pace
         self.clock = ClockMap(pace)
@@ -112,6 +144,7 @@ class Robot:
             # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
             *(f"output_double_register_{self._word + i}" for i in range(3)),
             *(() if output is None else ("actual_digital_output_bits",)),
+            *(("actual_digital_input_bits",) if self._arc_inputs.wired else ()),
         ]
         try:
             self.receive = RTDEReceiveInterface(host, -1.0, names, False, upper)
@@ -193,6 +226,7 @@ class Robot:
             pose = receive.getActualTCPPose()
             echo, lost_s, passes = (float(receive.getOutputDoubleRegister(word + i)) for i in range(3))
             process_on = None if self._output is None else self.process_on
+            inputs = int(receive.getActualDigitalInputBits()) if self._arc_inputs.wired else 0
             if robot_time == receive.getTimestamp():
                 break
         if robot_time != self._robot_time:
@@ -219,6 +253,8 @@ class Robot:
             robot_time - self._passed_at,
             process_on,
             echo < 0.0,
+            self._arc_inputs.arc(inputs),
+            self._arc_inputs.fault(inputs),
         )
 
     def excuse(self, seconds: float) -> None:

@@ -18,7 +18,7 @@ from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
-from weldcal.systems.drivers.ur.supervisor import Limits
+from weldcal.systems.drivers.ur.supervisor import FOLLOWING_PATIENCE_S, Limits
 from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
@@ -44,12 +44,18 @@ class UrRtde(DriverConfig):
     payload_kg: float = 1.4  # of the welding tool
     payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
     process_output: int | None = None  # standard digital output (0 to 7) that switches the torch; null: none is wired
+    # standard digital inputs (0 to 7) of the power source; null: not wired. Without an established arc the weld does not move,
+    # and a fault ends it
+    arc_input: int | None = None
+    arc_fault_input: int | None = None
 
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
         limits = Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
+        if self.follow:
+            return limits.in_lockstep(FOLLOWING_PATIENCE_S)
         return limits.in_lockstep() if self.lockstep else limits
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
@@ -73,12 +79,14 @@ class UrRtdeArm(LeafSystem):
         - X_BF
         - sample_time
         - status
+        - arc_established
 
     Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of the
     update less the sample's age, computed from robot time mapped to host time. `desired_state` (12) rad, rad/s is the
     predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
     feedthrough.
     On a computer that is late the clock's `rate` is below 1: velocities are sent, and read, in proportion to it.
+    `arc_established` (1): 1 while the power source reports an arc, or where its input is not wired.
     `process_on` (1) switches the torch's digital output, where one is wired; unconnected means off.
     """
 
@@ -90,9 +98,9 @@ class UrRtdeArm(LeafSystem):
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._process = self.DeclareVectorInputPort("process_on", 1)
-        # q, qd, sample time, desired q, desired qd, codes of the status: numbers only, because an update of abstract state
+        # q, qd, sample time, desired q, desired qd, arc, codes of the status: numbers only, because an update of abstract state
         # would make Drake copy and compute everything anew, 500 times a second
-        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6), found.codes])
+        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6), [0.0], found.codes])
         vector = self.DeclareDiscreteState(start)
         ticket = {self.discrete_state_ticket(vector)}
         self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
@@ -101,6 +109,7 @@ class UrRtdeArm(LeafSystem):
         self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
         self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
         self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(found.status), self._status, ticket)
+        self.DeclareVectorOutputPort("arc_established", 1, self._arc, ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._read)
         self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
 
@@ -113,7 +122,8 @@ class UrRtdeArm(LeafSystem):
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
-        discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, found.codes]))
+        arc = float(found.arc is None or found.arc)
+        discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, [arc], found.codes]))
 
     def _send(self, context: Context) -> EventStatus:
         wanted = np.array(self._command.Eval(context))
@@ -139,7 +149,10 @@ class UrRtdeArm(LeafSystem):
         output.set_value(forward_kinematics(self._arm, context.get_discrete_state_vector().value()[:6]))
 
     def _status(self, context: Context, output: Any) -> None:
-        output.set_value(status_of(tuple(context.get_discrete_state_vector().value()[25:])))
+        output.set_value(status_of(tuple(context.get_discrete_state_vector().value()[26:])))
+
+    def _arc(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, context.get_discrete_state_vector()[25])
 
     def _time(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
@@ -167,6 +180,9 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise InputError(
             f"robot.process_output must be a standard digital output from 0 to 7, not {config.process_output}."
         )
+    for name in ("arc_input", "arc_fault_input"):
+        if (n := getattr(config, name)) is not None and not 0 <= n < N_OUTPUTS:
+            raise InputError(f"robot.{name} must be a standard digital input from 0 to 7, not {n}.")
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
@@ -182,6 +198,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         payload_kg=config.payload_kg,
         payload_cog_m=(x, y, z),
         process_output=config.process_output,
+        arc_input=config.arc_input,
+        arc_fault_input=config.arc_fault_input,
     )
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
     return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)
@@ -198,5 +216,7 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
     if config.process_output is not None:
         build.inputs["ur10e.process_on"] = arm.GetInputPort("process_on")
+    if config.arc_input is not None:
+        build.outputs["ur10e.arc_established"] = arm.GetOutputPort("arc_established")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
         build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)

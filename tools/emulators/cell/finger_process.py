@@ -85,7 +85,9 @@ def draw(view: TagView, X_FM: Array, noise_grey: float, rng: np.random.Generator
 
 
 def run_finger_camera(setup: FingerSetup, world: Connection) -> None:
-    """Serve until the world closes its end of the pipe; it sends (Unix time s, X_FM (4, 4)) for each exposure."""
+    """Serve until the world closes its end of the pipe; it sends (Unix time s, X_FM (4, 4)) for each exposure, and is told when
+    the picture is shown.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
@@ -96,3 +98,4 @@ def run_finger_camera(setup: FingerSetup, world: Connection) -> None:
         while True:
             taken, X_FM = world.recv()
             stream.put(draw(view, X_FM, setup.camera.noise_grey, rng), taken)
+            world.send("shown")

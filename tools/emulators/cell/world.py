@@ -32,12 +32,14 @@ from weldcal.tools.emulators.cell.score import score
 from weldcal.tools.emulators.ur.addresses import take_address
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.main import Emulation
-from weldcal.tools.emulators.ur.process import CONTROL_PORT, LOCKSTEP_S
+from weldcal.tools.emulators.ur.process import CONTROL_PORT
 from weldcal.tools.emulators.ur.versions import parse_version
 
 START_LIMIT_S = 120.0
+WAITS_S = 30.0  # for a cell that is late, of the host
 REST_RAD_S = 1e-3
 RESTS_S = 0.2
+CAMERA_LIMIT_S = 1.0  # of the host: a camera that does not answer is not waited for longer
 Truth = dict[str, object]
 
 
@@ -110,6 +112,7 @@ class _World:
         self._every = 1.0 / camera.rate_hz
         self._latency_s = camera.latency_s
         self._next_picture = 0.0
+        self._unshown = False
         self._pictures: deque[tuple[float, tuple[float, Array]]] = deque()
         self._programs = controller.script_count
         self._rests_s, self._dirty = 0.0, True
@@ -153,8 +156,15 @@ class _World:
             self._next_picture += self._every
             self._pictures.append((t + self._latency_s, (unix_now(), self._physics.tag())))
         while self._pictures and t >= self._pictures[0][0]:
-            with contextlib.suppress(OSError):
-                self._finger.send(self._pictures.popleft()[1])
+            picture = self._pictures.popleft()[1]
+            with contextlib.suppress(OSError, EOFError):
+                # the world waits for its camera: no picture is late by more than this computer
+                if self._unshown and self._finger.poll(CAMERA_LIMIT_S):
+                    self._finger.recv()
+                    self._unshown = False
+                if not self._unshown:
+                    self._finger.send(picture)
+                    self._unshown = True
 
     def _answer_scanner(self) -> None:
         with contextlib.suppress(OSError, EOFError):
@@ -226,7 +236,7 @@ def run_world(
             wires.host,
             control_port,
             wires.pace if pace is None else pace,
-            LOCKSTEP_S,
+            WAITS_S,
             seed,
             after_step=inside.step,
         )

@@ -43,6 +43,7 @@ LATE_S = 0.05
 SLOWEST, FASTEST = 0.05, 1.0
 PARENT_CHECK_S = 0.2
 WAIT_S = 0.01
+KEEP_ALIVE_S = 0.5
 LONGEST_WAIT_S = 60.0
 
 
@@ -110,6 +111,7 @@ class Emulation:
         self._checker = Checker(controller)
         self._lockstep = Lockstep(controller, lockstep)
         self._world = World()
+        self._sent_at = 0.0
         self._network = Network(host, seed)
         self._rng = np.random.default_rng([seed, 1])
         heard = self._checker.heard
@@ -151,7 +153,7 @@ class Emulation:
         if ready is not None:
             ready(self._sentence)
         gc.freeze()
-        if self._after_step is None:
+        if self._after_step is None:  # one that carries a world would keep everything else from the processors
             with suppress(OSError):  # a controller has a computer of its own: run first, where that is allowed
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
         try:
@@ -178,6 +180,9 @@ class Emulation:
                 deadline = clock()
                 continue
             if self._lockstep.waits(now):
+                if now - self._sent_at > KEEP_ALIVE_S:  # clients close a connection on which nothing comes for seconds
+                    self._sent_at = now
+                    self._rtde.frame(now)
                 network.flush(now)
                 network.poll(WAIT_S, clock)
                 deadline = max(deadline, clock())  # what was waited is not made up for
@@ -195,6 +200,7 @@ class Emulation:
 
     def _frame(self, now: float) -> None:
         world, network, controller = self._world, self._network, self._controller
+        self._sent_at = now
         if world.unplugged_until is not None and now >= world.unplugged_until:
             world.unplugged_until = None
             network.plug()
