@@ -1,4 +1,4 @@
-"""What every test may ask for: the repository, the measured data, a headless browser, one finished demo."""
+"""What every test may ask for: the repository, the measured data, a headless browser."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ import pytest
 from tests.browser import browser
 from tests.places import SHARED_DATA, require_data
 from tests.scheduling import Scheduling, order, processes
-from tests.short_job import short_jobs
-from tests.ur_rtde import NEEDS_UR_RTDE
+from tests.short_job import finished_demo, short_jobs
 
-__all__ = ["browser", "short_jobs"]
+__all__ = ["browser", "finished_demo", "short_jobs"]
 
 # Imports and collected tests stay for good: to look through all of them again and again takes a third of what collecting takes.
 gc.disable()
@@ -49,13 +48,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files are dealt to the processes one by one, in this order.
-
-    The tests on the emulated robot need its client library.
-    """
-    for item in items:
-        if item.path.parent.name == "hardware":
-            item.add_marker(NEEDS_UR_RTDE)
+    """Files are dealt to the processes one by one, in this order."""
     items.sort(key=order)
 
 
@@ -86,13 +79,6 @@ class FinishedRun:
     stderr: str
     summary: dict[str, Any]
     folder: Path
-
-
-@pytest.fixture(scope="session")
-def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
-    """The README's first command, run once for all tests that look at what it leaves (no browser is opened)."""
-    folder = tmp_path_factory.mktemp("demo") / "result"
-    return run_weldcal("demo", "--no-browser", "--out", str(folder), folder=folder)
 
 
 def run_weldcal(*arguments: str, folder: Path, timeout_s: float = 1200) -> FinishedRun:

@@ -12,8 +12,8 @@ STREAMING = (
     *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
     *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
 )
-# A core that is left with one of these at the end keeps the other waiting.
-SLOWEST = ("test_readme.py", "test_cell.py")
+# They look at the finished demo. A core that is left with them at the end keeps the other waiting.
+DEMO = ("tests/scenario/test_readme.py", "tests/scenario/test_cell.py")
 MOST_PROCESSES = 4
 
 
@@ -26,12 +26,14 @@ def order(item: pytest.Item) -> tuple[object, ...]:
     """Streams first, for they take their time whatever the others do; then what takes longest."""
     name = item.path.name
     streams = STREAMING.index(name) if name in STREAMING else len(STREAMING)
-    return streams, name not in SLOWEST, item.path.parent.name != "scenario"
+    return streams, not item.nodeid.startswith(DEMO), item.path.parent.name != "scenario"
 
 
 class Scheduling(LoadFileScheduling):  # type: ignore[misc]  # xdist has no types
-    """File by file, but all that stream are one file."""
+    """File by file, but all that stream are one file, and all that look at the finished demo."""
 
     def _split_scope(self, nodeid: str) -> str:
         path = nodeid.split("::", 1)[0]
+        if path in DEMO:
+            return "demo"
         return "streaming" if path.rsplit("/", 1)[-1] in STREAMING else path

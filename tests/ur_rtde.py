@@ -1,4 +1,4 @@
-"""The mark of tests that need ur_rtde, the robot's client library, which Python 3.13 does not have yet."""
+"""The mark of tests that need ur_rtde, a client of the emulator, which Python 3.13 does not have yet."""
 
 from __future__ import annotations
 

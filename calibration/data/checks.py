@@ -18,7 +18,8 @@ from weldcal.models.files import read_text, sha256
 from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
 
 UNITS = {"m": 1.0, "mm": 1e-3}
-CONFIGURATIONS = ("eye_on_base",)
+CONFIGURATIONS = ("eye_on_base", "eye_in_hand")
+IN_HAND = "eye_in_hand"
 MODES = ("static", "motion")
 _SAMPLE = 10_000  # points whose distance is enough to tell metres from millimetres
 # Median distances that a flange has from its base, and a scanned point from its camera. The bounds are a factor of 1000 apart, so
@@ -53,6 +54,11 @@ def read_header(path: Path) -> DatasetHeader:
         raise DatasetError(
             f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles "
             f"{', '.join(CONFIGURATIONS)}."
+        )
+    if header.configuration == IN_HAND and header.mode != "motion":
+        raise DatasetError(
+            f"'{path.name}' asks for the configuration '{IN_HAND}', which calibrate handles in motion (mode: motion); at rest use "
+            "weldcal hand-eye."
         )
     _check_poses(header, path)
     return header

@@ -10,6 +10,7 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.checks import (
+    IN_HAND,
     UNITS,
     check_reach,
     digest,
@@ -19,7 +20,7 @@ from weldcal.calibration.data.checks import (
     unit_quaternion,
 )
 from weldcal.calibration.data.clouds import NO_NOTES, CloudError, find_cloud, save_cloud
-from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.header import DatasetHeader, Units
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import pose
@@ -76,6 +77,11 @@ class MotionDataset:
         """Pose of the calibration feature in the flange frame."""
         f = self.header.feature_in_flange
         return RigidTransform(unit_quaternion(f.wxyz, "feature_in_flange"), f.xyz)
+
+    @property
+    def in_hand(self) -> bool:
+        """Whether the scanner is on the flange and sees a fixed target."""
+        return self.header.configuration == IN_HAND
 
     @property
     def X_BC_guess(self) -> RigidTransform | None:
@@ -192,6 +198,18 @@ def _write_table(path: Path, names: Sequence[str], rows: Iterable[Sequence[objec
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(names)
         writer.writerows([v if isinstance(v, str) else repr(v) for v in row] for row in rows)
+
+
+def read_stream(path: Path, *, robot: str = "", unit: str = "m") -> tuple[RobotStream, list[str]]:
+    """A robot's stream from a file alone, with poses in ``unit`` (m or mm) or joint angles of ``robot``, and sentences about rows that
+    were left out. Raises DatasetError, one sentence."""
+    if unit not in UNITS:
+        raise DatasetError(f"The unit '{unit}' is not known; write m or mm.")
+    if not path.is_file():
+        raise DatasetError(
+            f"There is no '{path}'; give a table with the columns time,{','.join(POSE_COLUMNS)} or time,q1,...,q6."
+        )
+    return _read_stream(path, DatasetHeader(units=Units(poses=unit)), robot)
 
 
 def _read_stream(path: Path, header: DatasetHeader, robot: str) -> tuple[RobotStream, list[str]]:

@@ -20,6 +20,7 @@ from weldcal.models.arrays import Array
 from weldcal.models.documents import Section, read_document, shown
 from weldcal.models.errors import InputError
 
+ON_BASE = "eye_on_base"
 RESULT_FILE = "calibration.yaml"
 
 
@@ -55,6 +56,7 @@ class CalibrationResult:
     origin; ``joint_covariance`` (6 + K, 6 + K) that of X_BC and the factors of the scanner correction, where there is one;
     ``clock`` of the scanner and ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as
     they were estimated, where the calibration was made in motion;
+    With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and ``target`` the centre (3,) m and normal (3,) of what was seen, in the base.
     ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans."""
 
     X_BC: RigidTransform
@@ -78,6 +80,13 @@ class CalibrationResult:
     software: str = ""
     clock: ScannerClock | None = None
     clock_covariance: Array | None = None
+    configuration: str = ON_BASE
+    target: tuple[Array, Array] | None = None
+
+    @property
+    def symbol(self) -> str:
+        """Name of the pose: X_BC, or X_FC of a scanner on the flange."""
+        return "X_BC" if self.configuration == ON_BASE else "X_FC"
 
 
 def software_version() -> str:
@@ -112,22 +121,24 @@ def write_atomically(path: Path, text: str) -> None:
 def save_result(result: CalibrationResult, folder: Path) -> Path:
     """Write ``calibration.yaml`` in ``folder``; returns its path."""
     q = result.X_BC.rotation().ToQuaternion().wxyz()
+    parent = "base" if result.configuration == ON_BASE else "flange"
     document = {
         "schema": 1,
         "software": result.software or software_version(),
         "robot": result.robot,
         "flange": result.flange,
         "scanner": result.scanner,
-        "configuration": "eye_on_base",
-        "X_BC": {
+        "configuration": result.configuration,
+        result.symbol: {
             "matrix": matrix4(result.X_BC),
             "xyz": [float(v) for v in result.X_BC.translation()],
             "wxyz": [float(v) for v in q],
         },
         "covariance": {
-            "order": "rotation (rad) then translation (m), on the base side about the camera origin",
+            "order": f"rotation (rad) then translation (m), on the {parent} side about the camera origin",
             "matrix": [[float(v) for v in row] for row in result.covariance],
         },
+        **({} if result.target is None else {"target": target_document(result.target)}),
         "scanner_correction": result.scanner_correction,
         "joint_covariance": None
         if result.joint_covariance is None
@@ -159,6 +170,11 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
     return path
 
 
+def target_document(target: tuple[Array, Array]) -> dict[str, list[float]]:
+    """A fixed target's centre (m) and normal in the base as plain values."""
+    return {"xyz": [float(v) for v in target[0]], "normal": [float(v) for v in target[1]]}
+
+
 def load_result(path: Path) -> CalibrationResult:
     """Read a calibration.yaml (or the folder that holds it).
 
@@ -170,6 +186,10 @@ def load_result(path: Path) -> CalibrationResult:
     if not path.exists():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
     document = read_document(path)
+    if isinstance(document, dict) and "X_FC" in document:
+        raise InputError(
+            f"'{path}' is of a scanner on the flange (X_FC); a scanner that stands beside the robot is needed here."
+        )
     if not isinstance(document, dict) or not {"schema", "X_BC", "covariance"} <= set(document):
         raise InputError(f"'{path.name}' is not a calibration result; run 'weldcal calibrate' again.")
     d = Section.of(path.name, document)
@@ -295,14 +315,19 @@ def correction_note(result: CalibrationResult) -> str | None:
     )
 
 
+def result_parent(result: CalibrationResult) -> str:
+    """The frame, as ROS calls it, that the scanner is fixed in."""
+    return "base" if result.configuration == ON_BASE else "tool0"
+
+
 def export_json(result: CalibrationResult) -> str:
     """X_BC and covariance for other programs."""
     qw, qx, qy, qz = _wxyz(result.X_BC)
     return json.dumps(
         {
-            "parent": "base",
+            "parent": result_parent(result),
             "child": "scanner_optical_frame",
-            "X_BC": matrix4(result.X_BC),
+            result.symbol: matrix4(result.X_BC),
             "xyz": [float(v) for v in result.X_BC.translation()],
             "quaternion_wxyz": [qw, qx, qy, qz],
             "covariance_rotation_translation": np.asarray(result.covariance).tolist(),
@@ -315,13 +340,13 @@ def export_json(result: CalibrationResult) -> str:
 
 def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
     """Write every export into ``folder``; returns the paths."""
-    note = correction_note(result)
+    note, parent = correction_note(result), result_parent(result)
     comment = "" if note is None else f"# {note}\n"
     files = {
-        "scanner.urdf.xacro": export_urdf(result.X_BC, note=note),
-        "static_transform.sh": comment + export_ros2(result.X_BC),
+        "scanner.urdf.xacro": export_urdf(result.X_BC, parent, note=note),
+        "static_transform.sh": comment + export_ros2(result.X_BC, parent),
         "ur_pose.script": comment + export_ur_pose(result.X_BC),
-        "X_BC.json": export_json(result),
+        f"{result.symbol}.json": export_json(result),
     }
     for name, text in files.items():
         write_atomically(folder / name, text)

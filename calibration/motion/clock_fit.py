@@ -8,6 +8,9 @@ j_k is eliminated, so that frame k has the covariance S_k + sigma_j^2 g_k g_k^T 
 is linearised at each frame's own most probable capture time, not at the nominal one, since jitter takes a frame past the ends of a
 move. The variances (a factor of the fit's own noise, a common spread of centres and of normals, sigma_j) solve the equations of
 restricted maximum likelihood.
+
+A scanner on the flange that sees a fixed target is the same with the inverted motion: X_FC p_C,k - X_FB(t_k) p_BT = e_k. The target's
+centre p_BT and the two angles of its normal are then unknown, too.
 """
 
 from dataclasses import dataclass
@@ -34,6 +37,7 @@ from weldcal.models.arrays import Array
 
 Flags = NDArray[np.bool_]
 
+_COUNT = 15  # unknowns at most
 _GATE = 6.5  # sigma: only gross outliers go, as in the calibration at rest
 _LATE = 8.0  # robust deviations of a frame's time: beyond, it says nothing of the mean offset
 _LATE_FLOOR_S = 1e-3
@@ -41,12 +45,14 @@ _GUARD = 4.0  # jitters that a frame must lie within the stream's data
 _STEPS = 60
 _GRID = np.linspace(-6.0, 6.0, 25)
 _WIDEST = np.array(
-    [10.0] * 3 + [10.0] * 3 + [1.0, 1.0, 1.0, 1e3]
+    [10.0] * 3 + [10.0] * 3 + [1.0, 1.0, 1.0, 1e3] + [10.0] * 5
 )  # steps in directions without information stay within: rad, m, s, s/s, s
 
 OFFSET, DRIFT, ROLLING, EDGE = 6, 7, 8, 9
 """Indices of the clock's unknowns behind X_BC's six, and of the height of the edges found (in noises of the face)."""
-_PRIOR = np.array([0.0] * 9 + [1.0 / 3.0**2])  # information: edges lie within some noises of the face
+TARGET = (10, 11, 12, 13, 14)
+"""Indices of a fixed target's unknowns: its centre, and the rotations about its own x and y."""
+_PRIOR = np.array([0.0] * 9 + [1.0 / 3.0**2] + [0.0] * 5)  # information: edges lie within some noises of the face
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +62,7 @@ class ClockFit:
     ``information`` (K, K) of those; ``keep`` (N,) frames used; ``late`` (N,) frames whose time was left free; ``capture`` (N,) s most
     probable capture times and ``nominal`` (N,) s; ``centre`` (N, 3) m residuals at the capture times and ``lean`` (N, 2) rad those of
     the normals; ``rates`` (N, 3) m/s of the centre; ``jitters`` (N,) s as each frame alone tells it, and their variances
-    ``jitter_variance`` (N,) s^2; ``weighted`` (N, K) scores."""
+    ``jitter_variance`` (N,) s^2; ``weighted`` (N, K) scores. ``X_FR``: the feature on what moves; where TARGET is free, X_BT as estimated."""
 
     X_BC: RigidTransform
     offset: float
@@ -78,6 +84,7 @@ class ClockFit:
     jitter_variance: Array
     jacobian: Array
     weights: Array
+    X_FR: RigidTransform | None = None
 
 
 class MotionProblem:
@@ -89,6 +96,12 @@ class MotionProblem:
         self.frames, self.clock, self.motion, self.X_FR = frames, clock, motion, X_FR
         self.row = frames.p_C[:, 1] / frames.p_C[:, 2]
         self.slide = np.zeros_like(frames.p_C) if frames.slide is None else frames.slide
+
+    def move_target(self, delta: Array) -> None:
+        """Move the target by its five unknowns (5,) m, rad."""
+        X = self.X_FR or RigidTransform()
+        turn = RotationMatrix(exp_rotation(np.array([delta[3], delta[4], 0.0])))
+        self.X_FR = RigidTransform(X.rotation() @ turn, X.translation() + delta[:3])
 
     def nominal(self, offset: float, drift: float, rolling: float) -> Array:
         return self.clock.nominal(offset, drift) + rolling * self.row
@@ -129,6 +142,7 @@ def fit_clock(
     Gauss-Newton with the pivot of rotations at the middle of the feature's places; frames with gross errors are left out.
     """
     problem = MotionProblem(frames, clock, motion, X_FR)
+    moving_target = TARGET[0] in free
     allowed = np.isfinite(clock.base) if keep is None else keep & np.isfinite(clock.base)
     drift, rolling, edge = (0.0, 0.0, 0.0) if after is None else (after.drift, after.rolling, after.edge)
     nominal = problem.nominal(offset, drift, rolling)
@@ -158,13 +172,15 @@ def fit_clock(
         information = np.einsum("nij,nik->jk", J, WJ) + np.diag(_PRIOR[index])
         score = np.einsum("nij,ni->j", WJ, linear.y[kept])
         score += np.where(index == EDGE, edge * _PRIOR[index], 0.0)
-        delta = np.zeros(10)
+        delta = np.zeros(_COUNT)
         delta[index] = -_solved(information + np.diag(1.0 / _WIDEST[index] ** 2), score)
         R = exp_rotation(delta[:3]) @ X_BC.rotation().matrix()
         p = exp_rotation(delta[:3]) @ (X_BC.translation() - pivot) + pivot + delta[3:6]
         X_BC = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
         offset, drift = offset + delta[OFFSET], drift + delta[DRIFT]
         rolling, edge = rolling + delta[ROLLING], edge + delta[EDGE]
+        if moving_target:
+            problem.move_target(delta[10:])
         nominal = problem.nominal(offset, drift, rolling)
         linear.y[kept] += linear.J[kept] @ delta
         new = new_variances(linear, variances, W, information, kept, late, index)
@@ -186,7 +202,7 @@ def fit_clock(
     e, m, v, _, _ = problem.residuals(X_BC, capture, rolling, edge)
     return ClockFit(
         X_BC, float(offset), float(drift), float(rolling), float(edge), free, pivot, information, variances, kept, late, capture, nominal,
-        e, m, v, jitters, 1.0 / a, linear.J[:, :, index], W,
+        e, m, v, jitters, 1.0 / a, linear.J[:, :, index], W, problem.X_FR,
     )  # fmt: skip
 
 
@@ -287,7 +303,7 @@ def linearised(
     n = len(f)
     g = np.concatenate([v, turn], axis=1)
     y = np.concatenate([e, m], axis=1) + g * (capture - nominal)[:, None]
-    J = np.zeros((n, 5, 10))
+    J = np.zeros((n, 5, _COUNT))
     J[:, :3, :3] = -skew((f.p_C + edge * problem.slide) @ R.T + X.translation() - pivot)
     J[:, :3, 3:6] = np.eye(3)
     At = np.swapaxes(A, 1, 2)
@@ -298,6 +314,10 @@ def linearised(
     leaning = (v * problem.motion.feature(capture, problem.X_FR).n).sum(axis=1) / f.p_C[:, 2]
     J[:, :3, EDGE] = problem.slide @ R.T
     J[:, 3:, ROLLING] += leaning[:, None] * (At @ R[:, 1])
+    R_FB = problem.motion.poses(capture)[:, :3, :3]
+    target = (problem.X_FR or RigidTransform()).rotation().matrix()
+    J[:, :3, 10:13] = -R_FB
+    J[:, 3:, 13:] = -At @ R_FB @ np.column_stack([-target[:, 1], target[:, 0]])
     own, own_lean = np.zeros((n, 5, 5)), np.zeros((n, 5, 5))
     own[:, :3, :3] = R @ f.covariance @ R.T
     own_lean[:, 3, 3] = own_lean[:, 4, 4] = f.normal_sigma**2

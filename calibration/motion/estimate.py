@@ -10,10 +10,11 @@ from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
 from weldcal.calibration.errors import InconsistentPoses, TooFewPoses, UndeterminedPoses
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.calibration.motion.clock import FrameClock, arrival_clock, choose_clock
-from weldcal.calibration.motion.clock_fit import DRIFT, EDGE, OFFSET, ROLLING, ClockFit, fit_clock
+from weldcal.calibration.motion.clock_fit import DRIFT, EDGE, OFFSET, ROLLING, TARGET, ClockFit, fit_clock
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.place_errors import PlaceErrors, find_place_errors
 from weldcal.calibration.motion.start import Start, search_start
+from weldcal.calibration.motion.start_in_hand import search_in_hand
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 
@@ -25,7 +26,7 @@ _ROLLING_SIGMAS = 4.0  # beyond which a rolling shutter counts as seen
 _LEAST_SHARE = 0.5  # of the frames must agree on one pose
 _WORST_M = 0.02  # spread of the residuals across the motion: beyond, nothing fits
 # what an unknown may vary by (one sigma) and still count as determined: rad, m, s, s/s, s
-_OPEN = np.array([1e-2] * 3 + [5e-3] * 3 + [2e-2, 1e-3, 2e-2, 1e2])
+_OPEN = np.array([1e-2] * 3 + [5e-3] * 3 + [2e-2, 1e-3, 2e-2, 1e2] + [5e-3] * 3 + [1e-2] * 2)
 _WEAK = 0.2  # of that: worth a sentence
 _UNEVEN_S = 0.005  # a device's clock that jitters by more may be worse than the arrivals
 _NAMES = (
@@ -39,6 +40,11 @@ _NAMES = (
     "clock drift",
     "rolling time",
     "edge",
+    "target's x",
+    "target's y",
+    "target's z",
+    "target's tilt about x",
+    "target's tilt about y",
 )
 
 
@@ -93,7 +99,8 @@ def estimate_in_motion(
     *,
     held_out: bool = True,
 ) -> MotionEstimate:
-    """X_BC and the scanner's clock from frames in motion.
+    """X_BC and the scanner's clock from frames in motion. With an inverted ``motion``, of a scanner on the flange that sees a fixed target,
+    X_FC takes the place of X_BC, and the target's pose, found with it, is ``fit.X_FR``; ``X_FR`` is then not used.
 
     The device's clock is used where it runs evenly, else the arrivals. The clock's drift is estimated for a device, a rolling time
     within the frame where it is significant. Without motion that shows the offset, X_BC comes from the frames as they are and the
@@ -119,8 +126,8 @@ def estimate_in_motion(
             motion,
             fit.X_BC,
             -clock.sign * start.delay_s,
-            X_FR=X_FR,
-            free=(0, 1, 2, 3, 4, 5, *(() if frames.slide is None else (EDGE,))),
+            X_FR=fit.X_FR,
+            free=(0, 1, 2, 3, 4, 5, *(() if frames.slide is None else (EDGE,)), *_target(motion)),
         )
         places = find_place_errors(fit, frames)
         inverse, open_names, weak = _determined(fit, places)
@@ -151,11 +158,11 @@ def estimate_in_motion(
     T = np.eye(len(inverse))
     T[3:6, :3] = -skew(np.asarray(fit.X_BC.translation()) - fit.pivot)
     joint = T @ inverse @ T.T
-    kept = [k for k, name in enumerate(fit.free) if name != EDGE]
+    kept = [k for k, name in enumerate(fit.free) if name < EDGE]
     joint = 0.5 * (joint + joint.T)[np.ix_(kept, kept)]
     names = tuple(_NAMES[fit.free[k]] for k in kept)
-    held = _held_out(frames, clock, motion, fit, X_FR) if held_out else (np.full(len(frames), np.nan),) * 3
-    before, speed, along = _along(frames, clock, motion, fit, start, X_FR)
+    held = _held_out(frames, clock, motion, fit, fit.X_FR) if held_out else (np.full(len(frames), np.nan),) * 3
+    before, speed, along = _along(frames, clock, motion, fit, start, fit.X_FR)
     return MotionEstimate(
         X_BC=fit.X_BC,
         covariance=joint[:6, :6],
@@ -184,25 +191,40 @@ def _fitted(
     frames: ObservedFrames, clock: FrameClock, motion: ContinuousMotion, X_FR: RigidTransform | None
 ) -> tuple[Start, ClockFit]:
     """Start and fit with the unknowns that the data ask for."""
-    start = search_start(frames, clock, motion, X_FR)
+    start = search_in_hand(frames, clock, motion) if motion.inverted else search_start(frames, clock, motion, X_FR)
     if start is None:
         begin, end = motion.span
         raise InconsistentPoses(
             f"Too few frames were taken within the robot's stream ({begin:.3f} to {end:.3f} s); record both over the same time."
         )
+    X_FR = start.X_FR if motion.inverted else X_FR
     edge = () if frames.slide is None else (EDGE,)
+    target = _target(motion)
     plain = (0, 1, 2, 3, 4, 5, OFFSET, *((DRIFT,) if clock.kind == DEVICE else ()))
-    free = (*plain, *edge)
+    free = (*plain, *edge, *target)
     fit = fit_clock(frames, clock, motion, start.X_BC, -clock.sign * start.delay_s, X_FR=X_FR, free=free)
     rolling = fit_clock(
-        frames, clock, motion, fit.X_BC, fit.offset, X_FR=X_FR, free=(*plain, ROLLING, *edge), after=fit
+        frames, clock, motion, fit.X_BC, fit.offset, X_FR=fit.X_FR, free=(*plain, ROLLING, *edge, *target), after=fit
     )
     covariance, _ = _inverse(rolling.information, rolling.free)
     sigma = float(np.sqrt(covariance[len(plain), len(plain)]))
     if abs(rolling.rolling) > _ROLLING_SIGMAS * sigma and sigma < _OPEN[ROLLING]:
-        again = fit_clock(frames, clock, motion, rolling.X_BC, rolling.offset, X_FR=X_FR, free=(*plain, ROLLING, *edge))
+        again = fit_clock(
+            frames,
+            clock,
+            motion,
+            rolling.X_BC,
+            rolling.offset,
+            X_FR=rolling.X_FR,
+            free=(*plain, ROLLING, *edge, *target),
+        )
         return start, again
     return start, fit
+
+
+def _target(motion: ContinuousMotion) -> tuple[int, ...]:
+    """The unknowns of a fixed target, where one is seen."""
+    return TARGET if motion.inverted else ()
 
 
 def _corrected(frames: ObservedFrames, fit: ClockFit) -> Array:

@@ -13,6 +13,7 @@ from weldcal.calibration.flange.fit import FlangeFit, FlangeFitConfig, FlangeGue
 from weldcal.calibration.motion.clock import choose_clock
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.start import search_start
+from weldcal.calibration.motion.start_in_hand import search_in_hand
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import FlangeStandard
@@ -85,11 +86,12 @@ def see_frames(
 
     Some frames, spread over the recording, are searched whole. They give a first X_BC and delay, and with them the robot's
     stream says where the flange is in each other frame; where it is not there, the whole frame is searched. ``X_BC``: pose to
-    begin with. Deterministic for ``seed``. Raises TooFewPoses where too few frames show the flange to begin.
+    begin with. An inverted ``motion`` is that of a fixed target before a scanner on the flange. Deterministic for ``seed``. Raises
+    TooFewPoses where too few frames show the flange to begin.
     """
     seen = FramesSeen(data)
     finder = _Finder(data, standard, seed)
-    X_start = X_BC or data.X_BC_guess
+    X_start = None if motion.inverted else X_BC or data.X_BC_guess
     reach = _RADIUS * standard.outer_m
     if data.header.scanner_guess is not None and X_BC is None:
         reach += data.header.scanner_guess.radius_m
@@ -153,7 +155,11 @@ class _Prediction:
     def __init__(self, data: MotionDataset, motion: ContinuousMotion, seen: FramesSeen) -> None:
         observed = seen.observed
         clock = choose_clock(observed)
-        start = search_start(observed, clock, motion, data.X_FR)
+        start = (
+            search_in_hand(observed, clock, motion)
+            if motion.inverted
+            else search_start(observed, clock, motion, data.X_FR)
+        )
         self.p = np.full((len(data.frames), 3), np.nan)
         self.n = self.p.copy()
         if start is None:
@@ -162,7 +168,7 @@ class _Prediction:
         base = np.array(
             [(np.nan if f.device is None else f.device + clock.shift) if by_device else f.arrival for f in data.frames]
         )
-        at = motion.feature(base - start.delay_s, data.X_FR)
+        at = motion.feature(base - start.delay_s, start.X_FR if motion.inverted else data.X_FR)
         R = start.X_BC.rotation().matrix()
         self.p, self.n = (at.p - start.X_BC.translation()) @ R, at.n @ R
 

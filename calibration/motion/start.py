@@ -24,12 +24,13 @@ _LEAST_KNOWN = 0.5  # of the frames must lie within the stream
 @dataclass(frozen=True, eq=False)
 class Start:
     """Coarse result: the delay (s) of the clock's base behind capture, X_BC, and the curve of cost against delay: ``delays`` (D,) s
-    and ``rms_m`` (D,) of the better part of the frames, NaN where too few lie within the stream."""
+    and ``rms_m`` (D,) of the better part of the frames, NaN where too few lie within the stream. ``X_FR``: the feature on what moves, or the fixed target X_BT."""
 
     delay_s: float
     X_BC: RigidTransform
     delays: Array
     rms_m: Array
+    X_FR: RigidTransform | None = None
 
 
 def search_start(
@@ -53,7 +54,7 @@ def search_start(
     cost, _, _ = _costs(part, base, delays, motion, X_FR)
     if not np.isfinite(cost).any():
         return None
-    best = _plausible(delays, cost)
+    best = plausible(delays, cost)
     fine = np.array([best]) if given else best + np.arange(-_STEP_S, _STEP_S + 0.5 * _FINE_S, _FINE_S)
     fine_cost, R, p = _costs(part, base, fine, motion, X_FR)
     k = int(np.nanargmin(fine_cost)) if np.isfinite(fine_cost).any() else 0
@@ -66,7 +67,7 @@ def search_start(
     )
 
 
-def _plausible(delays: Array, cost: Array) -> float:
+def plausible(delays: Array, cost: Array) -> float:
     """The delay of least cost; where a motion repeats itself, of those about as good the one nearest to zero."""
     c = np.where(np.isfinite(cost), cost, np.inf)
     around = np.minimum(np.concatenate([[np.inf], c[:-1]]), np.concatenate([c[1:], [np.inf]]))

@@ -32,7 +32,7 @@ class Variances:
 
 @dataclass(eq=False)
 class Linearised:
-    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5), Jacobians J (N, 5, 9),
+    """The model linearised at the frames' capture times: residuals extrapolated to the nominal times y (N, 5), Jacobians J (N, 5, 15),
     rates g (N, 5) and the unit covariances of the three kinds of noise in 5 x 5."""
 
     y: Array

@@ -9,17 +9,20 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.calibration.data.scanner_clock import ScannerClock
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.motion.drift.residuals import TrackedFrame, tracked_rows
+from weldcal.calibration.data.results import CalibrationResult
+from weldcal.calibration.data.scanner_clock import DEVICE, ScannerClock
+from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
+from weldcal.calibration.motion.drift.residuals import CLOCK, TrackedFrame, tracked_rows
 from weldcal.calibration.motion.drift.sequential import WARM_UP, DriftConfig, DriftEvent, DriftTest
+from weldcal.calibration.motion.drift.watch import drift_config
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
-from weldcal.systems.messages import FlangeEstimate, Message
+from weldcal.systems.messages import CalibrationStatus, FlangeEstimate, Message
 from weldcal.systems.motion.pose_recorder import PoseHistory
 
 _HALF_S = 0.01  # about a capture: its velocity
 _RECENT = 400  # frames that the view shows
+_CLOCKS_APART_S = 0.5  # a device time that is this far from the arrival is one of a clock that was set anew
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -32,11 +35,31 @@ class MonitoredCalibration:
     correction: ScannerCorrection = dc.field(default_factory=ScannerCorrection)
     clock: ScannerClock | None = None
     delay_s: float = 0.0
+    config: DriftConfig | None = None
+
+    @staticmethod
+    def of(result: CalibrationResult, delay_s: float, *, false_alarms_per_hour: float = 1e-3) -> "MonitoredCalibration":
+        """What a result says; ``delay_s`` is the usual delay of the scanner, where the result does not know its clock."""
+        clock = result.clock
+        sigma = None if clock is None or clock.offset_s is None else clock.sigma_s
+        spread = 1e-3 * result.sigma_position_mm
+        config = drift_config(spread, sigma, DriftConfig(false_alarms_per_hour=false_alarms_per_hour))
+        correction = correction_from_document(result.scanner_correction) or ScannerCorrection()
+        return MonitoredCalibration(result.X_BC, result.covariance, correction, clock, delay_s, config)
+
+    @staticmethod
+    def made(status: CalibrationStatus, delay_s: float, config: DriftConfig) -> "MonitoredCalibration | None":
+        """The calibration that a run has made; None until it is done."""
+        e = status.estimate
+        if e is None or not status.done:
+            return None
+        config = drift_config(e.sigma_position_m, None, config)
+        return MonitoredCalibration(e.X_BC, e.covariance, status.correction, None, delay_s, config)
 
 
 @dc.dataclass(frozen=True, eq=False)
 class DriftStatus(Message):
-    """The state of the watch after its newest frame. ``recent`` (n, 5): time s, error (3) m, offset of the frame's time s.
+    """The state of the watch after its newest frame. ``recent`` (n, 6): time s, error (3) m at the time by the clock, offset of the clock s, test statistic.
 
     ``X_BC`` with its ``covariance`` (6, 6) is the scanner's pose by all frames since the last change: the recalibration.
     ``alarmed``: a change is being measured; ``events``: those that were measured.
@@ -45,7 +68,7 @@ class DriftStatus(Message):
     sequence: int = 0
     frames: int = 0
     dropped: int = 0
-    recent: Array = dc.field(default_factory=lambda: np.empty((0, 5)))
+    recent: Array = dc.field(default_factory=lambda: np.empty((0, 6)))
     statistic: float = 0.0
     threshold: float = np.inf
     alarmed: bool = False
@@ -72,6 +95,18 @@ class DriftStatus(Message):
         return ""
 
 
+@dc.dataclass(frozen=True)
+class _Anchor:
+    """A time of the device's clock and what it is taken for on the robot's clock, s."""
+
+    device_s: float
+    robot_s: float
+
+    def time(self, device_s: float) -> float:
+        """A device time on the robot's clock, s."""
+        return self.robot_s + device_s - self.device_s
+
+
 @dc.dataclass(frozen=True, eq=False)
 class _Watch(Message):
     """The status and the test behind it, which is copied before it is changed."""
@@ -81,6 +116,7 @@ class _Watch(Message):
     watched: MonitoredCalibration | None = None
     pivot: Array | None = None
     asked: bool = False
+    anchor: _Anchor | None = None
 
 
 class DriftMonitor(LeafSystem):
@@ -93,24 +129,28 @@ class DriftMonitor(LeafSystem):
         - flange_estimate
         - history
         - recalibrate
+        - calibration_status
         output_ports:
         - drift
         - moved
 
     `drift` is a `DriftStatus`; `moved` (1) is 1 from an alarm on. When `recalibrate` (1, may stay open) rises, the pose that the
-    frames since the last change show becomes the calibration that is watched. All state is in the Context. Theory: docs/drift.md.
+    frames since the last change show becomes the calibration that is watched. Without a ``calibration`` the one on
+    `calibration_status` (may stay open) is watched from when it is done; a streamed frame is then expected ``delay_s`` after its capture.
+    All state is in the Context. Theory: docs/drift.md.
     """
 
     def __init__(
-        self, arm: ArmModel, X_FR: RigidTransform, calibration: MonitoredCalibration, config: DriftConfig | None = None,
-        period_s: float = 0.02,
+        self, arm: ArmModel, X_FR: RigidTransform, calibration: MonitoredCalibration | None, config: DriftConfig | None = None,
+        period_s: float = 0.02, delay_s: float = 0.0,
     ) -> None:  # fmt: skip
         super().__init__()
-        self._arm, self._X_FR, self._config = arm, X_FR, config
+        self._arm, self._X_FR, self._config, self._delay_s = arm, X_FR, config, delay_s
         self._estimate = self.DeclareAbstractInputPort("flange_estimate", AbstractValue.Make(FlangeEstimate()))
         self._history = self.DeclareAbstractInputPort("history", AbstractValue.Make(PoseHistory()))
         self._recalibrate = self.DeclareVectorInputPort("recalibrate", 1)
-        first = _Watch(DriftStatus(X_BC=calibration.X_BC, covariance=calibration.covariance), watched=calibration)
+        self._calibration = self.DeclareAbstractInputPort("calibration_status", AbstractValue.Make(CalibrationStatus()))
+        first = _begun(calibration)
         self._state = self.DeclareAbstractState(AbstractValue.Make(first))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareAbstractOutputPort("drift", lambda: AbstractValue.Make(DriftStatus()), self._drift_out, ticket)
@@ -128,8 +168,11 @@ class DriftMonitor(LeafSystem):
         new = old
         if asked != old.asked:
             new = dc.replace(recalibrated(new) if asked else new, asked=asked)
+        if old.watched is None and self._calibration.HasValue(context):
+            config = self._config or DriftConfig()
+            new = _begun(MonitoredCalibration.made(self._calibration.Eval(context), self._delay_s, config))
         estimate: FlangeEstimate = self._estimate.Eval(context)
-        if estimate.sequence > old.status.sequence:
+        if new.watched is not None and estimate.sequence > old.status.sequence:
             history: PoseHistory = self._history.Eval(context)
             new = watched_frame(new, estimate, history, self._arm, self._X_FR, self._config)
         if new is not old:
@@ -142,21 +185,33 @@ class DriftMonitor(LeafSystem):
         output.SetAtIndex(0, float(self.status(context).moved))
 
 
+def _begun(calibration: MonitoredCalibration | None) -> _Watch:
+    """The watch of a calibration before its first frame."""
+    if calibration is None:
+        return _Watch()
+    return _Watch(DriftStatus(X_BC=calibration.X_BC, covariance=calibration.covariance), watched=calibration)
+
+
 def watched_frame(
     watch: _Watch, estimate: FlangeEstimate, history: PoseHistory, arm: ArmModel, X_FR: RigidTransform, config: DriftConfig | None
 ) -> _Watch:  # fmt: skip
     """The watch after one more estimate; a frame without a fit, a time or a pose of the arm is counted as dropped."""
     status = dc.replace(watch.status, sequence=estimate.sequence)
-    frame = _tracked(watch.watched, estimate, history, arm, X_FR)
+    if watch.watched is not None:
+        watch = dc.replace(watch, anchor=_anchored(watch.anchor, estimate, watch.watched.delay_s))
+    frame = _tracked(watch.watched, estimate, history, arm, X_FR, watch.anchor)
     if frame is None or watch.watched is None:
         return dc.replace(watch, status=dc.replace(status, dropped=status.dropped + 1))
     pivot = frame.p_BR if watch.pivot is None else watch.pivot
     c = watch.watched
-    test = DriftTest(c.X_BC, c.covariance, pivot, config) if watch.test is None else copy.deepcopy(watch.test)
+    test = (
+        DriftTest(c.X_BC, c.covariance, pivot, c.config or config) if watch.test is None else copy.deepcopy(watch.test)
+    )
     rows = tracked_rows(c.X_BC, pivot, [frame])
     events = test.update(rows)
     X, covariance = test.current()
-    row = np.concatenate([[frame.time], rows.residuals[0, :3], [test.clock_s]])
+    error = rows.residuals[0, :3] - test.clock_s * rows.derivatives[0, :3, CLOCK]
+    row = np.array([frame.time, *error, test.clock_s, test.statistic])
     status = dc.replace(
         status, frames=status.frames + 1, recent=np.vstack([status.recent[1 - _RECENT :], row]), statistic=test.statistic,
         threshold=test.threshold, alarmed=test.alarmed, events=(*status.events, *events), X_BC=X, covariance=covariance,
@@ -175,7 +230,12 @@ def recalibrated(watch: _Watch) -> _Watch:
 
 
 def _tracked(
-    c: MonitoredCalibration | None, estimate: FlangeEstimate, history: PoseHistory, arm: ArmModel, X_FR: RigidTransform
+    c: MonitoredCalibration | None,
+    estimate: FlangeEstimate,
+    history: PoseHistory,
+    arm: ArmModel,
+    X_FR: RigidTransform,
+    anchor: _Anchor | None,
 ) -> TrackedFrame | None:
     """A frame with the feature's pose and rates at its capture; None where one of them is missing."""
     fit = estimate.fit
@@ -183,8 +243,7 @@ def _tracked(
         return None
     time: float | None = estimate.capture_time
     if np.isfinite(estimate.arrival_time):  # streamed: when it was captured is not known
-        time = None if c.clock is None else c.clock.capture(estimate.arrival_time, estimate.device_time)
-        time = estimate.arrival_time - c.delay_s if time is None else time
+        time = _captured(c, estimate, anchor)
     assert time is not None
     X = [history.pose_at(arm, t) for t in (time - _HALF_S, time, time + _HALF_S)]
     before, now, after = (None if x is None else (x @ X_FR).GetAsMatrix4() for x in X)
@@ -196,3 +255,24 @@ def _tracked(
         str(estimate.sequence), time, now[:3, 3], now[:3, 2], rates[:3, 3], rates[:3, 2], p_C, n_C,
         fit.center_covariance, fit.normal_sigma,
     )  # fmt: skip
+
+
+def _anchored(anchor: _Anchor | None, estimate: FlangeEstimate, delay_s: float) -> _Anchor | None:
+    """The device's clock as its first frame shows it; one that was set anew begins again. None where a frame has no device time."""
+    if estimate.device_time is None or not np.isfinite(estimate.arrival_time):
+        return None
+    usual = estimate.arrival_time - delay_s
+    if anchor is not None and abs(anchor.time(estimate.device_time) - usual) < _CLOCKS_APART_S:
+        return anchor
+    return _Anchor(estimate.device_time, usual)
+
+
+def _captured(c: MonitoredCalibration, estimate: FlangeEstimate, anchor: _Anchor | None) -> float:
+    """When a streamed frame was captured (s), by the calibration's clock. Where that is not known, or was set anew since, by the
+    device's clock from its first frame on: what that is wrong by is the same for all frames, and the test estimates it."""
+    usual = estimate.arrival_time - c.delay_s
+    if c.clock is not None:
+        time = c.clock.capture(estimate.arrival_time, estimate.device_time)
+        if time is not None and (c.clock.kind != DEVICE or abs(time - usual) < _CLOCKS_APART_S):
+            return time
+    return usual if anchor is None or estimate.device_time is None else anchor.time(estimate.device_time)

@@ -23,7 +23,7 @@ POSITIVE = {
     *("rate_hz", "focal_px", "field_of_view_deg", "width", "height", "recording_fps", "cloud_points"),
 }
 NOT_NEGATIVE = {
-    *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "verification_scans", "payload_kg"),
+    *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "knock_s", "verification_scans", "payload_kg"),
     *("repeatability_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
     *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
     *("placement_translation_mm", "placement_rotation_deg"),
@@ -36,6 +36,8 @@ LENGTHS = {
     "home_deg": 6,
     "payload_cog_m": 3,
     "gradient_error_per_m": 2,
+    "knock_mm": 3,
+    "knock_deg": 3,
 }
 
 

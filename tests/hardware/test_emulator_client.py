@@ -17,12 +17,14 @@ from pydrake.math import RigidTransform
 from tests.hardware.bare_rtde import Rtde
 from tests.hardware.emulator_process import Emulator, emulator, emulator_process, run_client, start_client
 from tests.hardware.test_emulator_wire import calibrated, chain, kinematics_of, packages
+from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian, load_arm
 from weldcal.models.errors import InputError
 from weldcal.tools.emulators.ur.controller.poses import rotation_matrix
 from weldcal.tools.emulators.ur.main import HOME
 
 __all__ = ["emulator"]
+pytestmark = NEEDS_UR_RTDE
 
 SPEED_M_S = 0.02
 CONNECT = """

@@ -12,6 +12,7 @@ import pytest
 
 from tests.hardware.emulator_process import run_client
 from tests.systems.cells import EXACT_PLATE, SMALL_IDEAL_SCANNER, Drive, scenario
+from tests.ur_rtde import NEEDS_UR_RTDE
 from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.errors import RobotRefused
@@ -235,6 +236,7 @@ def test_numbers_30_ms_late_leave_the_torch_on_and_the_arm_at_its_speed(burning:
     assert burning.stream.state.fault is Fault.NONE
 
 
+@NEEDS_UR_RTDE
 def test_the_stock_clients_output_reaches_the_terminals_and_the_state_stream(bench: Bench) -> None:
     script = """
 import sys, time, rtde_io, rtde_receive

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.places import ROOT
+from tests.short_job import SEED, ShortJobs, short_job_scenario
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
@@ -19,7 +20,6 @@ from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
-from weldcal.tools.studies.perfect_world import perfect
 
 # Both arms stand at the same planned poses, so the same picture is fitted twice: what may differ is a few pixels at the edge of
 # the flange, 0.02 mm of the fit (test_cell). The largest error of a torch is a single tick's: 2 ms at 8 mm/s are 0.02 mm more.
@@ -35,31 +35,18 @@ PACE = 0.5  # a faster one leaves the link less time than a busy machine of two 
 NOMINAL = ROOT / "models/arms/ur10e/default_kinematics.yaml"
 
 
-SEED = 5  # its planned poses lie near each other
-SHORTEST = """
-welding: {seam_length_mm: 20.0}
-calibration: {minimum_scans: 4, maximum_scans: 4}
-scanner: !RenderedScanner {preset: ideal, width: 824, height: 616}
-"""
-
-
-def finished_job(folder: Path, robot: str, pace: float | None) -> DemoResult:
-    """Calibrate, verify, plan, approach, weld, retract: all that a job is, as short as it gets."""
-    options = RunOptions("a test's own", folder, SEED, robot=robot, pace=pace, recording=False)
-    return run_scenario(perfect(load_scenario("s_groove", SHORTEST)), options)
-
-
 @pytest.fixture(scope="module")
 def emulated_job(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
-    """The job on the emulated controller, whose time waits for a computer that is busy."""
-    return finished_job(tmp_path_factory.mktemp("emulated") / "run", "emulated", JOB_PACE)
+    """The short job on the emulated controller, whose time waits for a computer that is busy."""
+    folder = tmp_path_factory.mktemp("emulated") / "run"
+    options = RunOptions("a test's own", folder, SEED, robot="emulated", pace=JOB_PACE, recording=False)
+    return run_scenario(short_job_scenario(), options)
 
 
 def test_the_same_job_on_the_emulated_robot_ends_with_the_same_figures(
-    emulated_job: DemoResult, tmp_path: Path
+    emulated_job: DemoResult, short_jobs: ShortJobs
 ) -> None:
-    emulated = emulated_job.summary()
-    simulated = finished_job(tmp_path / "run", "simulated", None).summary()
+    emulated, simulated = emulated_job.summary(), short_jobs.summary()
     assert emulated["state"] == "done", emulated.get("reason")
     assert simulated["state"] == "done", simulated.get("reason")
     for key, same_mm in SAME_MM.items():

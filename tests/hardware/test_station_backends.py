@@ -136,21 +136,16 @@ def workers() -> list[Path]:
     return [folder for folder in folders if b"weldcal.systems.drivers.ur.worker" in (folder / "cmdline").read_bytes()]
 
 
-def test_only_the_loop_of_a_worker_runs_before_the_cell_not_the_threads_that_poll(
-    backend: Backend, drive: PacedDrive
-) -> None:
+def test_a_worker_is_one_thread_that_runs_before_the_cell(backend: Backend, drive: PacedDrive) -> None:
     if backend.name == "simulated":
         assert workers() == []
         return
     (worker,) = workers()
+    assert [task.name for task in (worker / "task").iterdir()] == [worker.name]
     loop = int(worker.name)
-    polling = [int(task.name) for task in (worker / "task").iterdir() if int(task.name) != loop]
-    assert len(polling) >= 2, "one for each connection of ur_rtde"
     if os.sched_getscheduler(loop) != os.SCHED_RR:
         pytest.skip("this system gives no real-time priority to this user")
     assert os.sched_getparam(loop).sched_priority == LOOP_PRIORITY > CELL_PRIORITY
-    expected = CELL_PRIORITY if len(os.sched_getaffinity(loop)) > 1 else LOOP_PRIORITY
-    assert [os.sched_getparam(thread).sched_priority for thread in polling] == [expected] * len(polling)
 
 
 def test_the_position_is_held_from_the_start_and_zero_moves_nothing(drive: PacedDrive) -> None:
@@ -172,10 +167,17 @@ def test_a_velocity_is_followed_and_the_sample_carries_its_own_time(drive: Paced
     before, t_before = drive.get("ur10e.position_measured"), drive.get("ur10e.sample_time")[0]
     drive.run(0.4)
     after, t_after = drive.get("ur10e.position_measured"), drive.get("ur10e.sample_time")[0]
-    # The clocks of two processes agree to a few ms, and a busy machine delays a sample's arrival.
-    assert (after - before) / (t_after - t_before) == pytest.approx(SLOWLY, rel=0.1)
+    # A busy machine's late commands slow the arm along its path (`time_scale`), and delay a sample's arrival.
+    moved = (after - before) / (t_after - t_before)
+    kept = float(moved @ SLOWLY / (SLOWLY @ SLOWLY))
+    assert moved == pytest.approx(kept * SLOWLY, abs=2e-3)
+    assert 0.0 < kept < 1.05
     assert t_after == pytest.approx(drive.time, abs=0.03)
-    assert drive.get("ur10e.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3)
+    for _ in range(40):
+        if drive.get("ur10e.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3):
+            break
+        drive.run(0.05)
+    assert drive.get("ur10e.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3), "reached while nothing is late"
     world = drive.station.world
     seen = drive.station.world.plant.GetPositions(drive.plant, world.arm)
     assert seen == pytest.approx(drive.true_arm(), abs=2e-3), "what the cameras see is where the arm is"

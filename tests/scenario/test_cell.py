@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses as dc
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import FinishedRun, run_weldcal
-from tests.ur_rtde import NEEDS_UR_RTDE
+from tests.short_job import ShortJob
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.planning.calibration_poses import PlannedPose
 from weldcal.calibration.planning.clearance import arm_bodies, path_clearance
@@ -51,9 +50,9 @@ def run(scenario: Scenario, folder: Path, seed: int = 0) -> DemoResult:
 
 
 @pytest.fixture(scope="module")
-def short_job(short_jobs: Callable[[str], DemoResult]) -> DemoResult:
-    """The demo's cell on a 30 mm seam, with a noisy scanner; the job on both robots has a perfect one."""
-    return short_jobs("phoxi_m")
+def short_job(finished_demo: ShortJob) -> DemoResult:
+    """The demo's cell on a 30 mm seam."""
+    return finished_demo.result
 
 
 def test_the_job_runs_from_calibration_to_the_end_of_the_seam(short_job: DemoResult) -> None:
@@ -362,7 +361,7 @@ def test_an_error_in_the_run_lets_go_of_the_robot() -> None:
         ({"robot": "simulated", "pace": 0.5}, "--dry-run and --pace need a controller"),
         ({"robot": "192.0.2.1", "pace": 0.5}, "runs in real time"),
         ({"robot": "emulated", "pace": 3.0}, "--pace must be from 0.05 to 1, and it is 3"),
-        pytest.param({"robot": "127.0.0.9"}, "127.0.0.9", marks=NEEDS_UR_RTDE),
+        ({"robot": "127.0.0.9"}, "127.0.0.9"),
         ({"speed_factor": 7.0}, "job.speed_factor"),
     ],
 )

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.browser import Browser, colours
-from tests.conftest import FinishedRun
+from tests.short_job import ShortJob
 
 # Each command of the README and the test that runs it, here or in another file (with a short job, where the job is long).
 RUN_BY = {
@@ -46,28 +46,26 @@ def test_the_commands_of_the_readme_are_run(repository: Path, readme: str) -> No
     assert [name for name in RUN_BY.values() if f"def {name}(" not in tests] == []
 
 
-def test_the_demo_ends_done_and_leaves_the_files_that_the_readme_names(finished_demo: FinishedRun, readme: str) -> None:
-    assert finished_demo.returncode == 0, finished_demo.stderr
+def test_the_demo_ends_done_and_leaves_the_files_that_the_readme_names(finished_demo: ShortJob, readme: str) -> None:
+    assert finished_demo.returncode == 0, finished_demo.output
     assert finished_demo.summary["state"] == "done"
     promised = set(re.findall(r"`([a-z_]+\.(?:html|yaml|csv))`", readme.split("## Start")[1].split("\n## ")[0]))
     assert len(promised) >= 4
-    assert promised <= {path.name for path in finished_demo.folder.iterdir()}
+    assert promised <= {path.name for path in finished_demo.result.folder.iterdir()}
 
 
 @pytest.mark.parametrize("name", ["report.html", "recording.html"])
-def test_its_pages_open_without_a_network(
-    finished_demo: FinishedRun, browser: Browser, tmp_path: Path, name: str
-) -> None:
+def test_its_pages_open_without_a_network(finished_demo: ShortJob, browser: Browser, tmp_path: Path, name: str) -> None:
     ready = "document.querySelector('canvas')" if name == "recording.html" else "document.querySelector('.verdict')"
-    browser.open(finished_demo.folder / name, wait_for=ready)
+    browser.open(finished_demo.result.folder / name, wait_for=ready)
     pixels = browser.screenshot(tmp_path / "page.png", until=lambda picture: colours(picture) > 8)
     assert colours(pixels) > 8, "the page is not blank"
     assert browser.console_messages() == []
     assert browser.outside_addresses() == []
 
 
-def test_the_report_says_first_whether_it_worked(finished_demo: FinishedRun, browser: Browser) -> None:
-    browser.open(finished_demo.folder / "report.html")
+def test_the_report_says_first_whether_it_worked(finished_demo: ShortJob, browser: Browser) -> None:
+    browser.open(finished_demo.result.folder / "report.html")
     verdict = str(browser.run("return document.querySelector('.verdict').innerText"))
     assert verdict
     assert browser.text().index(verdict) < 300, "the verdict stands near the top"

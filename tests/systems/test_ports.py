@@ -34,7 +34,7 @@ from weldcal.systems.drivers.sensors.watch import DeviceWatch
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
 from weldcal.systems.drivers.sensors.wired_profiler import WiredProfiles
 from weldcal.systems.drivers.sensors.wired_scanner import WiredScanSensor, WiredScanStream
-from weldcal.systems.drivers.simulated.picture_scene import PicturePoses
+from weldcal.systems.drivers.simulated.picture_scene import KnockedStand, PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera, StreamingCamera
@@ -101,6 +101,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
+from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wall_clock import WallClock
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.settings import ServoConfig
@@ -157,6 +158,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     SeamPlanner: lambda: SeamPlanner(seam_planning()),
     DrawnSeamPlanner: lambda: DrawnSeamPlanner(seam_planning()),
     PicturePoses: lambda: PicturePoses(plain_station().world.plant, plain_station().world.scanner_view.frames),
+    KnockedStand: lambda: KnockedStand(plain_station().world.scanner_view.scene_graph.world_frame_id(), 1.0, X),
     ArucoDeformationEstimator: lambda: ArucoDeformationEstimator(the_arm(), TOOL, RenderedFingerCamera().camera()),
     WeldingVelocityServo: lambda: WeldingVelocityServo(the_arm(), TOOL, ServoConfig()),
     SingularityGuard: lambda: SingularityGuard(the_arm(), TOOL.X_FT),
@@ -166,6 +168,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     FlangeMover: FlangeMover,
     SlewLimiter: lambda: SlewLimiter(SlewLimits()),
     JobSequencer: lambda: JobSequencer(JOB),
+    DriftView: lambda: DriftView(Meshcat(MeshcatParams(host="localhost", port=0)), 0.03, VisualizationConfig()),
     CellVisualizer: lambda: CellVisualizer(
         Meshcat(MeshcatParams(host="localhost", port=0)), TOOL, X, 0.03, VisualizationConfig()
     ),
@@ -326,6 +329,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
     },
     PicturePoses: {"body_poses": list, "frame_poses": FramePoseVector},
+    KnockedStand: {"frame_poses": FramePoseVector},
     ArucoDeformationEstimator: {"image": Image, "history": PoseHistory, "deformation": Deformation, "deflection": 5},
     WeldingVelocityServo: {
         "planned_seam": PlannedSeam,
@@ -363,10 +367,12 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "velocity": 6,
         "settled_goal": 1,
     },
+    DriftView: {"drift": DriftStatus, "flange_estimate": FlangeEstimate},
     DriftMonitor: {
         "flange_estimate": FlangeEstimate,
         "history": PoseHistory,
         "recalibrate": 1,
+        "calibration_status": CalibrationStatus,
         "drift": DriftStatus,
         "moved": 1,
     },
@@ -386,6 +392,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "job_state": JobState,
         "scan_trigger": 1,
         "streaming": 1,
+        "scanner_streaming": 1,
     },
     CellVisualizer: {
         "job_state": JobState,

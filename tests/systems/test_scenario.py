@@ -49,6 +49,9 @@ scanner: !RenderedScanner
   gradient_error_per_m: [0.01, -0.02]
   warp_mm: 0.05
   mounted_on: flange
+  knock_s: 3.0
+  knock_mm: [0.3, 0.0, -0.2]
+  knock_deg: [0.0, 0.05, 0.0]
 finger_camera: !RenderedFingerCamera
   width: 320
   height: 240
@@ -66,6 +69,8 @@ motion:
   queue: 3
   record: true
   recording_folder: "recording"
+  watch: "calibration"
+  false_alarms_per_hour: 0.01
 wrist_camera: !RenderedWristCamera
   xyz_m: [0.07, 0.01, 0.04]
   rpy_deg: [1.0, 2.0, 91.0]

@@ -13,6 +13,7 @@ from weldcal.tools.cli import (
     hand_eye,
     monitor,
     motion,
+    plan_motion,
     profiler,
     reproduce,
     robots,
@@ -24,7 +25,7 @@ from weldcal.tools.cli import (
 
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
 COMMANDS = (
-    *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, runs.weld, view.view),
+    *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, plan_motion.plan_motion, runs.weld, view.view),
     *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
@@ -33,7 +34,7 @@ COMMANDS = (
     *motion.COMMANDS,
     *(tablet.serve, tablet.calibrate, runs.tablet_demo),
     *(hand_eye.ax_xb, hand_eye.ax_yb, hand_eye.axb_ycz, runs.hand_eye_live),
-    *(profiler.edge, profiler.sphere, profiler.compensate, profiler.seam, runs.profiler_live),
+    *(profiler.edge, profiler.sphere, profiler.compensate, profiler.seam, profiler.clock, runs.profiler_live),
 )
 GROUPS = {
     "benchmark": "Measure speed and accuracy.",

@@ -60,7 +60,7 @@ def calibrate(
             moving = calibrate_motion(
                 dataset, folder, robot=robot, flange=flange, seed=call.seed, progress=call.progress, centres=centres
             )
-            return Outcome(moving.summary(), rows=pose_rows(moving.result.X_BC))
+            return Outcome(moving.summary(), rows=pose_rows(moving.result.X_BC, moving.result.symbol))
         from weldcal.tools.commands.calibrate import calibrate_dataset
 
         report = calibrate_dataset(

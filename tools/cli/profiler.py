@@ -137,6 +137,27 @@ def seam(
     return _outcome(_with(data, map_seam(data, calibration, folder)), folder)
 
 
+@command("profiler clock", short_help="Find a profiler's clock from a straight edge.")
+def clock(
+    call: Call,
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="stream.csv of the robot and profiles.csv (time,x,z).")
+    ],
+    calibration: Annotated[Path, option("--calibration", "RESULT", "Result folder of edge, sphere or compensate.")],
+    robot: Annotated[str, option("--arm", "NAME", "The arm of a stream of joint angles.")] = "",
+    unit: Annotated[str, option("--unit", "U", "m or mm, of the profiles and of the stream's positions.")] = "m",
+    feature: Annotated[
+        str, option("--feature", "KIND", "Where a time has many rows, the edge in them: bar, step or apex.")
+    ] = "bar",
+    side: Annotated[str, option("--side", "S", "End of the near face: left or right.")] = "left",
+) -> Outcome:
+    """Find the offset of a profiler's clock while the arm weaves across one straight edge: capture = stamp - offset."""
+    from weldcal.tools.commands.profiler.clock import find_clock
+
+    out = call.folder("profiler", folder.resolve().name)
+    return Outcome(find_clock(folder, calibration, out, robot=robot, unit=unit, feature=feature, side=side))
+
+
 def _sphere(
     call: Call,
     file: Path,

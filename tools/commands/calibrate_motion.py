@@ -14,6 +14,7 @@ from weldcal.calibration.motion.frames import see_frames
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
@@ -37,7 +38,8 @@ def calibrate_motion(
     progress: Progress | None = None,
     centres: bool = False,
 ) -> MotionReport:
-    """Calibrate from a recording in motion and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
+    """Calibrate from a recording in motion, of a scanner beside the robot that sees the flange or of one on the flange
+    (eye_in_hand) that sees a fixed target of the flange's shape, and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
     ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, with the capture time).
     A frame that cannot be used is refused and reported. No scanner correction is estimated: a stream through a few places cannot
@@ -52,7 +54,7 @@ def calibrate_motion(
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
     data = load_motion_dataset(Path(folder), robot=robot)
     standard = get_flange(flange or data.header.flange)
-    motion = ContinuousMotion(data.stream)
+    motion = ContinuousMotion(data.stream, inverted=data.in_hand)
     seen = see_frames(data, standard, motion, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.8 * fraction))
     frames = seen.observed
     tell("solving", 0.8)
@@ -66,7 +68,7 @@ def calibrate_motion(
     refused = [*seen.refused, *_reasons(frames, estimate)]
     warnings = [*data.warnings, *estimate.warnings]
     shown = data.stream.poses[:: max(1, len(data.stream.poses) // _MOST_TURNED)]
-    if turn_deg([RigidTransform(X) for X in shown]) < _TURN_DEG:
+    if not data.in_hand and turn_deg([RigidTransform(X) for X in shown]) < _TURN_DEG:
         warnings.append(
             "The orientation hardly changes, so the motion cannot show a TCP that is set at the robot: it would shift X_BC by its own "
             "length. Check that the TCP is zero, or tilt the flange on the way."
@@ -90,6 +92,8 @@ def calibrate_motion(
         software=software_version(),
         clock=estimate.clock,
         clock_covariance=estimate.joint,
+        configuration=data.header.configuration,
+        target=_target(estimate) if data.in_hand else None,
     )
     report = MotionReport(result, estimate, frames, tuple(refused), outliers, time.monotonic() - started, Path(out))
     tell("writing the report", 0.95)
@@ -102,6 +106,13 @@ def calibrate_motion(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+def _target(estimate: MotionEstimate) -> tuple[Array, Array]:
+    """Centre (3,) m and normal (3,) in the base of the fixed target that was seen."""
+    X_BT = estimate.fit.X_FR
+    assert X_BT is not None
+    return np.asarray(X_BT.translation()), X_BT.rotation().matrix()[:, 2].copy()
 
 
 def _reasons(frames: ObservedFrames, estimate: MotionEstimate) -> list[tuple[str, str]]:

@@ -53,16 +53,15 @@ def monitor_recording(
     """
     started = time.monotonic()
     tell: Progress = progress or (lambda stage, fraction: None)
-    if not 0.0 < false_alarms_per_hour <= 3600.0:
-        raise InputError(
-            f"The rate of false alarms must be positive and at most 3600 per hour, not {false_alarms_per_hour:g}."
-        )
+    rate_checked(false_alarms_per_hour)
     if fused and body is None:
         raise InputError("A fused model is one of a link: name it with --body.")
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
     result = load_result(Path(calibration))
     data = load_motion_dataset(Path(folder), robot=read_header(Path(folder) / "dataset.yaml").robot or result.robot)
+    if data.in_hand:
+        raise InputError(f"'{folder}' is of a scanner on the flange; monitor watches one that stands beside the robot.")
     standard = get_flange(flange or data.header.flange or result.flange)
     motion = ContinuousMotion(data.stream)
     X_FR = data.X_FR
@@ -80,10 +79,12 @@ def monitor_recording(
     tell("testing for drift", 0.85)
     config = DriftConfig(false_alarms_per_hour=false_alarms_per_hour)
     watched = watch(result, frames, motion, X_FR=X_FR, dropped=refused, config=config)
-    watched = replace(watched, events=tuple(_told_apart(e, watched, data, result) for e in watched.events))
-    recalibrated = _recalibrated(result, watched, data, standard.designation, seed) if recalibrate else None
+    watched = replace(watched, events=tuple(told_apart(e, watched, data, result) for e in watched.events))
+    recalibrated = (
+        recalibrated_result(result, watched, data.hashes, standard.designation, seed) if recalibrate else None
+    )
     report = MonitorReport(
-        watched, result, recalibrated, _cause(watched), false_alarms_per_hour,
+        watched, result, recalibrated, causes(watched), false_alarms_per_hour,
         (*data.warnings, *_warnings(result, data, watched, len(refused), standard.designation)), time.monotonic() - started, Path(out),
     )  # fmt: skip
     tell("writing the report", 0.95)
@@ -97,10 +98,18 @@ def monitor_recording(
     return report
 
 
-def _recalibrated(
-    result: CalibrationResult, watched: Watched, data: MotionDataset, flange: str, seed: int
+def rate_checked(false_alarms_per_hour: float) -> None:
+    """Check the accepted rate. Raises InputError."""
+    if not 0.0 < false_alarms_per_hour <= 3600.0:
+        raise InputError(
+            f"The rate of false alarms must be positive and at most 3600 per hour, not {false_alarms_per_hour:g}."
+        )
+
+
+def recalibrated_result(
+    result: CalibrationResult, watched: Watched, hashes: dict[str, str], flange: str, seed: int
 ) -> CalibrationResult:
-    """The calibration as it is at the end of the recording, from all frames since the last change and the calibration before it."""
+    """The calibration as it is at the end of a watch, from all frames since the last change and the calibration before it."""
     held = 1e3 * np.linalg.norm(watched.after[~watched.gross & (watched.rows.times >= watched.since_s)], axis=1)
     errors = {"median": float(np.median(held)), "mean": float(held.mean()), "p95": float(np.percentile(held, 95.0))}
     return replace(
@@ -113,14 +122,14 @@ def _recalibrated(
         warnings=(*result.warnings, f"Recalibrated in motion from frames since {watched.since_s:.3f} s (robot clock)."),
         seed=seed,
         flange=flange,
-        data_hashes=data.hashes,
+        data_hashes=hashes,
         joint_covariance=None,
         clock_covariance=None,
         software=software_version(),
     )
 
 
-def _told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
+def told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: CalibrationResult) -> DriftEvent:
     """The event with its cause, where what stands still in the scans before and after it tells."""
     if e.kind != MOVED or e.since_start:
         return e
@@ -141,7 +150,7 @@ def _told_apart(e: DriftEvent, watched: Watched, data: MotionDataset, result: Ca
     return e if found is None or found.cause is None else replace(e, cause=found.cause)
 
 
-def _cause(watched: Watched) -> str:
+def causes(watched: Watched) -> str:
     """What the data tell of the cause, over all events."""
     return "; ".join(dict.fromkeys(e.cause for e in watched.events))
 

@@ -13,7 +13,6 @@ from weldcal.systems.addresses import controller_address, is_loopback, loopback_
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.pacing import draw_in_this_thread
 from weldcal.systems.scenario.schema import Scenario
@@ -76,15 +75,11 @@ def chosen_robot(
             )
         pace = 1.0 if pace is None else pace
         _check_pace(pace)
-        if not dry_run:
-            require_ur_rtde()
         yield _at(host, f"the controller at {host}", scenario, dry_run=dry_run, pace=pace)
         return
     wanted = loopback_address(address) if address else None
     pace = EMULATED_PACE if pace is None else pace
     _check_pace(pace)
-    if not dry_run:
-        require_ur_rtde()
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
     with emulator_process(

@@ -11,6 +11,7 @@ from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.runner import Run
 from weldcal.tools.outcomes.calibration import error_summary
+from weldcal.tools.outcomes.monitor import drift_document
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
 
@@ -50,15 +51,23 @@ class DemoResult:
         """Number of scans of the feature, verification included."""
         return self.status.sequence
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the job warned of and did not hold for."""
+        sequencer = self.run.cell.job.sequencer
+        return sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings
+
     def summary(self) -> dict[str, object]:
         """The JSON object of `demo` and `weld`."""
         found: dict[str, object] = {"state": self.state, "scenario": self.options.scenario, "seed": self.options.seed}
         found["robot"] = self.robot
         if self.run.reason:
             found["reason"] = self.run.reason
-        sequencer = self.run.cell.job.sequencer
-        if warnings := sequencer.job_state(sequencer.GetMyContextFromRoot(self.run.root)).warnings:
-            found["warnings"] = list(warnings)
+        if self.warnings:
+            found["warnings"] = list(self.warnings)
+        if (watched := self.run.cell.job.drift(self.run.root)) is not None:
+            found["drift_frames"] = watched.frames
+            found["drift"] = [drift_document(e) for e in watched.events]
         if self.calibration is not None:
             found["X_BC_error_mm"] = 1e3 * self.calibration.translation_m
             found["X_BC_error_deg"] = float(np.degrees(self.calibration.rotation_rad))
@@ -104,7 +113,7 @@ class DemoResult:
                 "scanner_correction": None,
                 "tilt_deg": live_errors(np.degrees(estimate.held_out.tilt_rad)),
                 "outliers": [id for id, used in zip(ids, estimate.inliers, strict=True) if not used],
-                "warnings": list(estimate.warnings),
+                "warnings": [*self.warnings, *estimate.warnings],
                 "unobservable": list(estimate.unobservable),
             }
         advice = next_scan(self.status, self.run.cell.job.poses, work_point(self.run.cell.scenario))

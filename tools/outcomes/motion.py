@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, matrix4
+from weldcal.calibration.data.results import CalibrationResult, matrix4, target_document
 from weldcal.calibration.motion.estimate import MotionEstimate
 from weldcal.calibration.motion.observed import ObservedFrames
 
@@ -49,7 +49,9 @@ class MotionReport:
             "mode": "motion",
             "n_used": int(e.inliers.sum()),
             "refused": [{"id": i, "reason": t} for i, t in self.refused],
-            "X_BC": matrix4(r.X_BC),
+            "configuration": r.configuration,
+            r.symbol: matrix4(r.X_BC),
+            **({} if r.target is None else {"target": target_document(r.target)}),
             "covariance": r.covariance.tolist(),
             "clock_offset_ms": _ms(clock.offset_s),
             "clock_offset_sigma_ms": _ms(clock.sigma_s),

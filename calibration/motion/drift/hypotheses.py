@@ -20,6 +20,7 @@ _STEPS, _RAMPS = 64, 12  # hypotheses kept of each kind
 _EVERY = {STEP: 2, RAMP: 40}  # frames between new ones
 _INFLUENCE = 25.0  # of chi-square with 5: a frame farther off counts as that far
 _NEW = 0.05  # unexplained share of the field's variance at a pose that the features do not reach
+_NOVEL_OVER = 80.0  # frames over which those at new poses are counted
 _HOURS = 3600.0
 
 
@@ -73,7 +74,7 @@ class DriftFilter:
         self.start, self.start_time = np.full(k, -1), np.full(k, np.inf)
         self.kind = np.repeat([STEP, RAMP], [_STEPS, _RAMPS])
         self._since = self.count
-        self.novel = 0
+        self.novel = 0.0
         self.favourite: tuple[int, Array] | None = None
 
     @property
@@ -169,7 +170,7 @@ class DriftFilter:
 
     def _rows(self, H: Array, p_C: Array, n_C: Array) -> tuple[Array, float]:
         phi, unexplained = self._field.features(p_C, n_C)
-        self.novel += unexplained > _NEW
+        self.novel += float(unexplained > _NEW) - self.novel / _NOVEL_OVER
         n = SIZE + _ROWS * len(phi)
         if n > self._n:
             new = np.arange(self._n, n)

@@ -21,7 +21,7 @@ class FieldConfig:
     length_m: float = 0.15
     length_rad: float = 0.5
     novelty: float = 0.01
-    largest: int = 80
+    largest: int = 120
 
 
 class PoseField:

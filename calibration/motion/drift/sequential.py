@@ -32,7 +32,7 @@ class DriftConfig:
     averages away; ``stated_m`` and ``stated_rad`` the same of a calibration's own covariance, which counts for a change that is
     as old as the first frame; it is tested for ``stated_s``. Changes older than ``longest_s`` are not tested. An alarm waits
     ``confirm_s`` before it says how far the scanner moved, and up to ``slow_s`` where a warm-up explains a slow change as well.
-    After ``novel_frames`` frames at poses that the field's features do not reach, the field is learnt anew.
+    Where ``novel_frames`` of the last 80 or so are at poses that the field's features do not reach, the field is learnt anew.
     """
 
     false_alarms_per_hour: float = 1e-3
@@ -100,12 +100,18 @@ class DriftTest:
         self._last_s = 0.0
         self.events: list[DriftEvent] = []
         tests = 3600.0 * frame_rate_hz * len(self.filter.kind)
-        level = min(self.config.false_alarms_per_hour / tests / 3.0, 0.3)
-        self.threshold, self._threshold_3 = float(chi2.isf(level, 6)), float(chi2.isf(level, 3))
+        level = min(self.config.false_alarms_per_hour / tests / 4.0, 0.3)
+        # of a move with six unknowns, and of a pure translation or rotation
+        self.threshold, self.threshold_alone = float(chi2.isf(level, 6)), float(chi2.isf(level, 3))
         turned = np.vstack(
             [np.eye(3), -skew(self._lever)]
         )  # about the scanner's origin: it moves the pivot by rotation x lever
         self._simple = (np.vstack([np.zeros((3, 3)), np.eye(3)]), turned)
+        # a turn about the line of sight shifts the feature least of all: alone, it has one unknown
+        about_view = turned @ (self._lever / max(float(np.linalg.norm(self._lever)), 1e-9))[:, None]
+        self._alone = tuple(
+            (E, self.threshold / float(chi2.isf(level, E.shape[1]))) for E in (*self._simple, about_view)
+        )
 
     @property
     def alarmed(self) -> bool:
@@ -200,11 +206,11 @@ class DriftTest:
         W = np.linalg.inv(S)
         Wa = np.einsum("kij,kj->ki", W, a)
         T = np.einsum("ki,ki->k", a, Wa)
-        for E in self._simple:  # a pure translation or rotation has three unknowns, and so a lower threshold
+        for E, share in self._alone:  # a pure translation or rotation has fewer unknowns, and so a lower threshold
             z = Wa @ E
             N = np.einsum("ia,kij,jb->kab", E, W, E)
-            T3 = np.einsum("ka,ka->k", z, np.linalg.solve(N, z[:, :, None])[:, :, 0])
-            T = np.maximum(T, T3 * (self.threshold / self._threshold_3))
+            fewer = np.einsum("ka,ka->k", z, np.linalg.solve(N, z[:, :, None])[:, :, 0])
+            T = np.maximum(T, fewer * share)
         least = np.where(f.kind == RAMP, c.creep_frames, c.least_frames)
         return np.where(f.used & (f.frames >= least), T, 0.0), theta, C, left
 

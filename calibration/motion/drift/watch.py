@@ -94,11 +94,11 @@ def watch(
 
 
 def drift_config(
-    result: CalibrationResult, clock_sigma_s: float | None, config: DriftConfig | None = None
+    sigma_position_m: float, clock_sigma_s: float | None, config: DriftConfig | None = None
 ) -> DriftConfig:
     """The test's settings for a calibration: its spread of scanner and arm is that of the field, where it states a larger one."""
     config = config or DriftConfig()
-    spread = float(np.clip(1e-3 * result.sigma_position_mm, config.filter.field.sigma_m, _MOST_SPREAD_M))
+    spread = float(np.clip(sigma_position_m, config.filter.field.sigma_m, _MOST_SPREAD_M))
     clock = max(_CLOCK_S, 3.0 * (clock_sigma_s if clock_sigma_s is not None else 10.0 * _CLOCK_S))
     known: FilterConfig = replace(config.filter, clock_s=clock, field=replace(config.filter.field, sigma_m=spread))
     return replace(config, filter=known)
@@ -129,7 +129,7 @@ def _tested(
         result.X_BC,
         result.covariance,
         pivot,
-        drift_config(result, clock.sigma_s, config),
+        drift_config(1e-3 * result.sigma_position_mm, clock.sigma_s, config),
         noise,
         1.0 / max(interval, 1e-3),
     )

@@ -337,7 +337,6 @@ class Acquisition(Generic[Datum]):
         pushed = self._frames[: max(len(self._frames) - self._kept + 1, 0)]
         dropped = sum(f.number > self._read for f in pushed)
         c = seen.counts
-        seen.counts = replace(c, received=c.received + 1, lost=c.lost + gap, dropped=c.dropped + dropped)
         if self.rules.frozen_s is not None:
             found = _print_of(d.datum)
             seen.same_since = (seen.same_since or seen.good_at) if found == self._print else None
@@ -348,6 +347,7 @@ class Acquisition(Generic[Datum]):
         seen.trouble = ""
         seen.good_at, self._excused = d.arrived, 0.0
         self._frames = (*self._frames[len(pushed) :], frame)
+        seen.counts = replace(c, received=c.received + 1, lost=c.lost + gap, dropped=c.dropped + dropped)
         self._tell()
 
     def _stamp(self, d: Delivery[Datum]) -> Stamp:

@@ -1,4 +1,4 @@
-"""A separate scene graph for a camera; its poses are updated only when a picture is taken."""
+"""A separate scene graph for a camera, and a stand that is knocked; its poses are updated only when a picture is taken."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +14,7 @@ from pydrake.geometry import (
     Role,
     SceneGraph,
 )
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
@@ -106,3 +107,39 @@ def add_picture_scene(
     builder.Connect(plant.get_body_poses_output_port(), poses.GetInputPort("body_poses"))
     builder.Connect(poses.GetOutputPort("frame_poses"), scene.get_source_pose_port(source))
     return PictureScene(scene, renderer, frames, poses)
+
+
+class KnockedStand(LeafSystem):
+    """Computes the pose of a camera's stand, which jumps once.
+
+    .. pydrake_system::
+
+        name: KnockedStand
+        output_ports:
+        - frame_poses
+
+    The stand's frame is the base until ``time_s`` and displaced by ``displacement`` in the base from then on.
+    """
+
+    def __init__(self, frame: FrameId, time_s: float, displacement: RigidTransform) -> None:
+        super().__init__()
+        self._frame, self._time_s, self._displacement = frame, time_s, displacement
+        self.DeclareAbstractOutputPort(
+            "frame_poses", lambda: AbstractValue.Make(FramePoseVector()), self._calculate, {self.time_ticket()}
+        )
+
+    def _calculate(self, context: Context, output: Any) -> None:
+        found = FramePoseVector()
+        found.set_value(self._frame, self._displacement if context.get_time() >= self._time_s else RigidTransform())
+        output.set_value(found)
+
+
+def add_stand(builder: DiagramBuilder, scene: PictureScene, time_s: float, displacement: RigidTransform) -> FrameId:
+    """Add a stand at the base's frame that jumps by ``displacement`` at ``time_s``; returns its frame in the camera's scene."""
+    graph = scene.scene_graph
+    source = graph.RegisterSource("stand")
+    frame = graph.RegisterFrame(source, GeometryFrame("stand"))
+    stand = builder.AddSystem(KnockedStand(frame, time_s, displacement))
+    stand.set_name("knocked_stand")
+    builder.Connect(stand.GetOutputPort("frame_poses"), graph.get_source_pose_port(source))
+    return frame

@@ -24,9 +24,11 @@ from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, LeafSystem, State
 from pydrake.systems.sensors import CameraInfo, ImageDepth32F, ImageRgba8U, RgbdSensor
 
+from weldcal.calibration.geometry.se3 import exp_rotation
 from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, drake_intrinsics, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
+from weldcal.systems.drivers.simulated.picture_scene import add_stand
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Message, Scan
@@ -54,6 +56,17 @@ class RenderedScanner(ScannerConfig):
     warp_mm: float = 0.0
     # base, or flange, or a link of the arm: shoulder ... wrist_2; the nominal pose is then in its frame
     mounted_on: str = "base"
+    # the stand is knocked at knock_s (null: never): the scanner then stands this far from its true pose, turned about its own
+    # origin by this rotation vector, both along the axes of the base
+    knock_s: float | None = None
+    knock_mm: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
+    knock_deg: list[float] = dc.field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def knock(self, X_BC: RigidTransform) -> RigidTransform:
+        """The displacement in the base of a scanner at ``X_BC`` when its stand is knocked."""
+        R = RotationMatrix(exp_rotation(np.deg2rad(self.knock_deg)))
+        p = X_BC.translation()
+        return RigidTransform(R, p + 1e-3 * np.array(self.knock_mm) - R @ p)
 
     def scanner(self) -> ScannerPreset:
         """The scanner with the configured resolution and field of view; the pixels' aspect ratio is unchanged."""
@@ -109,7 +122,7 @@ class DepthSensor(LeafSystem):
         output_ports:
         - scan
 
-    `trigger` (1) is the sequence number of the newest requested scan. When it increases, the depth image is rendered and the
+    `trigger` (1) is the sequence number of the newest requested scan (open: none). When it increases, the depth image is rendered and the
     scanner's noise is added from the seed and the sequence number. The cloud appears on `scan` after the exposure.
     """
 
@@ -136,7 +149,7 @@ class DepthSensor(LeafSystem):
         now = context.get_time()
         if pending.sequence > shown.sequence and now >= pending.capture_time + self._exposure_s - 1e-9:
             state.get_mutable_abstract_state(self._shown).set_value(pending)
-        wanted = int(self._trigger.Eval(context)[0])
+        wanted = int(self._trigger.Eval(context)[0]) if self._trigger.HasValue(context) else 0
         if wanted > pending.sequence:
             depth = np.array(self._depth.Eval(context).data[:, :, 0])
             rng = np.random.default_rng([self._seed, wanted])
@@ -220,6 +233,10 @@ def mount_scanner(config: RenderedScanner, build: StationBuild) -> MountedScanne
     camera = DepthRenderCamera(core, DepthRange(preset.near_m, preset.far_m))
     colour = ColorRenderCamera(core, False)
     parent = view.scene_graph.world_frame_id() if carrier is None else view.frames[carrier.index()]
+    if config.knock_s is not None:
+        if carrier is not None:
+            raise InputError("scanner.knock_s is for a scanner on a stand: write mounted_on: base, or leave it out.")
+        parent = add_stand(build.builder, view, config.knock_s, config.knock(X_BC))
     sensor = build.builder.AddSystem(RgbdSensor(parent, X_BC, colour, camera))
     sensor.set_name("scanner_depth")
     build.builder.Connect(view.scene_graph.get_query_output_port(), sensor.query_object_input_port())

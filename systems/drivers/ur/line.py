@@ -82,6 +82,10 @@ class Line:
             while self._socket.recv(65536):
                 pass
 
+    def release(self) -> tuple[socket.socket, bytearray]:
+        """The connection and what has arrived of it, for a caller that reads without waiting."""
+        return self._socket, self._inbox
+
     def nonsense(self) -> RobotUnreachable:
         """The exception for data that do not follow the protocol."""
         return RobotUnreachable(

@@ -1,29 +1,35 @@
-"""The worker's interface to the robot through ur_rtde: connect, upload the guard, read samples, send numbered velocities."""
+"""The worker's interface to the robot: connect, upload the guard, read samples, send numbered velocities."""
 
 import contextlib
-import os
-import socket
-import stat
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.clock import ClockMap
+from weldcal.systems.drivers.ur.dashboard import SCRIPT_PORT
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
+from weldcal.systems.drivers.ur.line import Line
 from weldcal.systems.drivers.ur.off_switch import OffSwitch
+from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, UPPER_OFFSET, register_names
+from weldcal.systems.drivers.ur.rtde_stream import RtdeStream
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
 
-RTDE_PORT = 30004
+# of the guard: commands in the integer register, with at most eight numbers; what it answers
+NO_COMMAND, VELOCITY, SPEED_STOP, SET_PAYLOAD, STOP_SCRIPT = 0, 9, 15, 17, 255
+READY, DONE = 1, 2
+OUTPUTS = "actual_digital_output_bits"
+INPUTS = "actual_digital_input_bits"
+LINE_LIMIT_S = 2.0
+FIRST_LIMIT_S = 2.0
+ANSWER_LIMIT_S = 2.0
 START_LIMIT_S = 8.0
 EXCUSED_S = 0.5
 ONLY_WITH_OUTPUT = "# only with an output"
@@ -86,31 +92,8 @@ def guard_script(upper_registers: bool, output: int | None = None) -> str:
     return changed.replace("input_int_register_24", "input_int_register_0")
 
 
-def _sockets_to(port: int) -> dict[int, int]:
-    """File descriptors of this process's connections to a port, each with its inode."""
-    found = {}
-    for name in os.listdir("/proc/self/fd"):
-        with contextlib.suppress(OSError):
-            descriptor = int(name)
-            status = os.fstat(descriptor)
-            if stat.S_ISSOCK(status.st_mode):
-                with socket.socket(fileno=os.dup(descriptor)) as copy:
-                    if copy.getpeername()[1:2] == (port,):
-                        found[descriptor] = status.st_ino
-    return found
-
-
-def _send_at_once(descriptors: Iterable[int]) -> None:
-    """Send every package when it is written. ur_rtde leaves Nagle's algorithm on: where the controller's packages are lost, and
-    with them its acknowledgements, commands would wait for up to 40 ms.
-    """
-    for descriptor in descriptors:
-        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as copy:
-            copy.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-
 class Robot:
-    """Both ur_rtde interfaces, the clock map and the newest complete package."""
+    """The stream to and from the controller, the clock map and the newest complete package."""
 
     def __init__(
         self,
@@ -122,38 +105,24 @@ class Robot:
         output: int | None = None,
         arc_inputs: ArcInputs | None = None,
     ) -> None:
-        # Here and not above: the guard's text can be read where ur_rtde is not installed.
-        from rtde_control import RTDEControlInterface
-        from rtde_receive import RTDEReceiveInterface
-
         self._host = host
-        self._word = 36 if upper else 12
+        base = UPPER_OFFSET if upper else 0
+        self._output, self._arm, self._pace = output, arm, pace
         self._script = guard_script(upper, output)
-        self._output = output
         self._arc_inputs = arc_inputs or ArcInputs()
-        self._arm = arm
-        self._pace = pace
         self.clock = ClockMap(pace)
-        kind = RTDEControlInterface
-        flags = kind.FLAG_CUSTOM_SCRIPT | kind.FLAG_NO_WAIT | kind.FLAG_NO_EXT_FT
-        flags |= kind.FLAG_UPPER_RANGE_REGISTERS if upper else 0
-        names = [
-            *ALWAYS,
-            "actual_TCP_pose",
-            f"output_int_register_{self._word}",
-            # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
-            *(f"output_double_register_{self._word + i}" for i in range(3)),
-            *(() if output is None else ("actual_digital_output_bits",)),
-            *(("actual_digital_input_bits",) if self._arc_inputs.wired else ()),
-        ]
+        self._answer, self._latch = f"output_int_register_{base}", f"output_int_register_{base + 12}"
+        # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
+        self._told = tuple(f"output_double_register_{base + 12 + i}" for i in range(3))
+        names = [*ALWAYS, "actual_TCP_pose", self._answer, self._latch, *self._told]
+        names += [] if output is None else [OUTPUTS]
+        names += [INPUTS] if self._arc_inputs.wired else []
         try:
-            self.receive = RTDEReceiveInterface(host, -1.0, names, False, upper)
-            self.control = RTDEControlInterface(host, -1.0, flags)
-        except (RuntimeError, ValueError) as error:
+            self._stream = RtdeStream(host, names, register_names(base))
+            self._stream.first(FIRST_LIMIT_S)
+        except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
-        self._sockets = _sockets_to(RTDE_PORT)
-        _send_at_once(self._sockets)
         self._switch = None if output is None else self._off_switch(host, output)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._excused = 0.0
@@ -172,42 +141,63 @@ class Robot:
 
     def start_guard(self) -> None:
         """Clear the command register, upload the guard and wait until it is active."""
-        with tempfile.NamedTemporaryFile("w", suffix=".script", delete=False) as file:
-            file.write(self._script)
-        try:
-            # a call while nothing runs fails, but it writes zero into the command register
-            self.control.kickWatchdog()
-            self.control.setCustomScriptFile(file.name)
-            until = time.monotonic() + START_LIMIT_S / self._pace
+        self.forget()
+        until = time.monotonic() + START_LIMIT_S / self._pace
+        with Line(self._host, SCRIPT_PORT, "Script", LINE_LIMIT_S) as line:
+            line.send(self._script.encode())
+            # the connection stays open until the program runs: to close one with unread data would reset it
             while time.monotonic() < until:
-                state, guard = self.receive.getRuntimeState(), self.receive.getOutputIntRegister(self._word)
-                if guard == STALE_REGISTER:
+                self._stream.wait(0.01)
+                line.drain()
+                if self._stream.number(self._latch) == STALE_REGISTER:
                     raise Refused(Fault.GUARD_REFUSED)
-                if state == PLAYING and guard == 1 and self.control.isProgramRunning():
+                if (
+                    self._playing
+                    and self._stream.number(self._latch) == 1
+                    and self._stream.number(self._answer) == READY
+                ):
                     return
-                time.sleep(0.01)
-            raise Refused(Fault.UPLOAD_REFUSED)
-        finally:
-            Path(file.name).unlink(missing_ok=True)
+        raise Refused(Fault.UPLOAD_REFUSED)
 
     def set_load(self, mass_kg: float, cog_m: list[float]) -> None:
         """Set the payload, then read it back, and the TCP, which the guard has set to zero."""
-        if not self.control.setPayload(mass_kg, cog_m):
+        if not self._once(SET_PAYLOAD, mass_kg, *cog_m):
             raise Refused(Fault.START_FAILED)
         found: dict[str, Value] = {}
         reader = threading.Thread(target=self._read_back, args=(found, mass_kg, cog_m), daemon=True)
         reader.start()
         while reader.is_alive():
-            self.control.kickWatchdog()
+            self.forget()
+            self._stream.poll()
             reader.join(0.01)
         if np.abs(np.array(found.get("tcp_offset", np.inf))).max() > 1e-6:
             raise Refused(Fault.TCP_NOT_ZERO)
         if not same_payload(found, mass_kg, cog_m):
             raise Refused(Fault.PAYLOAD_NOT_SET)
 
+    def _once(self, command: int, *arguments: float) -> bool:
+        """Give a command that the guard answers once; returns whether it did."""
+        until = time.monotonic() + ANSWER_LIMIT_S / self._pace
+        while self._stream.connected and self._playing and time.monotonic() < until:
+            self._write(command, *arguments)
+            self._stream.wait(0.01)
+            if self._stream.number(self._answer) == DONE:
+                break
+        else:
+            return False
+        while self._stream.connected and self._playing and time.monotonic() < until:
+            self.forget()
+            self._stream.wait(0.01)
+            if self._stream.number(self._answer) == READY:
+                return True
+        return False
+
+    def _write(self, command: int, *arguments: float) -> None:
+        self._stream.send(command, *arguments, *[0.0] * (DOUBLES - len(arguments)))
+
     def _read_back(self, found: dict[str, Value], mass_kg: float, cog_m: list[float]) -> None:
         """Read until the payload is the one that was set, in a thread: the connection's end may take longer than the guard
-        waits for a package. ur_rtde cannot read the TCP, and not all of its getters wait for their answer.
+        waits for a package.
         """
         until = time.monotonic() + READ_BACK_LIMIT_S / self._pace
         with contextlib.suppress(RobotUnreachable), RtdeProbe(self._host) as probe:
@@ -219,16 +209,12 @@ class Robot:
 
     def sample(self, now: float) -> RobotSample:
         """The newest sample, all fields of one package."""
-        receive, word = self.receive, self._word
-        for _ in range(5):
-            robot_time = float(receive.getTimestamp())
-            q, qd = np.array(receive.getActualQ()), np.array(receive.getActualQd())
-            pose = receive.getActualTCPPose()
-            echo, lost_s, passes = (float(receive.getOutputDoubleRegister(word + i)) for i in range(3))
-            process_on = None if self._output is None else self.process_on
-            inputs = int(receive.getActualDigitalInputBits()) if self._arc_inputs.wired else 0
-            if robot_time == receive.getTimestamp():
-                break
+        stream = self._stream
+        stream.poll()
+        robot_time = stream.number("timestamp")
+        echo, lost_s, passes = (stream.number(name) for name in self._told)
+        inputs = int(stream.number(INPUTS)) if self._arc_inputs.wired else 0
+        q = np.array(stream.vector("actual_q"))
         if robot_time != self._robot_time:
             self._robot_time, self._fresh_at, self._excused = robot_time, now, 0.0
             self.clock.update(robot_time, now)
@@ -239,19 +225,23 @@ class Robot:
             robot_time,
             self._fresh_at,
             q,
-            qd,
-            int(receive.getRobotMode()),
-            int(receive.getSafetyMode()),
-            int(receive.getRuntimeState()),
+            np.array(stream.vector("actual_qd")),
+            int(stream.number("robot_mode")),
+            int(stream.number("safety_mode")),
+            int(stream.number("runtime_state")),
             # the slider is in the second one; the first is the limiter's
-            float(receive.getSpeedScaling()) * float(receive.getTargetSpeedFraction()),
-            int(receive.getOutputIntRegister(word)),
-            self._connected(),
-            float(np.linalg.norm(kinematics_and_jacobian(self._arm, q)[1] - np.array(pose[:3]))),
+            stream.number("speed_scaling") * stream.number("target_speed_fraction"),
+            int(stream.number(self._latch)),
+            stream.connected,
+            float(
+                np.linalg.norm(
+                    kinematics_and_jacobian(self._arm, q)[1] - np.array(stream.vector("actual_TCP_pose")[:3])
+                )
+            ),
             now - self._first_unheard if self._sent else 0.0,
             lost_s,
             robot_time - self._passed_at,
-            process_on,
+            None if self._output is None else self.process_on,
             echo < 0.0,
             self._arc_inputs.arc(inputs),
             self._arc_inputs.fault(inputs),
@@ -264,14 +254,9 @@ class Robot:
         self._fresh_at += seconds
         self._first_unheard += seconds
 
-    def _connected(self) -> bool:
-        """Whether both connections are still those of the start; ur_rtde reconnects by itself and then reports no error."""
-        if not (self.receive.isConnected() and self.control.isConnected()):
-            return False
-        try:
-            return all(os.fstat(descriptor).st_ino == inode for descriptor, inode in self._sockets.items())
-        except OSError:
-            return False
+    @property
+    def _playing(self) -> bool:
+        return self._stream.number("runtime_state") == PLAYING
 
     def _listen(self, echo: float, now: float) -> None:
         if echo in self._sent:
@@ -288,7 +273,11 @@ class Robot:
         if not self._sent:
             self._first_unheard = now
         self._sent[self._number] = now
-        return bool(self.control.speedJ(qd.tolist(), acceleration, self._number))
+        if not self._playing:
+            self.forget()
+            return False
+        self._write(VELOCITY, *qd.tolist(), acceleration, self._number)
+        return True
 
     def torch_off(self) -> None:
         """Turn the process output off without the guard, which may have stopped."""
@@ -298,20 +287,19 @@ class Robot:
     @property
     def process_on(self) -> bool:
         """The state of the process output as reported by the controller."""
-        return self._output is not None and bool(self.receive.getActualDigitalOutputBits() >> self._output & 1)
+        return self._output is not None and bool(int(self._stream.number(OUTPUTS)) >> self._output & 1)
 
     @property
     def numbers(self) -> tuple[float, float, float]:
         """Number of the newest command sent, its time, and the newest number that the guard has read."""
         sent_at = self._sent.get(self._number, 0.0)
-        return abs(self._number), sent_at, abs(float(self.receive.getOutputDoubleRegister(self._word)))
+        return abs(self._number), sent_at, abs(self._stream.number(self._told[0]))
 
     def forget(self) -> None:
-        """Clear the command register: a call while the program does not run writes zero."""
-        self.control.kickWatchdog()
+        """Clear the command register."""
+        self._write(NO_COMMAND)
 
     def end_program(self) -> None:
         """End the guard script while the arm is at rest."""
-        if self.control.isProgramRunning():
-            self.control.speedStop(5.0)
-            self.control.stopScript()
+        if self._playing and self._once(SPEED_STOP, 5.0):
+            self._write(STOP_SCRIPT)

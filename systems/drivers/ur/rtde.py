@@ -17,7 +17,6 @@ from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur.readiness.releases import require_ur_rtde
 from weldcal.systems.drivers.ur.supervisor import FOLLOWING_PATIENCE_S, Limits
 from weldcal.systems.wall_clock import WallClock
 
@@ -40,7 +39,7 @@ class UrRtde(DriverConfig):
         False  # only for an emulator in lockstep: the cell's time waits for it too, as for a world of its own
     )
     velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
-    upper_registers: bool | None = None  # 24 to 47 (fieldbuses use the lower ones); null: where ur_rtde supports it
+    upper_registers: bool | None = None  # from 24 on (fieldbuses use those from 0 on); null: true
     payload_kg: float = 1.4  # of the welding tool
     payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
     process_output: int | None = None  # standard digital output (0 to 7) that switches the torch; null: none is wired
@@ -165,7 +164,6 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         InputError: the scenario names no host, or a pace other than 1 or lockstep for a real robot.
         RobotRefused, RobotUnreachable: the message gives the operator action.
     """
-    require_ur_rtde()
     if not config.host:
         raise InputError("Write the robot's address in the scenario: robot: !UrRtde {host: 192.168.1.10}.")
     if config.pace != FULL_PACE and not is_loopback(controller_address(config.host)):

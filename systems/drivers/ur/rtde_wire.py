@@ -1,11 +1,11 @@
 """A small RTDE client: reads selected outputs once, checks whether inputs are free, and writes claimed inputs.
 
-Packages of protocol version 2 are big endian: uint16 size (header included), uint8 type, payload. The driver's stream
-uses ur_rtde; this client is needed because ur_rtde cannot read `tcp_offset` and cannot release claimed registers.
+Packages of protocol version 2 are big endian: uint16 size (header included), uint8 type, payload.
 """
 
 from __future__ import annotations
 
+import socket
 import struct
 from collections.abc import Sequence
 from types import TracebackType
@@ -20,7 +20,7 @@ PROTOCOL_VERSION = 2
 MAX_NAMES_BYTES = 2048
 
 _PROTOCOL, _VERSION, _DATA, _OUTPUTS, _INPUTS, _START, _PAUSE = (ord(letter) for letter in "VvUOISP")
-_CODES = {
+CODES = {
     "DOUBLE": "d",
     "INT32": "i",
     "UINT32": "I",
@@ -76,21 +76,21 @@ class RtdeProbe:
             return {}
         if len(wanted) < len(names):
             types = self._set_outputs(wanted)
-        if not set(types) <= set(_CODES):
+        if not set(types) <= set(CODES):
             raise self._line.nonsense()
         (started,) = self._unpack(">?", self._request(_START, b""))
         if not started:
             raise self._line.nonsense()
         payload = self._next(_DATA)
         self._request(_PAUSE, b"")
-        layout = struct.Struct(">B" + "".join(_CODES[kind] for kind in types))
+        layout = struct.Struct(">B" + "".join(CODES[kind] for kind in types))
         if len(payload) != layout.size:
             raise self._line.nonsense()
         numbers = layout.unpack(payload)[1:]
         values: dict[str, Value] = {}
         at = 0
         for name, kind in zip(wanted, types, strict=True):
-            width = int(_CODES[kind][0]) if kind.startswith("VECTOR") else 0
+            width = int(CODES[kind][0]) if kind.startswith("VECTOR") else 0
             values[name] = numbers[at : at + width] if width else numbers[at]
             at += width or 1
         return values
@@ -105,6 +105,22 @@ class RtdeProbe:
             types = self._types(self._request(_INPUTS, ",".join(group).encode()), len(group))
             answer |= dict(zip(group, types, strict=True))
         return answer
+
+    def claim_recipe(self, names: Sequence[str]) -> tuple[int, list[str]]:
+        """Claim these inputs as one recipe; returns its number and the type of each, or IN_USE or NOT_FOUND."""
+        payload = self._request(_INPUTS, ",".join(names).encode())
+        return payload[0], self._types(payload, len(names))
+
+    def subscribe(self, names: Sequence[str], frequency_hz: float) -> list[str]:
+        """Choose the outputs of the stream; returns the type of each, or NOT_FOUND."""
+        return self._set_outputs(names, frequency_hz)
+
+    def start(self) -> tuple[socket.socket, bytearray]:
+        """Start the stream; returns the connection, which stays this client's, and what has arrived of it."""
+        (started,) = self._unpack(">?", self._request(_START, b""))
+        if not started:
+            raise self._line.nonsense()
+        return self._line.release()
 
     def grant(self, names: Sequence[str]) -> int | None:
         """Claim these inputs for `write`, and start; returns the recipe's number, or None where one of them is not free."""

@@ -1,7 +1,6 @@
 """The worker process: reads the robot, calls the supervisor, sends commands, and exits when the link fails.
 
-Only this process uses ur_rtde, whose constructors hold the GIL, whose getters do not report stale data, whose send
-reconnects by itself, and which may crash. The cell is isolated from it: it shares only memory with this process.
+The cell may compute for longer than a tick, or end: this process still supervises the arm. The two share only memory.
 """
 
 from __future__ import annotations
@@ -14,19 +13,16 @@ import sys
 import time
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.precedence import poll_beside_the_cell, take_priority
+from weldcal.systems.drivers.ur.precedence import take_priority
+from weldcal.systems.drivers.ur.robot import ArcInputs, Refused, Robot
 from weldcal.systems.drivers.ur.shared import Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
 from weldcal.systems.drivers.ur.time_scale import TimeScale
-
-if TYPE_CHECKING:
-    from weldcal.systems.drivers.ur.robot import Robot
 
 ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the controller only follows
 LATE_PASS_S = 0.020
@@ -91,12 +87,9 @@ class Worker:
             self._worst = max(self._worst, now - last)
             self._late += now - last > period + LATE_PASS_S
             if now - last > LATE_PASS_S:
-                # this process was suspended: let the receiving thread read the pending data before the checks, and count
-                # only the time in which the data could have been read
-                time.sleep(0.003)
+                # this process was suspended: the time in which it could not read the data is not the robot's silence
                 robot.excuse(now - last)
                 self._supervisor.excuse()
-                now = time.monotonic()
             last, deadline = now, max(deadline + period, now)
             sample = robot.sample(now)
             command = self._scaled(self._command(), now, sample)
@@ -113,7 +106,6 @@ class Worker:
                 self._drive(now, robot, sample, command, decision)
             self._publish(now, robot, sample, decision)
             if (command.stop or command.orphaned) and self._phase is not Phase.OBEYING:
-                # the exit closes both connections at once; ur_rtde's disconnect takes half a second for each
                 self._phase = Phase.ENDED
                 self._publish(now, robot, sample, decision)
                 return 0
@@ -186,8 +178,6 @@ def main() -> None:
     memory = Memory(int(sys.argv[1]))
     config: WorkerConfig = pickle.load(sys.stdin.buffer)
     take_priority()
-    from weldcal.systems.drivers.ur.robot import ArcInputs, Refused, Robot
-
     worker = Worker(config, memory)
     try:
         robot = Robot(
@@ -200,11 +190,9 @@ def main() -> None:
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))
-        poll_beside_the_cell()  # not earlier: ur_rtde's start-up calls busy-wait for these threads
     except Refused as refused:
         worker.refuse(refused.fault)
         os._exit(1)
-    # skip ur_rtde's destructors: they would try to reconnect on a broken link
     os._exit(worker.run(robot))
 
 

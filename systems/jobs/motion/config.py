@@ -1,4 +1,4 @@
-"""Configuration of a calibration in motion: the cube that the flange moves through, and how many frames are wanted."""
+"""Configuration of a job in motion: the cube that the flange moves through, how many frames are wanted, and what for."""
 
 import dataclasses as dc
 
@@ -23,6 +23,8 @@ class MotionJob:
     queue: int = 2  # frames that wait for the fit
     record: bool = False  # write what streams as a recording in motion, to `recording` in the result folder
     recording_folder: str = ""  # set by the command
+    watch: str = ""  # a calibration that is watched for drift instead of calibrating; set by `weldcal monitor`
+    false_alarms_per_hour: float = 1e-3  # that are accepted of the drift test
 
 
 def check_motion(job: MotionJob) -> None:

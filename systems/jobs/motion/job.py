@@ -1,4 +1,4 @@
-"""The motion job: calibrates a streaming scanner and its clock while the flange moves through the corners of a cube."""
+"""The motion job: calibrates a streaming scanner and its clock, or watches a calibration, while the flange moves in a cube."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,12 +7,11 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import Context
 
-from weldcal.calibration.planning.clearance import arm_bodies
+from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import get_flange
 from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
@@ -22,12 +21,15 @@ from weldcal.systems.jobs.motion.messages import MotionCalibration, MotionRecord
 from weldcal.systems.jobs.motion.procedure import MotionProcedure
 from weldcal.systems.jobs.motion.recorder import MotionRecorder
 from weldcal.systems.jobs.weld.flange_estimator import FlangeEstimator
+from weldcal.systems.jobs.weld.settings import feature_on_flange, feature_standard
 from weldcal.systems.messages import CalibrationStatus, JobCommand
-from weldcal.systems.motion.clear_moves import clear_move
+from weldcal.systems.motion.clear_moves import clear_move, station_bodies
+from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
 from weldcal.systems.motion.spine import FIRST, JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
+from weldcal.systems.viewer.drift_view import DriftView
 from weldcal.systems.wiring import Wiring
 
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]], dtype=np.float64) - 0.5  # no four in a plane
@@ -37,21 +39,24 @@ _POLL_S = 0.004  # of the queue and the estimator: a twelfth of a frame
 
 @dataclass(frozen=True, eq=False)
 class MotionPlanned:
-    """Joint angles (6,) rad of the corners, and the scanner's timing as known from its data sheet."""
+    """Joint angles (6,) rad of the corners, the scanner's delay (s) as known from its data sheet, and what is watched, if anything."""
 
     corners: tuple[Array, ...]
     q_home: Array
     delay_s: float
+    watched: CalibrationResult | None = None
 
 
 @dataclass(eq=False)
 class AddedMotion(AddedJob):
-    """The systems of the job."""
+    """The systems of the job; it has a `calibrator` or, where it watches a calibration, a `monitor`."""
 
     plan: MotionPlanned
+    X_FR: RigidTransform
     procedure: MotionProcedure
     collector: MotionCollector
-    calibrator: MotionCalibrator
+    calibrator: MotionCalibrator | None
+    monitor: DriftMonitor | None
     queue: FrameQueue
     recorder: MotionRecorder | None
     frames: int
@@ -66,9 +71,15 @@ class AddedMotion(AddedJob):
 
     def calibration(self, root: Context) -> MotionCalibration:
         """The result, where it is there."""
+        if self.calibrator is None:
+            return MotionCalibration()
         port = self.calibrator.GetOutputPort("calibration")
         found: MotionCalibration = port.Eval(self.calibrator.GetMyContextFromRoot(root))
         return found
+
+    def drift(self, root: Context) -> DriftStatus:
+        """What the monitor has found so far."""
+        return DriftStatus() if self.monitor is None else self.monitor.status(self.monitor.GetMyContextFromRoot(root))
 
     def counts(self, root: Context) -> tuple[int, int]:
         """Frames that were taken from the queue, and frames that were dropped."""
@@ -78,7 +89,7 @@ class AddedMotion(AddedJob):
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
         share = len(self.record(root).seen) / self.frames
-        return phases[-1][0], 0.05 + 0.85 * min(share, 1.0)
+        return self.drift(root).summary or phases[-1][0], 0.05 + 0.85 * min(share, 1.0)
 
 
 class Motion(Job[MotionPlanned]):
@@ -91,15 +102,19 @@ class Motion(Job[MotionPlanned]):
         """See Job."""
         job, streams = scenario.part(MotionJob), isinstance(scenario.scanner, StreamingScanner)
         if job is None:
-            if streams:
-                raise InputError("A !StreamingScanner belongs to a motion job: write motion: {} or another scanner.")
+            if streams and any(
+                getattr(scenario, key, None) is not None for key in ("mounting", "profiler_job", "tablet")
+            ):
+                raise InputError(
+                    "A !StreamingScanner belongs to a motion job or to the weld job: write motion: {} or another scanner."
+                )
             return
         check_motion(job)
         if not streams:
             raise InputError(
                 "A motion job needs a scanner that streams: write scanner: !StreamingScanner {} in the scenario."
             )
-        if scenario.job.weld or scenario.calibration.feature != "flange":
+        if scenario.job.weld or (scenario.calibration.feature != "flange" and not job.watch):
             raise InputError("A motion job calibrates by the bare flange: write tool: none and job: {weld: false}.")
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> MotionPlanned:
@@ -108,32 +123,35 @@ class Motion(Job[MotionPlanned]):
         assert job is not None
         assert isinstance(scanner, StreamingScanner)
         home = np.deg2rad(scenario.home_deg)
+        watched = load_result(Path(job.watch)) if job.watch else None
         corners = plan_corners(scenario, station, job, home, np.random.default_rng([seed, 16]))
-        return MotionPlanned(corners, home, scanner.stream().delay_s)
+        return MotionPlanned(corners, home, scanner.stream().delay_s, watched)
 
     def add(self, wiring: Wiring, spine: Spine, plan: MotionPlanned) -> AddedMotion:
         """See Job."""
         scenario, station, c = wiring.scenario, wiring.station, wiring.scenario.calibration
-        job, standard = scenario.part(MotionJob), get_flange(scenario.flange)
+        job, standard, X_FR = scenario.part(MotionJob), feature_standard(scenario), feature_on_flange(scenario, station)
         assert job is not None
+        watched = plan.watched
         factor = scenario.job.speed_factor
         maximum_time_s = scenario.job.maximum_time_s / factor
         # legs between corners are slower than the other moves: what moves the flange at the wanted speed on the fastest leg
         share = min(joint_speed(station.arm, plan.corners, job.speed_m_s) / self.move_speed, 1.0)
         procedure = wiring.add(
             "motion_procedure",
-            MotionProcedure(plan.corners, plan.q_home, job.frames, share, maximum_time_s=maximum_time_s),
-        )
+            MotionProcedure(
+                plan.corners, plan.q_home, job.frames, share, maximum_time_s=maximum_time_s, calibrates=watched is None
+            ),
+        )  # fmt: skip
         queue = wiring.add("frame_queue", FrameQueue(job.queue, _POLL_S))
         estimator = wiring.add(
             "flange_estimator",
             FlangeEstimator(
-                station.arm, RigidTransform(), standard, c.mounting_guess.pose(), c.guess_radius_mm * 1e-3,
-                station.background, _POLL_S, plan.delay_s,
+                station.arm, X_FR, standard, c.mounting_guess.pose() if watched is None else watched.X_BC,
+                c.guess_radius_mm * 1e-3, station.background, _POLL_S, plan.delay_s,
             ),
         )  # fmt: skip
         collector = wiring.add("motion_collector", MotionCollector())
-        calibrator = wiring.add("motion_calibrator", MotionCalibrator(station.arm, station.background))
         estimate, state = estimator.GetOutputPort("flange_estimate"), procedure.GetOutputPort("state")
         record = collector.GetOutputPort("record")
         wiring.connect(queue, stream=wiring.out("scanner.stream"), flange_estimate=estimate)
@@ -148,11 +166,25 @@ class Motion(Job[MotionPlanned]):
             collector, flange_estimate=estimate, state=state,
             position_measured=spine.arm.position, sample_time=wiring.out(f"{FIRST}.sample_time"),
         )  # fmt: skip
-        wiring.connect(calibrator, record=record, state=state)
         wiring.connect(
-            procedure, settled_goal=spine.arm.settled_goal, robot_status=spine.arm.status, record=record,
-            calibration=calibrator.GetOutputPort("calibration"), hold=spine.hold,
-        )  # fmt: skip
+            procedure,
+            settled_goal=spine.arm.settled_goal,
+            robot_status=spine.arm.status,
+            record=record,
+            hold=spine.hold,
+        )
+        calibrator, monitor = None, None
+        if watched is None:
+            calibrator = wiring.add("motion_calibrator", MotionCalibrator(station.arm, station.background))
+            wiring.connect(calibrator, record=record, state=state)
+            wiring.connect(procedure, calibration=calibrator.GetOutputPort("calibration"))
+        else:
+            monitored = MonitoredCalibration.of(watched, plan.delay_s, false_alarms_per_hour=job.false_alarms_per_hour)
+            monitor = wiring.add("drift_monitor", DriftMonitor(station.arm, X_FR, monitored, period_s=_POLL_S))
+            wiring.connect(monitor, flange_estimate=estimate, history=spine.arm.history)
+        if wiring.meshcat is not None and monitor is not None:
+            view = wiring.add("drift_view", DriftView(wiring.meshcat, 0.5 * standard.outer_m, scenario.visualization))
+            wiring.connect(view, drift=monitor.GetOutputPort("drift"), flange_estimate=estimate)
         wiring.feed("scanner.streaming", procedure.GetOutputPort("streaming"))
         recorder = None
         if job.record and job.recording_folder:
@@ -163,26 +195,34 @@ class Motion(Job[MotionPlanned]):
             if station.diagram.HasOutputPort(f"cheat.{name}"):
                 logged[name] = wiring.out(f"cheat.{name}")
         ports = JobPorts((procedure.GetOutputPort("job"),), state, logged=logged)
-        return AddedMotion(plan, procedure, collector, calibrator, queue, recorder, job.frames, ports, maximum_time_s)
+        return AddedMotion(
+            plan, X_FR, procedure, collector, calibrator, monitor, queue, recorder, job.frames, ports, maximum_time_s
+        )
 
 
 def plan_corners(
     scenario: Scenario, station: Station, job: MotionJob, q_home: Array, rng: np.random.Generator
 ) -> tuple[Array, ...]:
-    """Joint angles (6,) rad of the cube's corners, each flange leaning another way, with free moves between all of them.
+    """Joint angles (6,) rad that bring the feature to the cube's corners, leaning another way at each, with free moves between
+    all of them.
 
     Raises:
         InputError: a corner is out of reach, or the arm would touch the table or itself on the way.
     """
     X_BC = scenario.calibration.mounting_guess.pose()
-    centre, bodies = np.array(job.centre_m), arm_bodies(station.arm)
+    centre, bodies, X_RF = (
+        np.array(job.centre_m),
+        station_bodies(station),
+        feature_on_flange(scenario, station).inverse(),
+    )
     found: list[Array] = []
     for corner in CORNERS:
         p = centre + 1e-3 * job.edge_mm * corner
         for _ in range(_TRIES):
             off = RollPitchYaw(*np.radians(rng.uniform(-job.lean_deg, job.lean_deg, 3))).ToRotationMatrix()
             near = found[-1] if found else q_home
-            q = nearest_solution(station.arm, RigidTransform(facing(p, X_BC, q_home, station.arm) @ off, p), near)
+            X_BR = RigidTransform(facing(p, X_BC, q_home, station.arm, X_RF.inverse()) @ off, p)
+            q = nearest_solution(station.arm, X_BR @ X_RF, near)
             if q is not None and all(clear_move(scenario, station, bodies, other, q) for other in (q_home, *found)):
                 found.append(q)
                 break
@@ -194,11 +234,14 @@ def plan_corners(
     return tuple(found)
 
 
-def facing(p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel) -> RotationMatrix:
-    """The flange rotation R_BF at ``p`` (3,) m that faces the scanner, turned about its axis as near to that at home as can be."""
+def facing(
+    p: Array, X_BC: RigidTransform, q_home: Array, arm: ArmModel, X_FR: RigidTransform | None = None
+) -> RotationMatrix:
+    """The rotation R_BR of a feature at X_FR (the flange) that faces the scanner from ``p`` (3,) m, turned about its axis as near to
+    that at home as can be."""
     z = X_BC.translation() - p
     z = z / np.linalg.norm(z)
-    x_home = forward_kinematics(arm, q_home).rotation().matrix()[:, 0]
+    x_home = (forward_kinematics(arm, q_home) @ (X_FR or RigidTransform())).rotation().matrix()[:, 0]
     x = x_home - (x_home @ z) * z
     x = x / np.linalg.norm(x)
     return RotationMatrix(np.column_stack([x, np.cross(z, x), z]))

@@ -1,4 +1,4 @@
-"""MotionProcedure: moves the flange between the corners of a cube until enough frames are collected, then asks for the calibration."""
+"""MotionProcedure: moves the flange between the corners of a cube until enough frames are collected, then asks for the result."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,7 +33,8 @@ class MotionProcedure(LeafSystem):
         - streaming
         - state
 
-    `hold` (1) is the operator's stop request. `streaming` (1) turns the scanner on from the first corner to the last.
+    A procedure that does not calibrate ends at home, and its port `calibration` stays open. `hold` (1) is the operator's stop
+    request. `streaming` (1) turns the scanner on from the first corner to the last.
     """
 
     def __init__(
@@ -45,10 +46,11 @@ class MotionProcedure(LeafSystem):
         timeout_s: float = 60.0,
         maximum_time_s: float = np.inf,
         period_s: float = 0.008,
+        calibrates: bool = True,
     ) -> None:
         super().__init__()
         self._corners, self._home, self._frames, self._speed_share = tuple(corners), q_home, frames, speed_share
-        self._timeout_s, self._maximum_time_s = timeout_s, maximum_time_s
+        self._timeout_s, self._maximum_time_s, self._calibrates = timeout_s, maximum_time_s, calibrates
         self._settled = self.DeclareVectorInputPort("settled_goal", 1)
         self._robot = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
         self._record = self.DeclareAbstractInputPort("record", AbstractValue.Make(MotionRecord()))
@@ -85,7 +87,7 @@ class MotionProcedure(LeafSystem):
         if int(self._settled.Eval(context)[0]) != s.goal_id:
             return s
         if s.phase == "home":
-            return replace(s, phase="calibrate", since=now)
+            return replace(s, phase="calibrate" if self._calibrates else "done", since=now)
         record: MotionRecord = self._record.Eval(context)
         if s.phase == "collect" and len(record.seen) >= self._frames:
             return _go(s, "home", self._home, now, corner=-1)

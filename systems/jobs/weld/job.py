@@ -23,8 +23,10 @@ from weldcal.systems.jobs.weld.settings import (
     plan_poses,
     servo_config,
 )
+from weldcal.systems.jobs.weld.watch import add_watch
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport, WeldingVelocityServo
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
+from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
@@ -75,6 +77,7 @@ class WeldJob(AddedJob):
     servo_config: ServoConfig
     sequencer: JobSequencer
     calibrator: IterativeCalibrator
+    monitor: DriftMonitor | None
     welding: WeldingPorts
     ports: JobPorts
     maximum_time_s: float
@@ -82,6 +85,10 @@ class WeldJob(AddedJob):
     def calibration_status(self, root: Context) -> CalibrationStatus:
         """The calibrator's status in a context of the whole Diagram."""
         return self.calibrator.status(self.calibrator.GetMyContextFromRoot(root))
+
+    def drift(self, root: Context) -> DriftStatus | None:
+        """What the drift watch has found; None where the scanner does not stream."""
+        return None if self.monitor is None else self.monitor.status(self.monitor.GetMyContextFromRoot(root))
 
     def planned_seam(self, root: Context) -> PlannedSeam:
         """The seam planner's newest plan; empty in a job that does not weld."""
@@ -144,6 +151,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         wiring.connect(calibrator, flange_estimate=estimator.GetOutputPort("flange_estimate"), history=history)
         wiring.connect(chooser, calibration_status=status)
         welding = _add_welding(wiring, spine, config, sequencer, status)
+        monitor = add_watch(wiring, spine, sequencer, status, X_FR, standard)
         wiring.feed("scanner.trigger", sequencer.GetOutputPort("scan_trigger"))
         wiring.connect(
             sequencer,
@@ -172,7 +180,9 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         if logged:
             logged["torch_on"] = spine.switch.GetOutputPort("process_on")
         ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged)
-        return WeldJob(scenario, plan, X_FR, config, sequencer, calibrator, welding, ports, times.maximum_time_s)
+        return WeldJob(
+            scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports, times.maximum_time_s
+        )
 
 
 def _add_welding(

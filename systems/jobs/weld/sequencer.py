@@ -267,6 +267,8 @@ PHASES: dict[str, Callable[[JobState, Seen, JobPlan], JobState]] = {
 }
 
 
+WATCHED = ("move_to_verify", "park", "approach_above", "approach", "weld", "retract", "home")
+"""Phases in which the scanner streams, if it can: its calibration is done, and no scan is wanted."""
 WELDED = ("weld", "retract", "home")
 """Phases in which a scanner that has moved is a warning: nothing that follows depends on its pose."""
 
@@ -320,11 +322,13 @@ class JobSequencer(LeafSystem):
         - job_state
         - scan_trigger
         - streaming
+        - scanner_streaming
 
     `drift` (may stay open) carries the DriftMonitor's status: a scanner that has moved holds the job before the weld and is a
     warning from then on. `hold` (1) is the operator's stop request; `arm_stopped` (1) of the ProcessSwitch is 1 after the guard stopped a weld.
     `job` carries the `JobCommand`, `job_state` the whole
-    `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station.
+    `JobState` with its log; `scan_trigger` and `streaming` (1) go to the station, and so does `scanner_streaming` (1) where
+    the scanner streams: after the calibration it does, except while it scans.
     """
 
     def __init__(self, plan: JobPlan, period_s: float = 0.02) -> None:
@@ -346,6 +350,7 @@ class JobSequencer(LeafSystem):
         self.DeclareAbstractOutputPort("job_state", lambda: AbstractValue.Make(JobState()), self._state_out, ticket)
         self.DeclareVectorOutputPort("scan_trigger", 1, self._trigger_out, ticket)
         self.DeclareVectorOutputPort("streaming", 1, self._streaming_out, ticket)
+        self.DeclareVectorOutputPort("scanner_streaming", 1, self._watching_out, ticket)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period_s, 0.0, self._update)
 
     def job_state(self, context: Context) -> JobState:
@@ -383,3 +388,6 @@ class JobSequencer(LeafSystem):
 
     def _streaming_out(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, float(self.job_state(context).command.streaming))
+
+    def _watching_out(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, float(self.job_state(context).command.phase in WATCHED))

@@ -7,8 +7,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.geometry.se3 import exp_rotation
-from weldcal.calibration.motion.body_model import BodyModel, fused_model, model_from_solids
-from weldcal.calibration.motion.tracking import BodyTracker, link_motion, observed_point
+from weldcal.calibration.motion.body.model import BodyModel, fused_model, model_from_solids
+from weldcal.calibration.motion.body.tracking import BodyTracker, link_motion, observed_point
 from weldcal.models.arms.kinematics import link_frames, load_arm
 from weldcal.models.arms.link_mesh import link_index, link_solids
 from weldcal.models.arrays import Array

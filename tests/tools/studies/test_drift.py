@@ -1,13 +1,15 @@
 """The drift study in its short form: knocks and a creep are found in time, a quiet minute raises no alarm."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from typer.testing import CliRunner
 
 from weldcal.tools.cli.app import app
-from weldcal.tools.studies.motion.drift import knock_trial
-from weldcal.tools.studies.motion.feature_world import WorldConfig
+from weldcal.tools.studies.motion.drift import Trial, _watched, found_by_angle, knock_trial
+from weldcal.tools.studies.motion.feature_world import Change, WorldConfig
 
 
 def test_the_short_form_meets_the_targets(tmp_path: Path) -> None:
@@ -26,3 +28,23 @@ def test_a_trial_says_what_the_change_was() -> None:
     assert trial.named == "rotation"
     assert trial.rotation_error_deg < 0.01
     assert abs(trial.time_error_s) < 0.3
+
+
+def test_a_turn_about_the_line_of_sight_shows_least() -> None:
+    trials = [
+        Trial("turn", k, view, 1.0, 0.0, 0.0, 0.0, "", 0, shown)
+        for k, (view, shown) in enumerate(((1.0, 0.5), (0.1, 9.0)))
+    ]
+    near, far = found_by_angle(trials)
+    assert (near["to_deg"], near["shown_median"], far["from_deg"]) == (10.0, 0.5, 45.0)
+    view = _watched(WorldConfig(), 1.0, 3, (0.0, np.zeros(3), np.zeros(3)))[1]
+    along, across = (
+        _watched(
+            replace(WorldConfig(), changes=(Change(25.0, (0.0, 0.0, 0.0), tuple(turn)),)),
+            28.0,
+            3,
+            (25.0, np.zeros(3), turn),
+        )[2]
+        for turn in (5e-4 * view, 5e-4 * np.array([0.0, 1.0, 0.0]))
+    )
+    assert across > 4.0 * along

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def test_without_an_arc_the_tool_comes_to_rest_and_the_torch_stays_asked_for(
     _, commands = ticks(lit, [False] * n(1.5))
     speeds = [speed(c) for c in commands]
     assert speeds[0] > 0.002, "it comes out of its motion"
-    assert all(b <= a + 1e-12 for a, b in zip(speeds, speeds[1:], strict=False)), "and only slows"
+    assert all(b <= a + 1e-12 for a, b in pairwise(speeds)), "and only slows"
     assert speeds[n(CONFIG.limits.ramp_s) + 1] == 0.0
     assert all(c.torch_on and c.phase == Phase.TRACK for c in commands)
 

@@ -1,18 +1,20 @@
 """`weldcal benchmark drift`: knocks, creeps and quiet hours of a watched calibration, on a world of features."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from weldcal.calibration.motion.drift.residuals import CLOCK
 from weldcal.calibration.motion.drift.sequential import DriftConfig, DriftEvent, DriftTest
 from weldcal.models.arrays import Array
 from weldcal.tools.console import Progress
 from weldcal.tools.report.files import records_csv, write_json
 from weldcal.tools.report.render import write_atomic
-from weldcal.tools.studies.motion.feature_world import Change, WorldConfig, simulate
+from weldcal.tools.studies.motion.feature_world import Change, World, WorldConfig, simulate
 from weldcal.tools.studies.targets import Target, all_met
 
 SHIFT_M, TURN_RAD = 2e-4, float(np.radians(0.03))
@@ -26,7 +28,8 @@ _CHUNK = 200  # frames handed over at a time
 @dataclass(frozen=True)
 class Trial:
     """One recording with one change: what it was, when it was found (s after it; NaN: not), and how well it was measured.
-    ``along_view`` is the cosine between the change's axis and the line of sight."""
+    ``along_view`` is the cosine between the change's axis and the line of sight. ``shown`` is what the frames of the first WITHIN_S
+    say of it to a test that knows the noise and all other errors exactly, in units of the test's threshold."""
 
     kind: str
     seed: int
@@ -37,6 +40,7 @@ class Trial:
     rotation_error_deg: float
     named: str
     false_alarms: int
+    shown: float
 
 
 @dataclass(frozen=True)
@@ -87,6 +91,7 @@ def run_drift_study(
         "rotation_error_deg": _spread(np.array([t.rotation_error_deg for t in knocks if t.kind == "turn"])),
         "named_right": sum(t.named == {"shift": "translation", "turn": "rotation"}[t.kind] for t in knocks),
         "latest": [asdict(t) for t in sorted(knocks, key=lambda t: -np.nan_to_num(t.found_after_s, nan=np.inf))[:5]],
+        "turns_by_angle_to_the_view": found_by_angle(knocks),
         "creep_mm_when_found": reached.tolist(),
         "quiet_hours": size.hours,
         "false_alarms": alarms,
@@ -108,8 +113,8 @@ def knock_trial(world: WorldConfig, seed: int, *, turn: bool) -> Trial:
     at = float(rng.uniform(*_KNOCK_S))
     shift, rotation = (np.zeros(3), TURN_RAD * axis) if turn else (SHIFT_M * axis, np.zeros(3))
     change = Change(at, tuple(shift.tolist()), tuple(rotation.tolist()))
-    events, view = _watched(replace(world, changes=(change,)), at + _AFTER_S, seed)
-    return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)))
+    events, view, shown = _watched(replace(world, changes=(change,)), at + _AFTER_S, seed, (at, shift, rotation))
+    return _trial("turn" if turn else "shift", seed, events, at, shift, rotation, float(abs(axis @ view)), shown)
 
 
 def creep_trial(world: WorldConfig, seed: int) -> Trial:
@@ -121,8 +126,8 @@ def creep_trial(world: WorldConfig, seed: int) -> Trial:
     shift = CREEP_MOST_M * axis
     change = Change(_CREEP_START_S, tuple(shift.tolist()), over_s=over)
     slow = replace(world, frame_s=8.0 * world.frame_s, changes=(change,))
-    events, view = _watched(slow, _CREEP_START_S + over, seed)
-    return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)))
+    events, view, _ = _watched(slow, _CREEP_START_S + over, seed, (0.0, shift, np.zeros(3)))
+    return _trial("creep", seed, events, _CREEP_START_S, shift, np.zeros(3), float(abs(axis @ view)), float("nan"))
 
 
 def quiet_hours(
@@ -141,27 +146,64 @@ def quiet_hours(
     return len(test.events), largest, test.threshold
 
 
-def _watched(config: WorldConfig, duration_s: float, seed: int) -> tuple[list[DriftEvent], Array]:
-    """Events of a recording, and the line of sight in the base."""
+def _watched(
+    config: WorldConfig, duration_s: float, seed: int, change: tuple[float, Array, Array]
+) -> tuple[list[DriftEvent], Array, float]:
+    """Events of a recording, the line of sight in the base, and what its frames show of a change (time s, shift m, rotation rad)."""
     w = simulate(config, duration_s, seed)
     test = DriftTest(w.X_BC, w.covariance, w.pivot, DriftConfig(), frame_rate_hz=1.0 / config.frame_s)
     for k in range(0, len(w.rows), _CHUNK):
         test.update(w.rows.part(slice(k, k + _CHUNK)))
     test.finish()
-    return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2])
+    return test.events, np.asarray(w.X_BC.rotation().matrix()[:, 2]), _shown(w, test, change)
+
+
+def _shown(w: World, test: DriftTest, change: tuple[float, Array, Array]) -> float:
+    """The expected statistic of a pure shift or turn by the frames of WITHIN_S after it, over its threshold, where noise and all other
+    errors are known exactly and the clock alone is not."""
+    at, shift, rotation = change
+    chosen = np.flatnonzero((w.rows.times >= at) & (w.rows.times <= at + WITHIN_S))
+    if not len(chosen) or test.noise is None:
+        return float("nan")
+    H = w.rows.derivatives[chosen][:, :, : CLOCK + 1]
+    motion = w.rows.derivatives[chosen][:, :, CLOCK]
+    noise = test.noise
+    R = np.array([noise.covariance(S, u) for S, u in zip(w.rows.covariances[chosen], motion, strict=True)])
+    N = np.einsum("nia,nij,njb->ab", H, np.linalg.inv(R), H)
+    known = N[:CLOCK, :CLOCK] - np.outer(N[:CLOCK, CLOCK], N[CLOCK, :CLOCK]) / N[CLOCK, CLOCK]
+    lever = w.pivot - np.asarray(w.X_BC.translation())
+    move = np.concatenate([rotation, shift + np.cross(rotation, lever)])
+    return float(move @ known @ move) / test.threshold_alone
+
+
+def found_by_angle(trials: Sequence[Trial]) -> list[dict[str, float]]:
+    """Of turns, by the angle between their axis and the line of sight: how many there were, the share found within WITHIN_S, and
+    the median of what the frames show."""
+    turns = [t for t in trials if t.kind == "turn"]
+    angles = np.degrees(np.arccos(np.clip([t.along_view for t in turns], 0.0, 1.0)))
+    rows = []
+    for low, high in pairwise((0.0, 10.0, 20.0, 30.0, 45.0, 90.0)):
+        part = [t for t, a in zip(turns, angles, strict=True) if low <= a < high or a == high == 90.0]
+        if part:
+            found = np.array([t.found_after_s for t in part])
+            rows.append({
+                "from_deg": low, "to_deg": high, "turns": len(part), "found_within_2_s_percent": _percent(found <= WITHIN_S),
+                "shown_median": float(np.median([t.shown for t in part])), "shown_least": float(min(t.shown for t in part)),
+            })  # fmt: skip
+    return rows
 
 
 def _trial(
-    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float
+    kind: str, seed: int, events: list[DriftEvent], at: float, shift: Array, rotation: Array, view: float, shown: float
 ) -> Trial:
     early = sum(e.found_s < at for e in events)
     later = [e for e in events if e.found_s >= at]
     if not later:
-        return Trial(kind, seed, view, *(4 * (float("nan"),)), "", early)
+        return Trial(kind, seed, view, *(4 * (float("nan"),)), "", early, shown)
     e = later[0]
     return Trial(
         kind, seed, view, e.found_s - at, e.time_s - at, 1e3 * float(np.linalg.norm(e.translation_m - shift)),
-        float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))), e.model, early,
+        float(np.degrees(np.linalg.norm(e.rotation_rad - rotation))), e.model, early, shown,
     )  # fmt: skip
 
 

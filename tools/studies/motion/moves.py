@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.motion_dataset import RobotStream
-from weldcal.calibration.geometry.se3 import pose
+from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.models.arms.chain import chain_inverse, chain_poses, load_chain
 from weldcal.models.arrays import Array
@@ -86,21 +86,12 @@ def cube_moves(
         assert found is not None
         near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
         q.append(near)
-    way = np.array(q)
-    poses = chain_poses(chain, way)
-    after = np.roll(np.arange(len(way)), -1)
-    steps = np.linspace(0.0, 1.0, 200)
-    lengths = np.linalg.norm(poses[after, :3, 3] - poses[:, :3, 3], axis=1)
-    if not linear:
-        for k in range(len(way)):
-            path = chain_poses(chain, way[k] + steps[:, None] * (way[after[k]] - way[k]))[:, :3, 3]
-            lengths[k] = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
     down = Rotation.from_euler(
         "zxy", [rng.uniform(-np.pi, np.pi), np.pi + rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)]
     )
     R_BC = down.as_matrix()
     X_BC = RigidTransform(RotationMatrix(R_BC), middle - 0.75 * R_BC[:, 2])
-    return Moves(way, poses, lengths, linear), X_BC
+    return closed_moves(np.array(q), linear=linear), X_BC
 
 
 def recorded_stream(
@@ -125,7 +116,7 @@ def recorded_stream(
 
 
 def observed_frames(
-    moves: Moves,
+    moves: "Moves | SeenFromHand",
     X_BC: RigidTransform,
     duration_s: float,
     rng: np.random.Generator,
@@ -185,3 +176,63 @@ def _axes(n: Array) -> Array:
     x = np.cross(n, other)
     x /= np.linalg.norm(x, axis=1)[:, None]
     return np.stack([x, np.cross(n, x), n], axis=2)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenFromHand:
+    """A fixed target X_BT as it moves in the frame of a moving flange: what takes the place of Moves for a scanner on the flange."""
+
+    moves: Moves
+    X_BT: RigidTransform
+
+    def at(self, t: Array) -> Array:
+        """Target poses X_FT (..., 4, 4) at times (...) s, exact."""
+        return np.asarray(inverse(self.moves.at(t)) @ self.X_BT.GetAsMatrix4())
+
+
+def hand_moves(
+    rng: np.random.Generator,
+    *,
+    linear: bool = False,
+    lean_deg: float = 25.0,
+    spread_m: float = 0.08,
+    waypoints: int = 6,
+) -> tuple[Moves, RigidTransform, RigidTransform]:
+    """Moves of a UR10e with a scanner on its flange about a fixed target, X_FC and X_BT; the target stays near the middle of the view."""
+    chain = load_chain(ROBOT)
+    X_FC = RigidTransform(
+        RotationMatrix(
+            Rotation.from_euler("zxy", [rng.uniform(-np.pi, np.pi), *rng.uniform(-0.2, 0.2, 2)]).as_matrix()
+        ),
+        np.array([0.08, 0.02, 0.06]) + rng.uniform(-0.02, 0.02, 3),
+    )
+    X_BT = RigidTransform(
+        RotationMatrix(Rotation.from_euler("xy", rng.uniform(-0.1, 0.1, 2)).as_matrix()),
+        [rng.uniform(0.55, 0.7), rng.uniform(-0.2, 0.2), 0.02],
+    )
+    q: list[Array] = []
+    near = np.array([0.2, -1.4, 2.0, -2.1, -1.6, 0.0])
+    while len(q) < waypoints:
+        lean = np.radians(lean_deg) * rng.uniform(-1.0, 1.0, 3)
+        R_BC = Rotation.from_euler("zxy", [lean[0], np.pi + lean[1], lean[2]]).as_matrix()
+        p = X_BT.translation() - rng.uniform(0.5, 0.62) * R_BC[:, 2] + spread_m * rng.uniform(-1.0, 1.0, 3)
+        X_BF = RigidTransform(RotationMatrix(R_BC), p) @ X_FC.inverse()
+        found = chain_inverse(chain, X_BF, near)
+        if found is not None:
+            near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
+            q.append(near)
+    return closed_moves(np.array(q), linear=linear), X_FC, X_BT
+
+
+def closed_moves(way: Array, *, linear: bool) -> Moves:
+    """Moves through waypoints (n, J) rad and back to the first one."""
+    chain = load_chain(ROBOT)
+    poses = chain_poses(chain, way)
+    after = np.roll(np.arange(len(way)), -1)
+    steps = np.linspace(0.0, 1.0, 200)
+    lengths = np.linalg.norm(poses[after, :3, 3] - poses[:, :3, 3], axis=1)
+    if not linear:
+        for k in range(len(way)):
+            path = chain_poses(chain, way[k] + steps[:, None] * (way[after[k]] - way[k]))[:, :3, 3]
+            lengths[k] = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
+    return Moves(way, poses, lengths, linear)

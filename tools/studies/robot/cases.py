@@ -16,8 +16,6 @@ STOP, GO, GO_OR_STOP, REFUSE = "stop", "go on", "go on or stop", "refuse"
 REST_S = 0.3
 
 LINK = frozenset({Fault.LINK_STALE, Fault.LINK_CLOSED, Fault.CONTROLLER_DEAF})
-# ur_rtde connects anew by itself while it sends, and may take the worker with it
-LOST = LINK | {Fault.WORKER_DIED}
 DEAF = LINK | {Fault.GUARD_LATCHED}
 ALL = frozenset(Fault) - {Fault.NONE}
 
@@ -149,8 +147,7 @@ RUNNING: tuple[Case, ...] = (
     Case("no state for 20 ms", _fault("drop", seconds=0.02), GO, short=False),
     Case("state 30 ms late for 0.3 s", _fault("delay", seconds=0.03, **{"for": 0.3}), GO, repair=CLEAR),
     Case("10 % of the states lost", _fault("drop_p", p=0.1), GO, repair=CLEAR),
-    # ur_rtde drops a whole package when the beginning of the next one has come with it: it goes deaf, and is stopped
-    _either("states in torn pieces", _fault("partial_writes", bytes=7), LINK, *CLEAR),
+    Case("states in torn pieces", _fault("partial_writes", bytes=7), GO, repair=CLEAR),
     Case("controller's frames jitter by 5 ms", _fault("jitter", seconds=0.005), GO, repair=CLEAR),
     Case("controller's clock 100 ppm fast", _fault("clock_skew", ppm=100), GO),
     Case("dashboard connection reset", _fault("reset_tcp", kind="dashboard"), GO, short=False),
@@ -172,13 +169,9 @@ RUNNING: tuple[Case, ...] = (
         rest_s=1.0,
         short=False,
     ),
-    _stops("RTDE connections reset", _fault("reset_tcp"), LOST),
-    _stops("RTDE connections closed", _fault("close_tcp"), LOST, short=False),
-    _stops("receiving connection reset", _fault("reset_tcp", index=0), LINK),
-    _stops("commanding connection reset", _fault("reset_tcp", index=1), LOST),
-    _stops("receiving connection closed", _fault("close_tcp", index=0), LINK, short=False),
-    _stops("commanding connection closed", _fault("close_tcp", index=1), LOST, short=False),
-    _stops("every connection reset", _fault("reset_tcp", kind="all"), LOST),
+    _stops("RTDE connection reset", _fault("reset_tcp"), LINK),
+    _stops("RTDE connection closed", _fault("close_tcp"), LINK, short=False),
+    _stops("every connection reset", _fault("reset_tcp", kind="all"), LINK),
     _stops("controller ignores commands", _fault("mute_input"), DEAF, CLEAR),
     # the guard slows the arm, and the next number gives it its speed back
     Case("numbers 15 ms late", _fault("mute_input", seconds=0.015), GO, may_rest=True),

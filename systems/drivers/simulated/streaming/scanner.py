@@ -1,4 +1,4 @@
-"""Simulated streaming scanner: frames at its own rate, exposed over a time, that arrive later with stamps of its own clock."""
+"""Simulated streaming scanner: frames at its own rate that arrive later with stamps of its own clock, and single scans at rest."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -13,8 +13,14 @@ from pydrake.systems.sensors import ImageDepth32F, ImageRgba8U
 from weldcal.models.errors import InputError
 from weldcal.models.exposure import mixed_exposure
 from weldcal.models.scanner_streams import ScannerStream, get_stream
-from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
-from weldcal.systems.drivers.simulated.rendered_scanner import RenderedScanner, darkness, mount_scanner
+from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
+from weldcal.systems.drivers.simulated.rendered_scanner import (
+    DepthSensor,
+    MountedScanner,
+    RenderedScanner,
+    darkness,
+    mount_scanner,
+)
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
 from weldcal.systems.drivers.station_build import StationBuild
 from weldcal.systems.messages import Message, ScanStream, StreamedScan
@@ -24,10 +30,14 @@ _KEPT = 8  # arrived frames on the port
 
 @dc.dataclass
 class StreamingScanner(RenderedScanner):
-    """`!StreamingScanner`: a scanner that streams. Timing is the preset's where it is null; the shutter is global."""
+    """`!StreamingScanner`: a scanner that streams. Timing is the preset's where it is null; the shutter is global.
+
+    It also takes single scans with the noise of `static_preset`, in the same view."""
 
     DEFAULT_FOR: ClassVar[tuple[str, ...]] = ()
     preset: str = "motioncam_3d_stream_half"
+    static_preset: str = "motioncam_3d_static"
+    static_exposure_s: float = 0.25
     width: int | None = None
     height: int | None = None
     exposure_s: float = 0.010
@@ -77,7 +87,7 @@ class DepthStream(LeafSystem):
         - newest_capture
 
     The instants of an exposure are whole steps of the plant. `newest_capture` (2), the number and the true time (s) of the newest
-    exposed frame, is for reports and tests only.
+    exposed frame, is for reports and tests only. `streaming` (1) may stay open: nothing streams then.
     """
 
     def __init__(
@@ -109,7 +119,8 @@ class DepthStream(LeafSystem):
 
     def _instant(self, context: Context, state: State, k: int) -> None:
         old: _Streaming = context.get_abstract_state(self._state).get_value()
-        if self._streaming.Eval(context)[0] < 0.5 or (k > 0 and len(old.instants) != k):
+        on = self._streaming.HasValue(context) and self._streaming.Eval(context)[0] > 0.5
+        if not on or (k > 0 and len(old.instants) != k):
             return
         depth = np.array(self._depth.Eval(context).data[:, :, 0])
         new = dc.replace(old, instants=(*old.instants[:k], depth))
@@ -148,7 +159,7 @@ class DepthStream(LeafSystem):
 
 
 def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTransform:
-    """Mount the scanner as a RenderedScanner is and add its stream. Returns its true pose in its carrier's frame."""
+    """Mount the scanner as a RenderedScanner is, add its stream and its single scans. Returns its true pose in its carrier's frame."""
     if not 1 <= config.exposure_samples <= 16:
         raise InputError(f"scanner.exposure_samples must be from 1 to 16, and it is {config.exposure_samples}.")
     timing, world = config.stream(), build.require(SimulatedWorld)
@@ -161,5 +172,20 @@ def ApplyDriverConfig(config: StreamingScanner, build: StationBuild) -> RigidTra
     build.inputs["scanner.streaming"] = stream.GetInputPort("streaming")
     build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
     build.outputs["cheat.scanner_capture"] = stream.GetOutputPort("newest_capture")
+    _add_static_mode(config, build, mounted)
     build.outputs["cheat.joints"] = world.plant.get_state_output_port(world.arm)
     return mounted.X_LC
+
+
+def _add_static_mode(config: StreamingScanner, build: StationBuild, mounted: MountedScanner) -> None:
+    """Add the mode that takes a scan per trigger: the device's own errors are those of the stream, its noise is smaller."""
+    own, at_rest = mounted.device.noise, get_scanner(config.static_preset).noise
+    kept = ("scale_error", "gradient_per_m", "warp_m", "device")
+    noise = dc.replace(at_rest, **{name: getattr(own, name) for name in kept})
+    device = dc.replace(mounted.device, noise=noise)
+    scans = build.builder.AddSystem(DepthSensor(device, int(build.rng.integers(2**31)), config.static_exposure_s))
+    scans.set_name("scanner_at_rest")
+    build.builder.Connect(mounted.sensor.depth_image_32F_output_port(), scans.GetInputPort("depth_image"))
+    build.builder.Connect(mounted.sensor.color_image_output_port(), scans.GetInputPort("color_image"))
+    build.inputs["scanner.trigger"] = scans.GetInputPort("trigger")
+    build.outputs["scanner.scan"] = scans.GetOutputPort("scan")

@@ -31,7 +31,7 @@ from weldcal.systems.drivers.ur.readiness.load import (
     payload_finding,
 )
 from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET, ranges, register_names
-from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported, upper_range_works
+from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported
 from weldcal.systems.drivers.ur.rtde_wire import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
 
 RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
@@ -137,8 +137,7 @@ def preflight(
 
     Args:
         host: name or address of the controller.
-        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses do not use; None: where
-            the client supports them.
+        upper_registers: whether the driver will use the registers from 24 on, which fieldbuses do not use; None: it will.
         timeout_s: longest time of each request to the controller.
         nominal: the expected arm; a UR10e where None.
         load: the payload that the job needs; shown and not compared where None.
@@ -176,7 +175,7 @@ class _Look:
         self._arm: ArmModel | None = None
         self._error: tuple[float, float] | None = None
         self._dashboard = True
-        self._upper: bool | None = None
+        self._upper = True
 
     def report(self) -> Preflight:
         """All checks in their order, including those not made."""
@@ -193,7 +192,7 @@ class _Look:
             arm=self._arm,
             pose_error_m=error_m,
             pose_error_rad=error_rad,
-            upper_registers=bool(self._upper),
+            upper_registers=self._upper,
         )
 
     def _waiting(self, name: str) -> Check:
@@ -204,7 +203,7 @@ class _Look:
 
     def run(self, upper: bool | None) -> None:
         """Make all checks that can be made."""
-        self._upper = upper
+        self._upper = upper is not False
         try:
             claims = self._ask_rtde()
         except RobotUnreachable as problem:
@@ -238,8 +237,6 @@ class _Look:
             self._version = rtde.version
             if not self._check_version(rtde.version):
                 return {}
-            if self._upper is None:
-                self._upper = upper_range_works(rtde.version)
             claims = rtde.claim(register_names(self._offset))
             self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:

@@ -1,7 +1,7 @@
 """Names of the input registers that the driver claims, and their ranges as text."""
 
-# What ur_rtde's RTDEControlInterface claims: 8 integers and 18 doubles, from 0 or (upper registers) from 24.
-INTEGERS, DOUBLES, UPPER_OFFSET = 8, 18, 24
+# The command and its numbers, from register 0 or (upper registers) 24 on.
+INTEGERS, DOUBLES, UPPER_OFFSET = 1, 8, 24
 
 
 def register_names(offset: int) -> list[str]:

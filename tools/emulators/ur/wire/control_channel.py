@@ -174,7 +174,12 @@ class ControlServer(Server):
     def _links(self, request: Request) -> list[Connection]:
         """Connections of the protocol that the request names (rtde unless it says so), or the one at `index`."""
         found = self._network.of_kind(str(request.get("kind", "rtde")))
-        return [found[int(request["index"])]] if "index" in request and found else found
+        if "index" not in request or not found:
+            return found
+        index = int(request["index"])
+        if not 0 <= index < len(found):
+            raise InputError(f"There is no connection {index}: {len(found)} are open.")
+        return [found[index]]
 
     def _each(self, request: Request, **values: Any) -> None:
         for connection in self._links(request):

@@ -9,7 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.clouds import CloudError
 from weldcal.calibration.data.motion_dataset import FrameTime, MotionDataset, RobotStream
-from weldcal.calibration.motion.body_model import BodyModel
+from weldcal.calibration.motion.body.model import BodyModel
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arms.kinematics import ArmModel, link_frames

@@ -1,0 +1,135 @@
+"""The stream of packages between the worker and the controller: the newest outputs are read, the command registers written.
+
+One connection, no thread: the worker's loop reads what has arrived. Packages as in `rtde_wire`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import select
+import struct
+import time
+from collections.abc import Sequence
+
+from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
+from weldcal.systems.drivers.ur.rtde_wire import CODES, IN_USE, NOT_FOUND, RtdeProbe
+
+E_SERIES, FASTEST_HZ, CB3_HZ = 5, 500.0, 125.0
+DATA = ord("U")
+HEADER = struct.Struct(">HB")
+
+
+class RtdeStream:
+    """Outputs at the controller's own rate, and one recipe of inputs that this connection has claimed.
+
+    Raises:
+        RobotUnreachable: nothing answers, or not as RTDE does. RobotRefused: the inputs are taken, or an output is unknown.
+    """
+
+    def __init__(self, host: str, outputs: Sequence[str], inputs: Sequence[str]) -> None:
+        self._probe = RtdeProbe(host)
+        try:
+            self._recipe, kinds = self._probe.claim_recipe(inputs)
+            if {IN_USE, NOT_FOUND} & set(kinds):
+                raise RobotRefused("Another client or a fieldbus writes the command registers.")
+            self._package = struct.Struct(">B" + "".join(CODES[kind] for kind in kinds))
+            rate = FASTEST_HZ if self._probe.version[0] >= E_SERIES else CB3_HZ
+            kinds = self._probe.subscribe(outputs, rate)
+            if not set(kinds) <= set(CODES):
+                raise RobotRefused("The controller does not report all that the driver reads.")
+        except BaseException:
+            self._probe.close()
+            raise
+        self._socket, self._inbox = self._probe.start()
+        self._layout = struct.Struct(">B" + "".join(CODES[kind] for kind in kinds))
+        self._at: dict[str, slice | int] = {}
+        at = 1
+        for name, kind in zip(outputs, kinds, strict=True):
+            width = int(CODES[kind][0]) if kind.startswith("VECTOR") else 0
+            self._at[name] = slice(at, at + width) if width else at
+            at += width or 1
+        self._newest: tuple[float, ...] | None = None
+        self.connected = True
+
+    def poll(self) -> None:
+        """Read all packages that have arrived; the newest counts. A connection that has ended is told by `connected`."""
+        if not self.connected:
+            return
+        self._socket.settimeout(0.0)
+        try:
+            while data := self._socket.recv(65536):
+                self._inbox += data
+            self.connected = False
+        except (BlockingIOError, InterruptedError):
+            pass
+        except OSError:
+            self.connected = False
+        self._decode()
+
+    def wait(self, seconds: float) -> None:
+        """Poll, after the next package or this time."""
+        with contextlib.suppress(OSError, ValueError):
+            select.select([self._socket], [], [], max(seconds, 0.0))
+        self.poll()
+
+    def first(self, limit_s: float) -> None:
+        """Wait for the first package.
+
+        Raises:
+            RobotUnreachable: none comes.
+        """
+        until = time.monotonic() + limit_s
+        while self._newest is None:
+            if not self.connected or time.monotonic() > until:
+                raise RobotUnreachable("The controller accepts the recipe and sends no data.")
+            self.wait(0.01)
+
+    def number(self, name: str) -> float:
+        """An output in the newest package."""
+        at = self._at[name]
+        assert isinstance(at, int)
+        return self._package_now[at]
+
+    def vector(self, name: str) -> tuple[float, ...]:
+        """An output of several numbers in the newest package."""
+        at = self._at[name]
+        assert isinstance(at, slice)
+        return self._package_now[at]
+
+    @property
+    def _package_now(self) -> tuple[float, ...]:
+        if self._newest is None:
+            raise RobotUnreachable("The controller has sent no data yet.")
+        return self._newest
+
+    def send(self, *values: float) -> None:
+        """Write the inputs, in the order in which they were claimed."""
+        payload = self._package.pack(self._recipe, *values)
+        try:
+            self._socket.settimeout(0.0)
+            sent = self._socket.send(HEADER.pack(len(payload) + HEADER.size, DATA) + payload)
+        except OSError:
+            # what cannot be sent at once would arrive late: the guard slows the arm and stops it, and the echo tells
+            return
+        if sent < len(payload) + HEADER.size:
+            self.connected = False  # half a package is in the stream: what follows would be read wrongly
+
+    def close(self) -> None:
+        """Hang up, which releases the inputs."""
+        self._probe.close()
+
+    def _decode(self) -> None:
+        newest, inbox, at = None, self._inbox, 0
+        while len(inbox) - at >= HEADER.size:
+            size, kind = HEADER.unpack_from(inbox, at)
+            if size < HEADER.size:
+                self.connected = False
+                return
+            if len(inbox) - at < size:
+                break
+            if kind == DATA and size - HEADER.size == self._layout.size:
+                newest = at + HEADER.size
+            at += size
+        if newest is not None:
+            self._newest = self._layout.unpack_from(inbox, newest)
+        del inbox[:at]

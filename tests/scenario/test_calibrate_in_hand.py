@@ -1,0 +1,104 @@
+"""`weldcal calibrate` on a rendered recording of a scanner on the arm in motion: X_FC, target and clock against the truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from typer.testing import CliRunner
+
+from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
+from weldcal.calibration.errors import DatasetError, UndeterminedPoses
+from weldcal.calibration.motion.estimate import estimate_in_motion
+from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.models.arrays import Array
+from weldcal.models.flanges import get_flange
+from weldcal.models.scanners import get_scanner
+from weldcal.tools.cli.app import app
+from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.studies.flange.frames import flange_frame
+from weldcal.tools.studies.motion.moves import (
+    SeenFromHand,
+    closed_moves,
+    hand_moves,
+    observed_frames,
+    recorded_stream,
+)
+
+SECONDS, EVERY = 12.0, 3
+TARGET = "iso9409-1-50-4-m6"
+
+Truth = tuple[Path, RigidTransform, RigidTransform]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+    """Every third frame of 12 s at 20 per second, with device times, and the true X_FC and X_BT."""
+    folder = tmp_path_factory.mktemp("hand") / "recording"
+    rng = np.random.default_rng(2)
+    scanner = get_scanner("motioncam_3d_motion", 480)
+    scanner = replace(scanner, noise=replace(scanner.noise, sigma_m=1e-4))
+    moves, X_FC, X_BT = hand_moves(rng)
+    seen = SeenFromHand(moves, X_BT)
+    frames, capture = observed_frames(seen, X_FC, SECONDS, rng, device=True, epoch_s=100.0)
+    picked = range(0, len(capture), EVERY)
+
+    def clouds() -> Iterator[tuple[str, Array]]:
+        for j, k in enumerate(picked):
+            X_CT = X_FC.inverse() @ RigidTransform(seen.at(capture[k]))
+            shown = flange_frame(scanner, get_flange(TARGET), np.random.default_rng(j), X_CR=X_CT, clutter=0)
+            yield f"f{j:04d}", shown.points_C
+
+    assert frames.device is not None
+    times = [FrameTime(f"f{j:04d}", float(frames.arrival[k]), float(frames.device[k])) for j, k in enumerate(picked)]
+    header = DatasetHeader(robot="ur10e", flange=TARGET, scanner="motioncam_3d_motion", configuration="eye_in_hand")
+    stream = recorded_stream(moves, SECONDS, rng, joints=True)
+    intrinsics = (scanner.fx, scanner.fy, scanner.cx, scanner.cy)
+    save_motion_dataset(folder, header, stream, times, clouds(), intrinsics=intrinsics)
+    return folder, X_FC, X_BT
+
+
+def test_the_scanner_on_the_arm_and_its_clock_are_found(recording: Truth, tmp_path: Path) -> None:
+    folder, X_FC, X_BT = recording
+    ran = CliRunner().invoke(app, ["calibrate", str(folder), "--json", "--out", str(tmp_path / "out")])
+    assert ran.exit_code == 0, ran.output
+    said = json.loads(ran.output.strip().splitlines()[-1])
+    assert (said["configuration"], said["clock"]) == ("eye_in_hand", "device")
+    assert "X_BC" not in said
+    found, p = np.array(said["X_FC"]), np.array([0.0, 0.0, 0.56, 1.0])
+    assert 1e3 * np.linalg.norm((found @ p)[:3] - (X_FC.GetAsMatrix4() @ p)[:3]) < 0.15
+    assert 1e3 * np.array(said["target"]["xyz"]) == pytest.approx(1e3 * X_BT.translation(), abs=0.15)
+    assert said["target"]["normal"] == pytest.approx(X_BT.rotation().matrix()[:, 2], abs=5e-4)
+    assert said["clock_offset_ms"] == pytest.approx(1e5, abs=1.0)
+    assert said["held_out_mm"]["median"] < 0.2
+    written = (tmp_path / "out" / "calibration.yaml").read_text()
+    assert "X_FC:" in written
+    assert "--frame-id tool0" in (tmp_path / "out" / "static_transform.sh").read_text()
+    watched = CliRunner().invoke(app, ["monitor", str(folder), "--calibration", str(tmp_path / "out")])
+    assert watched.exit_code == 1
+    assert "X_FC" in watched.stderr
+
+
+def test_at_rest_the_other_command_is_named(recording: Truth, tmp_path: Path) -> None:
+    folder = tmp_path / "rest"
+    folder.mkdir()
+    text = (recording[0] / "dataset.yaml").read_text()
+    (folder / "dataset.yaml").write_text(text.replace("mode: motion", "mode: static"))
+    with pytest.raises(DatasetError, match="weldcal hand-eye"):
+        calibrate_dataset(folder, tmp_path / "out")
+
+
+def test_without_turns_the_pose_is_open() -> None:
+    rng = np.random.default_rng(3)
+    moves, X_FC, X_BT = hand_moves(rng, lean_deg=0.0, spread_m=0.1)
+    shifted = closed_moves(moves.q, linear=True)
+    frames, _ = observed_frames(SeenFromHand(shifted, X_BT), X_FC, 12.0, rng, device=True)
+    motion = ContinuousMotion(recorded_stream(shifted, 12.0, rng), inverted=True)
+    with pytest.raises(UndeterminedPoses, match="target's"):
+        estimate_in_motion(frames, motion, held_out=False)
