@@ -14,6 +14,8 @@ FALL_PER_S, RISE_PER_S = 25.0, 2.0  # moves are at most 1 rad/s: a fall adds 25 
 SLOWEST = 0.1
 # The servo needs pictures and detections: where this computer makes them late the path is slowed too.
 PICTURE_LATE_S, PICTURE_SPAN_S = 0.025, 0.100
+# A robot that waits for this computer's next velocity does not move its time: go on after this time of the wall clock.
+ROBOT_STANDS_S, ROBOT_LOOK_S = 0.030, 0.0005
 STOPPED = 0.02  # the rate at which a held path stands: at 1 rad/s the arm stops within a step of the slew limit
 
 
@@ -60,6 +62,7 @@ class WallClock:
         self, pace: float, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
     ) -> None:
         self.pace, self._clock, self._sleep = pace, clock, sleep
+        self.follows = False  # see following
         self._due = 0.0  # wall clock at which the Diagram's time is _at
         self._at: float | None = None
         self.rate, self.slowest_rate = 1.0, 1.0
@@ -71,6 +74,25 @@ class WallClock:
         self.lateness = Lateness()
         self.held = False
         self.waiting_s = 0.0  # wall seconds for which the oldest picture or detection has been waited for
+
+    @classmethod
+    def following(cls, robot_time: Callable[[], float]) -> "WallClock":
+        """A clock that waits for the robot's own time (s), for an emulated robot that waits for this computer.
+
+        Neither gets ahead of the other, however slow both are. The path is not slowed: a robot that waits loses nothing.
+        """
+
+        def wait(seconds: float) -> None:
+            newest = robot_time()
+            due, moved_at = newest + seconds, time.monotonic()
+            while newest < due and time.monotonic() - moved_at < ROBOT_STANDS_S:
+                time.sleep(ROBOT_LOOK_S)
+                before, newest = newest, robot_time()
+                moved_at = time.monotonic() if newest != before else moved_at
+
+        found = cls(1.0, robot_time, wait)
+        found.follows = True
+        return found
 
     @property
     def stands(self) -> bool:
@@ -112,7 +134,7 @@ class WallClock:
     def _set_rate(self, step: float, late: float, moving: bool) -> None:
         wanted = min(max(1.0 - (late - SLOW_FROM_S) / SLOW_SPAN_S, SLOWEST), 1.0)
         # a single long delay says nothing about the rate that the computer can keep
-        if not moving or late > LATE_S:
+        if not moving or late > LATE_S or self.follows:
             wanted = 1.0
         wanted = min(wanted, max(1.0 - (self.waiting_s - PICTURE_LATE_S) / PICTURE_SPAN_S, SLOWEST))
         if self.held:

@@ -55,6 +55,8 @@ def chosen_robot(
         return
     if word is None:
         word = scenario.robot.host if isinstance(scenario.robot, UrRtde) else SIMULATED
+        if isinstance(scenario.robot, UrRtde) and pace is None and scenario.robot.pace != 1.0:
+            pace = scenario.robot.pace
     if word == SIMULATED:
         if dry_run or pace is not None:
             raise InputError(

@@ -14,6 +14,7 @@ from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
+from weldcal.systems.station import Truth
 from weldcal.tools.outcomes.arm_frame import true_work_point
 from weldcal.welding.record.process import (
     PathError,
@@ -103,9 +104,8 @@ def live_calibration_error(cell: Cell[WeldJob], estimate: CalibrationEstimate) -
     return replace(off, at_work_m=float(np.linalg.norm(estimate.X_BC.multiply(corrected) - work)))
 
 
-def true_seam(cell: Cell[WeldJob]) -> SeamCurve | None:
+def true_seam(truth: Truth) -> SeamCurve | None:
     """The reference path of the torch: above the true groove's root, in B."""
-    truth = cell.station.truth
     if truth.workpiece is None or truth.X_BP is None:
         return None
     ups = truth.workpiece.up_P
@@ -116,7 +116,7 @@ def true_seam(cell: Cell[WeldJob]) -> SeamCurve | None:
 
 def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
     """The seam points that the servo measured with the tip, against the ground truth; None where there are none."""
-    state, seam = cell.job.servo_report(root).state, true_seam(cell)
+    state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth)
     if state is None or seam is None or len(state.refined) < 10:
         return None
     assert cell.station.cad is not None
@@ -175,7 +175,7 @@ def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
 
 def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     """Measure the weld, with its errors where the ground truth is known; None where nothing was welded."""
-    log, seam = weld_log(cell, root), true_seam(cell)
+    log, seam = weld_log(cell, root), true_seam(cell.station.truth)
     if log is None:
         return None
     plan = cell.job.planned_seam(root).seam

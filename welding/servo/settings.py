@@ -199,6 +199,7 @@ class TorchControl:
         k_roll: work-angle feedback, 1/s; work_angle_rad: wanted roll about the chord.
         ignition_error_m: the arc starts only with the torch this close to the seam; ignition_window_m: a weld whose arc
             does not start within so much of the seam is a fault.
+        ignition_limit_s: longest time from the torch's start to an established arc; arc_lost_s: longest time without it after.
     """
 
     k_b: float = 4.0
@@ -208,6 +209,8 @@ class TorchControl:
     work_angle_rad: float = 0.0
     ignition_error_m: float = 1.5e-3
     ignition_window_m: float = 10.0e-3
+    ignition_limit_s: float = 2.0
+    arc_lost_s: float = 0.3
 
     def __post_init__(self) -> None:
         _check_numbers("torch.", self, signed=("work_angle_rad",))

@@ -36,11 +36,14 @@ class DeflectionSample:
 
 @dataclass(frozen=True)
 class ServoSample:
-    """One servo tick's input: time s, pose of T in B now, and the newest frame (the same again until a newer comes)."""
+    """One servo tick's input: time s, pose of T in B now, the newest frame (the same again until a newer comes), and whether
+    the arc is established where the torch is on; True where nobody tells.
+    """
 
     time: float
     X_BT: RigidTransform
     deflection: DeflectionSample | None = None
+    arc: bool = True
 
 
 @dataclass(frozen=True)
@@ -165,6 +168,8 @@ class WeldingState:
     advanced: tuple[float, float] = (0.0, -math.inf)
     torch_on: bool = False
     lit_at: float = math.nan
+    arc_seen: bool = False
+    arc_waited_s: float = 0.0
     V: Array = field(default_factory=lambda: np.zeros(6))
     V_stop: Array = field(default_factory=lambda: np.zeros(6))
     stopped_ticks: int = 0

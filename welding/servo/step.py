@@ -21,6 +21,7 @@ from weldcal.welding.servo.contact import (
     with_progress,
 )
 from weldcal.welding.servo.feel_start import BACK_STEPS, begin_feeling_back, feel_start_step
+from weldcal.welding.servo.ignition import start_arc, wait_for_arc, with_arc
 from weldcal.welding.servo.laws import get_law, motion_law
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, WeldingCommand, WeldingState
@@ -69,8 +70,11 @@ def welding_step(
         return _touch(before, state, sample, is_new, config, dt)
     if is_new and state.phase in _MOVING:
         state = _contact(before, state, config)
+    if state.phase in _MOVING and state.torch_on and not sample.arc:
+        state, V, problem = wait_for_arc(state, sample, config, dt)
+        return _answer(state, V, config, Diagnostics()) if problem is None else _rest(_fault(state, problem), config)
     if state.phase in _MOVING:
-        return _weld(state, sample, config, dt)
+        return _weld(with_arc(state, sample), sample, config, dt)
     return _rest(state, config)
 
 
@@ -269,7 +273,7 @@ def _weld(
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
         return _rest(_fault(state, text), config)
     # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
-    start = _start_arc(state, curve)
+    start = start_arc(state, curve)
     lit = state.torch_on or (target.s >= start and error < config.torch.ignition_error_m)
     burning = lit and target.s < state.s_end
     lit_at = sample.time if burning and not state.torch_on else state.lit_at
@@ -291,11 +295,6 @@ def _weld(
         p_BTorch_target=target.point,
     )
     return _answer(state, motion.V_BT, config, diagnostics)
-
-
-def _start_arc(state: WeldingState, curve: SeamCurve) -> float:
-    """Arc length m on the moved plan at which the arc starts: the measured start of the groove, else the planned one."""
-    return 0.0 if state.start_point is None else curve.nearest(state.start_point, 0.0, 0.02)
 
 
 def _unlit(state: WeldingState, s_torch: float, past_start: float, error: float, config: ServoConfig) -> str | None:

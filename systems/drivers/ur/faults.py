@@ -31,6 +31,7 @@ class Fault(IntEnum):
     ROBOT_NOT_RUNNING = 25
     PROGRAM_STOPPED = 26
     PROGRAM_PAUSED = 27
+    ARC_FAULT = 28
     GUARD_REFUSED = 30
     UPLOAD_REFUSED = 31
     CONTROL_REFUSED = 32
@@ -68,6 +69,7 @@ SENTENCES = {
     Fault.ROBOT_NOT_RUNNING: "ROBOT NOT RUNNING: the arm is in mode {detail:.0f}; switch it on and release its brakes on the pendant, then start again.",
     Fault.PROGRAM_STOPPED: "PROGRAM STOPPED: the program on the controller was stopped; start again.",
     Fault.PROGRAM_PAUSED: "PROGRAM PAUSED: the program on the controller was paused; press Stop, not Play, on the pendant, and start again.",
+    Fault.ARC_FAULT: "ARC: the power source reports a fault; look for its message (gas, wire, cooling, no contact), clear it and start again.",
     Fault.GUARD_REFUSED: "An old command in the controller's registers could not be cleared: close the program that writes them and start again.",
     Fault.UPLOAD_REFUSED: "The controller did not start the guard script: switch it to Remote Control (top right of the pendant), or see its Log tab for an error.",
     Fault.CONTROL_REFUSED: "The controller refused the connection: its registers may be in use by EtherNet/IP or another client; run `weldcal check-robot`.",

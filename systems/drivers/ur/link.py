@@ -53,6 +53,7 @@ class LinkState:
     clock_residual_s: float
     clock_drift: float
     process_on: bool = False  # process output as reported by the controller
+    arc: bool | None = None  # established; None where the input is not wired
     detail: float = 0.0  # of the fault
     robot_mode: int = 7
     safety_mode: int = 1
@@ -127,6 +128,8 @@ class UrLink:
         payload_kg: float = 0.0,
         payload_cog_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
         process_output: int | None = None,
+        arc_input: int | None = None,
+        arc_fault_input: int | None = None,
     ) -> UrLink:
         """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
 
@@ -134,7 +137,17 @@ class UrLink:
             RobotRefused: the message gives the operator action; worker and program are ended.
         """
         config = WorkerConfig(
-            host, arm, limits, rate_hz, upper_registers, payload_kg, payload_cog_m, os.getpid(), process_output
+            host,
+            arm,
+            limits,
+            rate_hz,
+            upper_registers,
+            payload_kg,
+            payload_cog_m,
+            os.getpid(),
+            process_output,
+            arc_input,
+            arc_fault_input,
         )
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace
@@ -167,6 +180,12 @@ class UrLink:
     def joints_at(self, host_time: float) -> NDArray[np.float64] | None:
         """Joint positions (6,) rad at a host time (s, monotonic) of the last two seconds; None where there is no sample."""
         return self._memory.ring.at(host_time)
+
+    def robot_time(self) -> float:
+        """The controller's time (s) of the newest sample; 0 before the first. Never blocks."""
+        with contextlib.suppress(TornRead):
+            self._last = self._memory.state.read() or self._last
+        return 0.0 if self._last is None else self._last[_AT["robot_time"]]
 
     def state(self) -> LinkState:
         """The newest state. Never blocks.
@@ -210,6 +229,7 @@ class UrLink:
             found[_AT["residual"]],
             found[_AT["drift"]],
             found[_AT["process"]] > 0.5,
+            None if found[_AT["arc"]] < -0.5 else found[_AT["arc"]] > 0.5,
             detail,
             int(found[_AT["robot_mode"]]),
             int(found[_AT["safety_mode"]]),

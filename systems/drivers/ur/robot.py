@@ -5,6 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
@@ -25,6 +26,7 @@ from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, Robot
 NO_COMMAND, VELOCITY, SPEED_STOP, SET_PAYLOAD, STOP_SCRIPT = 0, 9, 15, 17, 255
 READY, DONE = 1, 2
 OUTPUTS = "actual_digital_output_bits"
+INPUTS = "actual_digital_input_bits"
 LINE_LIMIT_S = 2.0
 FIRST_LIMIT_S = 2.0
 ANSWER_LIMIT_S = 2.0
@@ -43,6 +45,27 @@ def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[flo
         return False
     mass, cog = np.array(found["payload"]), np.array(found["payload_cog"])
     return bool(abs(mass - mass_kg) <= 0.0101 and np.abs(cog - np.array(cog_m)).max() <= 1.01e-3)
+
+
+@dataclass(frozen=True)
+class ArcInputs:
+    """Standard digital inputs of the power source: arc established, arc fault; None where one is not wired."""
+
+    established: int | None = None
+    arc_fault: int | None = None
+
+    @property
+    def wired(self) -> bool:
+        """Whether there is one."""
+        return self.established is not None or self.arc_fault is not None
+
+    def arc(self, bits: int) -> bool | None:
+        """Whether the arc is established; None where that is not wired."""
+        return None if self.established is None else bool(bits >> self.established & 1)
+
+    def fault(self, bits: int) -> bool:
+        """Whether the power source reports a fault."""
+        return self.arc_fault is not None and bool(bits >> self.arc_fault & 1)
 
 
 class Refused(Exception):
@@ -72,17 +95,28 @@ def guard_script(upper_registers: bool, output: int | None = None) -> str:
 class Robot:
     """The stream to and from the controller, the clock map and the newest complete package."""
 
-    def __init__(self, host: str, *, upper: bool, pace: float, arm: ArmModel, output: int | None = None) -> None:
+    def __init__(
+        self,
+        host: str,
+        *,
+        upper: bool,
+        pace: float,
+        arm: ArmModel,
+        output: int | None = None,
+        arc_inputs: ArcInputs | None = None,
+    ) -> None:
         self._host = host
         base = UPPER_OFFSET if upper else 0
         self._output, self._arm, self._pace = output, arm, pace
         self._script = guard_script(upper, output)
+        self._arc_inputs = arc_inputs or ArcInputs()
         self.clock = ClockMap(pace)
         self._answer, self._latch = f"output_int_register_{base}", f"output_int_register_{base + 12}"
         # echo of the newest command number, the time for which the guard kept the arm from moving, its passes
         self._told = tuple(f"output_double_register_{base + 12 + i}" for i in range(3))
         names = [*ALWAYS, "actual_TCP_pose", self._answer, self._latch, *self._told]
         names += [] if output is None else [OUTPUTS]
+        names += [INPUTS] if self._arc_inputs.wired else []
         try:
             self._stream = RtdeStream(host, names, register_names(base))
             self._stream.first(FIRST_LIMIT_S)
@@ -179,6 +213,7 @@ class Robot:
         stream.poll()
         robot_time = stream.number("timestamp")
         echo, lost_s, passes = (stream.number(name) for name in self._told)
+        inputs = int(stream.number(INPUTS)) if self._arc_inputs.wired else 0
         q = np.array(stream.vector("actual_q"))
         if robot_time != self._robot_time:
             self._robot_time, self._fresh_at, self._excused = robot_time, now, 0.0
@@ -208,6 +243,8 @@ class Robot:
             robot_time - self._passed_at,
             None if self._output is None else self.process_on,
             echo < 0.0,
+            self._arc_inputs.arc(inputs),
+            self._arc_inputs.fault(inputs),
         )
 
     def excuse(self, seconds: float) -> None:

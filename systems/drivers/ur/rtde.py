@@ -17,7 +17,7 @@ from weldcal.systems.drivers.station_build import PreparedRobot, StationBuild
 from weldcal.systems.drivers.ur.link import UrLink, status_of
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
-from weldcal.systems.drivers.ur.supervisor import Limits
+from weldcal.systems.drivers.ur.supervisor import FOLLOWING_PATIENCE_S, Limits
 from weldcal.systems.wall_clock import WallClock
 
 FULL_PACE = 1.0
@@ -35,17 +35,26 @@ class UrRtde(DriverConfig):
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
     lockstep: bool = False  # only for the emulator: its time waits for this computer
+    follow: bool = (
+        False  # only for an emulator in lockstep: the cell's time waits for it too, as for a world of its own
+    )
     velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
     upper_registers: bool | None = None  # from 24 on (fieldbuses use those from 0 on); null: true
     payload_kg: float = 1.4  # of the welding tool
     payload_cog_m: list[float] = dc.field(default_factory=lambda: [0.03, 0.0, 0.05])
     process_output: int | None = None  # standard digital output (0 to 7) that switches the torch; null: none is wired
+    # standard digital inputs (0 to 7) of the power source; null: not wired. Without an established arc the weld does not move,
+    # and a fault ends it
+    arc_input: int | None = None
+    arc_fault_input: int | None = None
 
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
         limits = Limits(
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
+        if self.follow:
+            return limits.in_lockstep(FOLLOWING_PATIENCE_S)
         return limits.in_lockstep() if self.lockstep else limits
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
@@ -69,12 +78,14 @@ class UrRtdeArm(LeafSystem):
         - X_BF
         - sample_time
         - status
+        - arc_established
 
     Units as in the simulated arm. `sample_time` is the time of the robot's sample on the Diagram's clock: the time of the
     update less the sample's age, computed from robot time mapped to host time. `desired_state` (12) rad, rad/s is the
     predicted state of the arm at the next tick, which the simulated arm follows. Outputs depend on the state only: no
     feedthrough.
     On a computer that is late the clock's `rate` is below 1: velocities are sent, and read, in proportion to it.
+    `arc_established` (1): 1 while the power source reports an arc, or where its input is not wired.
     `process_on` (1) switches the torch's digital output, where one is wired; unconnected means off.
     """
 
@@ -86,9 +97,9 @@ class UrRtdeArm(LeafSystem):
         found = link.state()
         self._command = self.DeclareVectorInputPort("velocity_command", 6)
         self._process = self.DeclareVectorInputPort("process_on", 1)
-        # q, qd, sample time, desired q, desired qd, codes of the status: numbers only, because an update of abstract state
+        # q, qd, sample time, desired q, desired qd, arc, codes of the status: numbers only, because an update of abstract state
         # would make Drake copy and compute everything anew, 500 times a second
-        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6), found.codes])
+        start = np.concatenate([found.q, np.zeros(6), [0.0], found.q, np.zeros(6), [0.0], found.codes])
         vector = self.DeclareDiscreteState(start)
         ticket = {self.discrete_state_ticket(vector)}
         self.DeclareVectorOutputPort("desired_state", 12, self._desired, ticket)
@@ -97,6 +108,7 @@ class UrRtdeArm(LeafSystem):
         self.DeclareAbstractOutputPort("X_BF", lambda: AbstractValue.Make(RigidTransform()), self._pose, ticket)
         self.DeclareVectorOutputPort("sample_time", 1, self._time, ticket)
         self.DeclareAbstractOutputPort("status", lambda: AbstractValue.Make(found.status), self._status, ticket)
+        self.DeclareVectorOutputPort("arc_established", 1, self._arc, ticket)
         self.DeclarePeriodicDiscreteUpdateEvent(period_s, 0.0, self._read)
         self.DeclarePeriodicPublishEvent(send_s, 0.0, self._send)
 
@@ -104,11 +116,13 @@ class UrRtdeArm(LeafSystem):
         found = self._link.state()
         old = context.get_discrete_state_vector().value()
         rate = self._clock.rate
-        sampled = max(context.get_time() - self._clock.pace * rate * found.age_s, float(old[12]))
+        age_s = 0.0 if self._clock.follows else self._clock.pace * rate * found.age_s
+        sampled = max(context.get_time() - age_s, float(old[12]))
         qd = found.qd / rate
         ahead = min(context.get_time() + self._period_s - sampled, 0.05)
         desired = np.clip(found.q + ahead * qd, self._arm.position_lower, self._arm.position_upper)
-        discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, found.codes]))
+        arc = float(found.arc is None or found.arc)
+        discrete.set_value(np.concatenate([found.q, qd, [sampled], desired, qd, [arc], found.codes]))
 
     def _send(self, context: Context) -> EventStatus:
         wanted = np.array(self._command.Eval(context))
@@ -134,7 +148,10 @@ class UrRtdeArm(LeafSystem):
         output.set_value(forward_kinematics(self._arm, context.get_discrete_state_vector().value()[:6]))
 
     def _status(self, context: Context, output: Any) -> None:
-        output.set_value(status_of(tuple(context.get_discrete_state_vector().value()[25:])))
+        output.set_value(status_of(tuple(context.get_discrete_state_vector().value()[26:])))
+
+    def _arc(self, context: Context, output: BasicVector) -> None:
+        output.SetAtIndex(0, context.get_discrete_state_vector()[25])
 
     def _time(self, context: Context, output: BasicVector) -> None:
         output.SetFromVector(context.get_discrete_state_vector().value()[12:13])
@@ -153,10 +170,17 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         raise InputError("Only the emulator can run at another pace: leave pace at 1 for a robot.")
     if config.lockstep and not is_loopback(controller_address(config.host)):
         raise InputError("Only the emulator waits for this computer: leave lockstep at false for a robot.")
+    if config.follow and not config.lockstep:
+        raise InputError(
+            "robot.follow needs robot.lockstep: only an emulator that waits for this computer may be waited for."
+        )
     if config.process_output is not None and not 0 <= config.process_output < N_OUTPUTS:
         raise InputError(
             f"robot.process_output must be a standard digital output from 0 to 7, not {config.process_output}."
         )
+    for name in ("arc_input", "arc_fault_input"):
+        if (n := getattr(config, name)) is not None and not 0 <= n < N_OUTPUTS:
+            raise InputError(f"robot.{name} must be a standard digital input from 0 to 7, not {n}.")
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
@@ -172,8 +196,11 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         payload_kg=config.payload_kg,
         payload_cog_m=(x, y, z),
         process_output=config.process_output,
+        arc_input=config.arc_input,
+        arc_fault_input=config.arc_fault_input,
     )
-    return PreparedRobot(arm, link.state().q, link, WallClock(config.pace), config.lockstep)
+    clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
+    return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)
 
 
 def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
@@ -187,5 +214,7 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
     if config.process_output is not None:
         build.inputs["ur10e.process_on"] = arm.GetInputPort("process_on")
+    if config.arc_input is not None:
+        build.outputs["ur10e.arc_established"] = arm.GetOutputPort("arc_established")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
         build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)

@@ -132,6 +132,7 @@ STATE = (
     "process",  # 1 where the process output is on, as the controller reports it
     "residual",  # of the clock fit, s
     "drift",
+    "arc",  # 1 established, 0 not, -1: not wired
 )
 
 

@@ -25,6 +25,7 @@ OUTPUT_ON_S = 0.020
 # The guard itself turns the output off where it waits for a number, and after 20 frames says so: somebody else's after 25.
 OUTPUT_OFF_S = 0.050
 PATIENCE_S, HELD_S = 5.0, 0.010  # in lockstep: of the host's time, of the controller's
+FOLLOWING_PATIENCE_S = 30.0  # where the cell waits for the controller too: no time of the host decides
 
 
 class Action(IntEnum):
@@ -41,6 +42,7 @@ ACTIONS = {
     Fault.STATE_IMPLAUSIBLE: Action.LEAVE,
     **{fault: Action.BRAKE for fault in Fault if Fault.COMMAND_LATE <= fault < Fault.PROTECTIVE_STOP},
     **{fault: Action.STOP for fault in Fault if fault >= Fault.PROTECTIVE_STOP},
+    Fault.ARC_FAULT: Action.BRAKE,
 }
 
 
@@ -82,16 +84,16 @@ class Limits:
             pace=pace,
         )
 
-    def in_lockstep(self) -> Limits:
+    def in_lockstep(self, patience_s: float = PATIENCE_S) -> Limits:
         """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no stop."""
         return replace(
             self,
-            stale_s=max(self.stale_s, PATIENCE_S),
-            stale_process_s=max(self.stale_process_s, PATIENCE_S),
-            late_s=max(self.late_s, PATIENCE_S),
-            lost_s=max(self.lost_s, PATIENCE_S),
-            deaf_s=max(self.deaf_s, PATIENCE_S),
-            jump_s=max(self.jump_s, PATIENCE_S),
+            stale_s=max(self.stale_s, patience_s),
+            stale_process_s=max(self.stale_process_s, patience_s),
+            late_s=max(self.late_s, patience_s),
+            lost_s=max(self.lost_s, patience_s),
+            deaf_s=max(self.deaf_s, patience_s),
+            jump_s=max(self.jump_s, patience_s),
             hold_s=HELD_S / self.pace,
         )
 
@@ -116,6 +118,8 @@ class RobotSample:
     guard_silent_s: float = 0.0  # of the controller's time, since the newest pass of the guard script
     process_on: bool | None = None  # the process output; None where none is wired
     process_asked: bool = False  # whether the newest number that the guard script has read asks for it
+    arc: bool | None = None  # established; None where the input is not wired
+    arc_fault: bool = False  # the power source reports a fault
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +189,8 @@ class Supervisor:
         for look in (self._link(now, robot), self._safety(robot), self._program(robot), self._output(robot)):
             if look[0] is not Fault.NONE:
                 return look
+        if robot.arc_fault and (command.process or robot.process_asked):
+            return Fault.ARC_FAULT, 0.0
         return self._motion(now, robot, command)
 
     def _link(self, now: float, robot: RobotSample) -> tuple[Fault, float]:

@@ -19,7 +19,7 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.precedence import take_priority
-from weldcal.systems.drivers.ur.robot import Refused, Robot
+from weldcal.systems.drivers.ur.robot import ArcInputs, Refused, Robot
 from weldcal.systems.drivers.ur.shared import Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
 from weldcal.systems.drivers.ur.time_scale import TimeScale
@@ -53,6 +53,8 @@ class WorkerConfig:
     payload_cog_m: tuple[float, float, float]
     parent: int
     process_output: int | None = None
+    arc_input: int | None = None
+    arc_fault_input: int | None = None
 
 
 class Worker:
@@ -159,6 +161,7 @@ class Worker:
         values += [sample.robot_mode, sample.safety_mode, sample.runtime_state, sample.speed_scaling]
         values += [decision.fault, decision.detail, self._fault_time, number, sent_at, echo, robot.echo_latency]
         values += [self._worst, self._late, robot.process_on, robot.clock.residual_s, robot.clock.drift]
+        values.append(-1.0 if sample.arc is None else float(sample.arc))
         self._memory.state.write([float(value) for value in values])
 
     def refuse(self, fault: Fault) -> None:
@@ -183,6 +186,7 @@ def main() -> None:
             pace=config.limits.pace,
             arm=config.arm,
             output=config.process_output,
+            arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))

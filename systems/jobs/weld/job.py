@@ -237,6 +237,8 @@ def _add_welding(
         sample_time=out("ur10e.sample_time"),
         job=command,
     )
+    if station.diagram.HasOutputPort("ur10e.arc_established"):
+        wiring.connect(servo, arc_established=out("ur10e.arc_established"))
     guard = wiring.add("singularity_guard", SingularityGuard(station.arm, tool.X_FT))
     wiring.connect(guard, V_BT=servo.GetOutputPort("V_BT"), position_measured=position)
     logged = {

@@ -51,6 +51,7 @@ class WeldingVelocityServo(LeafSystem):
         - position_measured
         - sample_time
         - job
+        - arc_established
         output_ports:
         - V_BT
         - servo_report
@@ -58,7 +59,8 @@ class WeldingVelocityServo(LeafSystem):
         - torch_on
 
     `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B, zero unless the job's mode is `weld`; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
-    (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch.
+    (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch. While it is on and
+    `arc_established` (1; unconnected: always) is 0 the tool stands.
     """
 
     def __init__(self, arm: ArmModel, tool: WeldingTool, config: ServoConfig) -> None:
@@ -69,6 +71,7 @@ class WeldingVelocityServo(LeafSystem):
         self._q = self.DeclareVectorInputPort("position_measured", 6)
         self._time = self.DeclareVectorInputPort("sample_time", 1)
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
+        self._arc = self.DeclareVectorInputPort("arc_established", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(ServoReport()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket | {self._job.ticket()})
@@ -87,7 +90,8 @@ class WeldingVelocityServo(LeafSystem):
                 state.get_mutable_abstract_state(self._state).set_value(report)
             return
         X_BT = forward_kinematics(self._arm, self._q.Eval(context)) @ self._tool.X_FT
-        sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample)
+        arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
+        sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()
         memory, command = welding_step(memory, sample, planned.seam, self._config)
         report = ServoReport(

@@ -43,6 +43,7 @@ LATE_S = 0.05
 SLOWEST, FASTEST = 0.05, 1.0
 PARENT_CHECK_S = 0.2
 WAIT_S = 0.01
+KEEP_ALIVE_S = 0.5
 LONGEST_WAIT_S = 60.0
 
 
@@ -86,18 +87,31 @@ def run_emulator(
     if not 0.0 <= lockstep <= LONGEST_WAIT_S:
         raise InputError(f"Give a lockstep bound from 0 to {LONGEST_WAIT_S:.0f} s, not {lockstep}.")
     controller = Controller(load_arm(robot, kinematics), np.array(q, dtype=np.float64), parse_version(polyscope))
-    _Emulator(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
+    Emulation(controller, host, control_port, pace, lockstep, seed).run(parent, ready)
 
 
-class _Emulator:
+class Emulation:
+    """A controller's ports and its loop. `after_step` is called with the host's time (s) after every step of the controller,
+    before its frame is sent: what it does belongs to the same time, and the controller waits for it.
+    """
+
     def __init__(
-        self, controller: Controller, host: str, control_port: int, pace: float, lockstep: float, seed: int
+        self,
+        controller: Controller,
+        host: str,
+        control_port: int,
+        pace: float,
+        lockstep: float,
+        seed: int,
+        after_step: Callable[[float], None] | None = None,
     ) -> None:
         self._controller = controller
+        self._after_step = after_step
         self._pace = pace
         self._checker = Checker(controller)
         self._lockstep = Lockstep(controller, lockstep)
         self._world = World()
+        self._sent_at = 0.0
         self._network = Network(host, seed)
         self._rng = np.random.default_rng([seed, 1])
         heard = self._checker.heard
@@ -129,6 +143,8 @@ class _Emulator:
         self._lockstep.heard(connection, recipe, now)
 
     def run(self, parent: int | None, ready: Callable[[str], None] | None) -> None:
+        """Run until it is asked to quit, by signal or on the control channel, or until process `parent` is gone."""
+
         def stop(*_: object) -> None:
             self._world.quit = True
 
@@ -137,8 +153,9 @@ class _Emulator:
         if ready is not None:
             ready(self._sentence)
         gc.freeze()
-        with suppress(OSError):  # a controller has a computer of its own: run first, where that is allowed
-            os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
+        if self._after_step is None:  # one that carries a world would keep everything else from the processors
+            with suppress(OSError):  # a controller has a computer of its own: run first, where that is allowed
+                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(3))
         try:
             self._loop(parent)
         finally:
@@ -163,6 +180,9 @@ class _Emulator:
                 deadline = clock()
                 continue
             if self._lockstep.waits(now):
+                if now - self._sent_at > KEEP_ALIVE_S:  # clients close a connection on which nothing comes for seconds
+                    self._sent_at = now
+                    self._rtde.frame(now)
                 network.flush(now)
                 network.poll(WAIT_S, clock)
                 deadline = max(deadline, clock())  # what was waited is not made up for
@@ -180,10 +200,13 @@ class _Emulator:
 
     def _frame(self, now: float) -> None:
         world, network, controller = self._world, self._network, self._controller
+        self._sent_at = now
         if world.unplugged_until is not None and now >= world.unplugged_until:
             world.unplugged_until = None
             network.plug()
         controller.step()
+        if self._after_step is not None:
+            self._after_step(now)
         self._checker.frame(now)
         if world.unplugged_until is None:
             for server in self._servers:

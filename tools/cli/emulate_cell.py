@@ -1,0 +1,37 @@
+"""weldcal emulate-cell: the physical world of a cell as a process, behind the wires of its devices."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from weldcal.tools.cli.options import Call, command, option
+
+
+@command("emulate-cell", common=("seed", "debug"), short_help="Play a cell's hardware on loopback.")
+def emulate_cell(
+    call: Call,
+    scenario: Annotated[
+        str, option("--scenario", "NAME", "The world: a scenario with simulated devices, by name or path.")
+    ] = "s_groove",
+    cell: Annotated[
+        str | None, option("--cell", "NAME", "Scenario with the devices' addresses; without it wired_NAME.")
+    ] = None,
+    truth: Annotated[Path | None, option("--truth", "FILE", "Write here what is true and how the weld was.")] = None,
+    pace: Annotated[float | None, option("--pace", "P", "Fastest speed relative to real time, 0.05 to 1.")] = None,
+    control_port: Annotated[
+        int, option("--control-port", "PORT", "Port that takes injected faults, as JSON lines.")
+    ] = 30090,
+) -> None:
+    """Play robot, scanner, finger camera, torch and workpiece of a cell on loopback, until it is interrupted."""
+    from weldcal.tools.commands.emulate_cell import emulate
+
+    emulate(
+        scenario,
+        cell,
+        call.seed,
+        truth=truth,
+        pace=pace,
+        control_port=control_port,
+        ready=lambda s: typer.echo(f"ready: {s}"),
+    )

@@ -1,0 +1,117 @@
+"""The world's physics: one plant step for each frame of the controller, and the record of what the torch really did."""
+
+import dataclasses as dc
+
+import numpy as np
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.planning.clearance import lowest_point, self_distance
+from weldcal.models.arms.kinematics import ArmModel, link_frames
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.systems.drivers.config import NoDevice
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
+from weldcal.systems.drivers.station_build import PreparedRobot
+from weldcal.systems.jobs.discovery import job_of
+from weldcal.systems.motion.clear_moves import station_bodies
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.station import Station, make_station
+from weldcal.tools.emulators.cell.arc import Arc
+from weldcal.tools.emulators.cell.world_arm import Repeatability, WorldArm
+
+STEP_S = 0.002
+LOG_EVERY = 4  # frames: the servo's period
+COLLISION_EVERY = 20
+
+
+def true_station(scenario: Scenario, arm: ArmModel, seed: int) -> Station:
+    """The simulated station of a scenario whose arm stands where its controller has moved it; all else follows from `seed`.
+
+    Raises:
+        InputError: the scenario has no simulated scanner, no workpiece or no finger camera.
+    """
+    scenario = dc.replace(scenario, robot=WorldArm())
+    if not (scenario.scanner.SIMULATED and scenario.finger_camera.SIMULATED) or scenario.workpiece is None:
+        raise InputError(
+            "The world needs a scenario with a simulated scanner, a simulated finger camera and a workpiece, such as s_groove."
+        )
+    if not isinstance(scenario.robot_2, NoDevice):
+        raise InputError("The world has one arm: remove robot_2 from its scenario.")
+    q_home = np.deg2rad(scenario.home_deg)
+    return make_station(scenario, seed, PreparedRobot(arm, q_home), job_of(scenario).furnish)
+
+
+def still(station: Station, q: Array) -> tuple[Simulator, Context]:
+    """A simulator of the station with the joint servos' reference at `q` (6,) rad and every other input at zero."""
+    simulator = Simulator(station.diagram)
+    context = simulator.get_mutable_context()
+    for k in range(station.diagram.num_input_ports()):
+        port = station.diagram.get_input_port(k)
+        port.FixValue(context, np.concatenate([q, np.zeros(6)]) if port.get_name() == "arm.desired_state" else 0.0)
+    return simulator, context
+
+
+class Physics:
+    """The plant of the world, advanced by the controller's frames."""
+
+    def __init__(self, scenario: Scenario, arm: ArmModel, seed: int, repeatability_mm: float) -> None:
+        self.station = true_station(scenario, arm, seed)
+        assert self.station.world is not None
+        assert self.station.tool is not None
+        self.world: SimulatedWorld = self.station.world
+        self._table_z_m = scenario.calibration.table_z_m
+        self._joints = Repeatability(arm, repeatability_mm, seed)
+        self._arm = arm
+        self._bodies = station_bodies(self.station)
+        self._simulator, self._context = still(self.station, self.station.q_start)
+        self._simulator.Initialize()
+        diagram, plant = self.station.diagram, self.world.plant
+        self._desired = diagram.GetInputPort("arm.desired_state")
+        self._torch_port = diagram.GetOutputPort("cheat.torch")
+        self._plant_context = plant.GetMyContextFromRoot(self._context)
+        self._poses = plant.get_body_poses_output_port()
+        tool = self.station.tool
+        assert self.world.tool is not None
+        self._plate, self._tip = (
+            int(plant.GetBodyByName(name, self.world.tool).index()) for name in ("tool_plate", "tip_z")
+        )
+        self._X_TM = tool.X_FT.InvertAndCompose(tool.X_FM_rest)
+        self._frame = 0
+        self.time_s = 0.0
+        self.arc_on_s = 0.0
+        self.torch: list[Array] = []  # (3,) m in B, at the servo's rate, while the arc burns
+        self.collisions = 0
+        self._touches = False
+
+    def step(self, q: Array, qd: Array, arc: Arc) -> None:
+        """Advance by one frame with the controller's joints (6,) rad, rad/s; `arc` tells whether the arc burns."""
+        self._frame += 1
+        self.time_s = STEP_S * self._frame
+        true_q = self._joints.true_joints(q, qd)
+        self._desired.FixValue(self._context, np.concatenate([true_q, qd]))
+        self._simulator.AdvanceTo(self.time_s)
+        if arc.burns:
+            self.arc_on_s += STEP_S
+            if self._frame % LOG_EVERY == 0:
+                self.torch.append(np.array(self._torch_port.Eval(self._context)))
+        if self._frame % COLLISION_EVERY == 0:
+            frames = link_frames(self._arm, true_q)
+            touches = lowest_point(self._bodies, frames) < self._table_z_m or self_distance(self._bodies, frames) < 0.0
+            self.collisions += int(touches and not self._touches)
+            self._touches = touches
+
+    def forget(self) -> None:
+        """Begin the record of another job."""
+        self.arc_on_s, self.collisions = 0.0, 0
+        self.torch.clear()
+
+    def positions(self) -> Array:
+        """All positions of the plant, as the scanner's process poses its copy of it."""
+        return np.array(self.world.plant.GetPositions(self._plant_context))
+
+    def tag(self) -> Array:
+        """The tag's pose in the flange frame, X_FM (4, 4), with the soft tip as it is bent now."""
+        poses = self._poses.Eval(self._plant_context)
+        found = poses[self._plate].InvertAndCompose(poses[self._tip]) @ self._X_TM
+        return np.asarray(found.GetAsMatrix4())

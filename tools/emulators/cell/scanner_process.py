@@ -1,0 +1,138 @@
+"""Process of the world's 3D scanner: a line over TCP triggers it, and it drops a cloud into a folder."""
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.arrays import Array
+from weldcal.systems.messages import Scan
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.tools.emulators.cell.physics import still, true_station
+
+EXPOSED_S = 0.3  # of the copy's time: a little longer than the scanner's exposure
+POSE_LIMIT_S = 30.0
+LONGEST_LINE = 4096
+
+
+@dataclass(frozen=True)
+class ScannerSetup:
+    """What the scanner's process is started with. It listens at `host`:`port` and writes into `folder`."""
+
+    scenario: str  # of the world, by name or path
+    arm: ArmModel
+    seed: int
+    host: str
+    port: int
+    folder: Path
+
+
+class Renderer:
+    """A copy of the world that is posed as the world is when the scanner is triggered."""
+
+    def __init__(self, setup: ScannerSetup) -> None:
+        self._station = true_station(load_scenario(setup.scenario), setup.arm, setup.seed)
+        assert self._station.world is not None
+        self._world = self._station.world
+        self._scans = 0
+
+    def scan(self, positions: Array) -> Array:
+        """The organised cloud (H, W, 3) m, float32, of a world with these positions of its plant, at rest."""
+        self._scans += 1
+        plant = self._world.plant
+        simulator, context = still(self._station, positions[:6])
+        plant.SetPositions(plant.GetMyContextFromRoot(context), positions)
+        diagram = self._station.diagram
+        diagram.GetInputPort("arm.desired_state").FixValue(context, np.concatenate([positions[:6], np.zeros(6)]))
+        diagram.GetInputPort("scanner.trigger").FixValue(context, float(self._scans))
+        simulator.AdvanceTo(EXPOSED_S)
+        found: Scan = diagram.GetOutputPort("scanner.scan").Eval(context)
+        if not found.sequence:
+            raise RuntimeError("the scanner made no scan within its exposure")
+        return np.asarray(found.points_C, dtype=np.float32)
+
+
+def drop(folder: Path, number: int, points: Array, capture_time: float, request: int) -> Path:
+    """Write a cloud as a program of a real scanner should: the note first, then the cloud under another name, then its name."""
+    name = f"scan_{number:04d}"
+    hidden, path = folder / f".{name}.json.tmp", folder / f"{name}.json"
+    hidden.write_text(json.dumps({"capture_time": capture_time, "request": request}), encoding="ascii")
+    os.replace(hidden, path)
+    hidden, path = folder / f".{name}.npz.tmp", folder / f"{name}.npz"
+    with hidden.open("wb") as file:
+        np.savez(file, points=points)
+    os.replace(hidden, path)
+    return path
+
+
+def run_scanner(setup: ScannerSetup, world: Connection) -> None:
+    """Serve until the world closes its end of the pipe. `world` answers "pose" with (Unix time s, plant positions)."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    renderer = Renderer(setup)
+    with socket.create_server((setup.host, setup.port)) as server, contextlib.suppress(EOFError, OSError):
+        world.send("ready")
+        server.settimeout(0.2)
+        numbers = iter(range(1, 1_000_000))
+        while True:
+            with contextlib.suppress(TimeoutError):
+                client, _ = server.accept()
+                with client:
+                    _serve(client, renderer, setup.folder, world, numbers)
+            _still_there(world)
+
+
+def _serve(client: socket.socket, renderer: Renderer, folder: Path, world: Connection, numbers: Iterator[int]) -> None:
+    """Answer the lines of one client until it leaves: `ok N` when the scan of `scan N` lies in the folder, or `error TEXT`."""
+    client.settimeout(0.2)
+    unread = b""
+    while True:
+        try:
+            found = client.recv(LONGEST_LINE)
+        except TimeoutError:
+            _still_there(world)
+            continue
+        except OSError:
+            return
+        if not found:
+            return
+        *lines, unread = (unread + found).split(b"\n")
+        unread = unread[-LONGEST_LINE:]
+        for line in lines:
+            answer = _answer(line.decode("ascii", "replace").strip(), renderer, folder, world, next(numbers))
+            try:
+                client.sendall(answer.encode("ascii") + b"\n")
+            except OSError:
+                return
+
+
+def _answer(line: str, renderer: Renderer, folder: Path, world: Connection, number: int) -> str:
+    word, _, request = line.partition(" ")
+    if word != "scan" or not request.isdigit():
+        return "error send: scan N"
+    world.send("pose")
+    if not world.poll(POSE_LIMIT_S):
+        return "error the world stands still"
+    taken, positions = world.recv()
+    drop(folder, number, renderer.scan(positions), taken, int(request))
+    return f"ok {request}"
+
+
+def _still_there(world: Connection) -> None:
+    """Raise EOFError where the world has ended."""
+    if world.poll(0.0):
+        world.recv()
+
+
+def unix_now() -> float:
+    """The host's clock, Unix time in s."""
+    return time.time()

@@ -1,0 +1,296 @@
+"""The world process: the controller, its arm's surroundings, and the processes of scanner and finger camera."""
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from weldcal.models.arms.kinematics import load_arm
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.systems.addresses import loopback_address
+from weldcal.systems.drivers.sensors.folder_scanner import FolderScanner
+from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
+from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
+from weldcal.systems.drivers.simulated.ur import SimulatedUr
+from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.emulators.cell.arc import Arc
+from weldcal.tools.emulators.cell.finger_process import FingerSetup, run_finger_camera
+from weldcal.tools.emulators.cell.physics import STEP_S, Physics
+from weldcal.tools.emulators.cell.scanner_process import ScannerSetup, run_scanner, unix_now
+from weldcal.tools.emulators.cell.score import score
+from weldcal.tools.emulators.ur.addresses import take_address
+from weldcal.tools.emulators.ur.controller.core import Controller
+from weldcal.tools.emulators.ur.main import Emulation
+from weldcal.tools.emulators.ur.process import CONTROL_PORT
+from weldcal.tools.emulators.ur.versions import parse_version
+
+START_LIMIT_S = 120.0
+WAITS_S = 30.0  # for a cell that is late, of the host
+REST_RAD_S = 1e-3
+RESTS_S = 0.2
+CAMERA_LIMIT_S = 1.0  # of the host: a camera that does not answer is not waited for longer
+Truth = dict[str, object]
+
+
+@dataclass(frozen=True)
+class Wires:
+    """Where the devices are, as the cell's scenario names them."""
+
+    host: str
+    pace: float
+    payload_kg: float
+    payload_cog_m: tuple[float, float, float]
+    process_output: int | None
+    arc_input: int | None
+    fault_input: int | None
+    folder: Path
+    trigger: tuple[str, int]
+    stream: tuple[str, int]
+
+
+def wires_of(cell: Scenario) -> Wires:
+    """The wires of a cell's scenario, all on loopback.
+
+    Raises:
+        InputError: a device of the scenario is not by wire, or not on loopback.
+    """
+    robot, scanner, camera = cell.robot, cell.scanner, cell.finger_camera
+    if not (isinstance(robot, UrRtde) and isinstance(scanner, FolderScanner) and isinstance(camera, VideoFingerCamera)):
+        raise InputError(
+            "The cell's scenario must have a robot !UrRtde, a scanner !FolderScanner and a finger_camera !VideoFingerCamera, "
+            "such as wired_s_groove."
+        )
+    trigger, stream = urlsplit(scanner.trigger), urlsplit(camera.source)
+    if trigger.scheme != "tcp" or stream.scheme != "http" or not scanner.folder:
+        raise InputError(
+            "The world needs scanner.folder, scanner.trigger: tcp://HOST:PORT and finger_camera.source: http://HOST:PORT/PATH in "
+            "the cell's scenario."
+        )
+    x, y, z = robot.payload_cog_m
+    return Wires(
+        loopback_address(robot.host),
+        robot.pace,
+        robot.payload_kg,
+        (x, y, z),
+        robot.process_output,
+        getattr(robot, "arc_input", None),
+        getattr(robot, "arc_fault_input", None),
+        Path(scanner.folder),
+        (loopback_address(trigger.hostname or ""), trigger.port or 0),
+        (loopback_address(stream.hostname or ""), stream.port or 0),
+    )
+
+
+class _World:
+    """What happens in each frame of the controller."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        physics: Physics,
+        wires: Wires,
+        camera: RenderedFingerCamera,
+        scanner: Connection,
+        finger: Connection,
+        wanted_m: float | None,
+        write: Callable[[Truth], None],
+    ) -> None:
+        self._controller, self._physics, self._wires = controller, physics, wires
+        self._scanner, self._finger, self._wanted_m, self._write = scanner, finger, wanted_m, write
+        self._arc = Arc()
+        self._every = 1.0 / camera.rate_hz
+        self._latency_s = camera.latency_s
+        self._next_picture = 0.0
+        self._unshown = False
+        self._pictures: deque[tuple[float, tuple[float, Array]]] = deque()
+        self._programs = controller.script_count
+        self._rests_s, self._dirty = 0.0, True
+
+    def step(self, now: float) -> None:
+        """One frame of the world, after the controller's."""
+        c, physics, wires = self._controller, self._physics, self._wires
+        enabled = wires.process_output is not None and bool(c.terminals.digital_outputs >> wires.process_output & 1)
+        burned = self._arc.burns
+        self._arc.step(enabled, STEP_S)
+        self._set_input(wires.arc_input, self._arc.burns)
+        self._set_input(wires.fault_input, self._arc.fault)
+        if c.script_count != self._programs:
+            if not c.terminals.digital_outputs and c.program is not None and c.program.kind != "sec":
+                physics.forget()
+            self._programs = c.script_count
+        physics.step(c.arm.q, c.arm.qd, self._arc)
+        self._expose()
+        self._answer_scanner()
+        rests = float(np.abs(c.arm.qd).max()) < REST_RAD_S
+        self._rests_s = self._rests_s + STEP_S if rests else 0.0
+        self._dirty |= burned != self._arc.burns or not rests
+        if self._dirty and ((burned and not self._arc.burns) or self._rests_s > RESTS_S):
+            self.write()
+
+    def write(self) -> None:
+        """Write the truth as it is now."""
+        self._dirty = False
+        rests = float(np.abs(self._controller.arm.qd).max()) < REST_RAD_S
+        self._write(score(self._physics, self._wanted_m, arc_burns=self._arc.burns, at_rest=rests))
+
+    def _set_input(self, n: int | None, on: bool) -> None:
+        if n is not None:
+            t = self._controller.terminals
+            t.digital_inputs = t.digital_inputs & ~(1 << n) | int(on) << n
+
+    def _expose(self) -> None:
+        """Take a picture where one is due, and send those whose latency is over."""
+        t = self._physics.time_s
+        if t >= self._next_picture - 1e-9:
+            self._next_picture += self._every
+            self._pictures.append((t + self._latency_s, (unix_now(), self._physics.tag())))
+        while self._pictures and t >= self._pictures[0][0]:
+            picture = self._pictures.popleft()[1]
+            with contextlib.suppress(OSError, EOFError):
+                # the world waits for its camera: no picture is late by more than this computer
+                if self._unshown and self._finger.poll(CAMERA_LIMIT_S):
+                    self._finger.recv()
+                    self._unshown = False
+                if not self._unshown:
+                    self._finger.send(picture)
+                    self._unshown = True
+
+    def _answer_scanner(self) -> None:
+        with contextlib.suppress(OSError, EOFError):
+            if self._scanner.poll(0.0):
+                self._scanner.recv()
+                self._scanner.send((unix_now(), self._physics.positions()))
+
+
+def run_world(
+    world_name: str,
+    cell_name: str,
+    seed: int,
+    *,
+    write: Callable[[Truth], None],
+    ready: Callable[[str], None],
+    pace: float | None = None,
+    control_port: int = CONTROL_PORT,
+) -> None:
+    """Play the world behind a cell's wires until the process is asked to end (SIGTERM or SIGINT).
+
+    Args:
+        world_name: what is true: a scenario, by name or path, with simulated devices; its deviations follow from `seed`.
+        cell_name: the scenario with what the cell knows, and on which addresses it looks for its devices.
+        seed: of everything random.
+        write: called with the contents of the truth file whenever they have changed.
+        ready: called once with a sentence when every device answers.
+        pace: fastest controller seconds per host second; None: the cell's. The controller waits for the physics.
+        control_port: port that takes the controller's injected faults.
+
+    Raises:
+        InputError: the scenarios cannot be played, or an address is taken.
+    """
+    world, cell = load_scenario(world_name), load_scenario(cell_name)
+    wires = wires_of(cell)
+    camera, device = world.finger_camera, world.robot
+    if not isinstance(camera, RenderedFingerCamera):
+        raise InputError("The world's finger camera is !RenderedFingerCamera.")
+    wires.folder.mkdir(parents=True, exist_ok=True)
+    arm = load_arm(world.arm, None if world.kinematics is None else Path(world.kinematics))
+    q_home = np.deg2rad(world.home_deg)
+    millimetres = device.repeatability_mm if isinstance(device, SimulatedUr) else 0.0
+    context = get_context("spawn")
+    with take_address(wires.host, 10.0), contextlib.ExitStack() as stack:
+        setup = ScannerSetup(world_name, arm, seed, *wires.trigger, wires.folder)
+        scanner = _start(context, stack, run_scanner, setup)
+        physics = Physics(world, arm, seed, millimetres)
+        assert physics.station.tool is not None
+        finger = _start(
+            context,
+            stack,
+            run_finger_camera,
+            FingerSetup(physics.station.tool, camera.camera(), seed, *wires.stream),
+        )
+        controller = Controller(arm, q_home, parse_version("5.21"))
+        controller.payload.mass, controller.payload.center = wires.payload_kg, list(wires.payload_cog_m)
+        length = cell.welding.seam_length_mm
+        inside = _World(
+            controller,
+            physics,
+            wires,
+            camera,
+            scanner.pipe,
+            finger.pipe,
+            None if length is None else 1e-3 * length,
+            write,
+        )
+        emulation = Emulation(
+            controller,
+            wires.host,
+            control_port,
+            wires.pace if pace is None else pace,
+            WAITS_S,
+            seed,
+            after_step=inside.step,
+        )
+        stack.callback(inside.write)
+        for child in (scanner, finger):
+            child.wait_until_ready()
+        sentence = (
+            f"The cell's world answers: robot {wires.host}, scans in {wires.folder}, trigger {setup.host}:{setup.port} (process "
+            f"{scanner.pid}), pictures http://{wires.stream[0]}:{wires.stream[1]}/ (process {finger.pid}), faults at port "
+            f"{control_port}."
+        )
+        inside.write()
+        emulation.run(None, lambda _: ready(sentence))
+
+
+class _Child:
+    """A device's process and the world's end of its pipe."""
+
+    def __init__(self, process: Any, pipe: Connection) -> None:
+        self._process, self.pipe = process, pipe
+
+    @property
+    def pid(self) -> int:
+        """The process's id."""
+        return int(self._process.pid)
+
+    def wait_until_ready(self) -> None:
+        """Wait for its first message. Raises InputError where it ends instead."""
+        until = time.monotonic() + START_LIMIT_S
+        while time.monotonic() < until and self._process.is_alive():
+            if self.pipe.poll(0.1):
+                with contextlib.suppress(EOFError):
+                    self.pipe.recv()
+                    return
+                break
+        raise InputError("A device of the world did not start; is its port taken by another program?")
+
+    def close(self) -> None:
+        """Close the pipe and end the process."""
+        self.pipe.close()
+        self._process.join(0.2)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join(3.0)
+        if self._process.is_alive():
+            self._process.kill()
+            self._process.join()
+
+
+def _start(context: Any, stack: contextlib.ExitStack, target: Callable[..., None], setup: object) -> _Child:
+    ours, its = context.Pipe()
+    process = context.Process(target=target, args=(setup, its), daemon=True)
+    process.start()
+    its.close()
+    child = _Child(process, ours)
+    stack.callback(child.close)
+    return child
