@@ -197,9 +197,10 @@ def test_a_bare_flange_has_no_centre_of_gravity(robot: Emulator) -> None:
         default = weldcal(robot.host, "--json")
     finally:
         robot.do("set_payload", mass=1.4, cog=[0.03, 0.0, 0.05])
-    assert named.returncode == 0, named.stderr
-    (found,) = [check["found"] for check in json.loads(named.stdout)["checks"] if check["name"] == "payload"]
-    assert found == "0.00 kg at (0, 0, 70) mm (scenario calibrate_only)"
+    checks = {check["name"]: check for check in json.loads(named.stdout)["checks"]}
+    # the last one is this computer's timing, which depends on what else it does
+    assert [name for name in CHECKS if checks[name]["state"] != "ok"] == [], named.stderr
+    assert checks["payload"]["found"] == "0.00 kg at (0, 0, 70) mm (scenario calibrate_only)"
     assert default.returncode == 1
     assert "The payload is not that of the welding tool" in default.stderr
 
@@ -264,7 +265,7 @@ def test_registers_of_the_lower_range_are_asked_for_where_the_driver_uses_them(r
     assert preflight(robot.host).ok
     problem = preflight(robot.host, upper_registers=False).first_problem
     assert problem is not None
-    assert problem.found == "int 0-1, double 3 in use"
+    assert problem.found == "int 0, double 3 in use"
 
 
 def test_a_command_that_an_earlier_client_left_behind_is_told_and_left_alone(robot: Emulator) -> None:
@@ -547,9 +548,7 @@ def test_the_command_ends_with_1_and_the_first_sentence(robot: Emulator) -> None
 
 
 def test_the_command_needs_no_project_and_no_robot(nobody: str) -> None:
-    start = time.monotonic()
     finished = weldcal(nobody)
-    assert time.monotonic() - start < 20.0
     assert finished.returncode == 1
     assert "port 30004 is closed" in finished.stderr
     assert "Traceback" not in finished.stderr
