@@ -266,7 +266,9 @@ def test_what_streams_to_the_emulated_robot_runs_one_by_one_and_first() -> None:
     others = ["tests/hardware/test_emulator_wire.py::test_a", "tests/scenario/test_mounting_cell.py::test_a[b/c.py::d]"]
     assert [scheduling._split_scope(test) for test in others] == [test.partition("::")[0] for test in others]
     assert len({scheduling._split_scope(f"{path}::test_a") for path in DEMO}) == 1
-    first, last = (SimpleNamespace(path=ROOT / test.partition("::")[0]) for test in (streams[-1], others[-1]))
+    first, last = (
+        SimpleNamespace(path=ROOT / test.partition("::")[0], nodeid=test) for test in (streams[-1], others[-1])
+    )
     assert order(first) < order(last)  # type: ignore[arg-type]
 
 
