@@ -71,6 +71,11 @@ class StationBuild:
     outputs: dict[str, OutputPort] = field(default_factory=dict)
     closables: list[Closable] = field(default_factory=list)
 
+    @property
+    def may_wait(self) -> bool:
+        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait for it."""
+        return self.robot is None or self.robot.clock is None or self.robot.waits
+
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""
         return next((part for part in self.parts if isinstance(part, kind)), None)
