@@ -23,7 +23,6 @@ from tests.hardware.emulator_process import Emulator, emulator_process
 from tests.places import ROOT
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur.dashboard import ask, stop_program
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import SENTENCES
 from weldcal.systems.drivers.ur.readiness import preflight as module
@@ -31,7 +30,8 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import KinematicsInfo,
 from weldcal.systems.drivers.ur.readiness.load import ExpectedLoad
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, Preflight, preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.dashboard import ask, stop_program
+from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.check_robot import emit_table

@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from weldcal.systems.addresses import AddressError, controller_address, is_loopback, loopback_address, own_address
-from weldcal.systems.drivers.ur.line import Line
+from weldcal.systems.drivers.ur.wire.line import Line
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.robots import chosen_robot

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.systems.drivers.ur.dashboard import stop_program
 from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.faults import Fault, sentence
 from weldcal.systems.drivers.ur.readiness.operator_actions import ROBOT_MODES, SAFETY_MODES
 from weldcal.systems.drivers.ur.shared import STATE, Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import ACTIONS, Action, Limits
+from weldcal.systems.drivers.ur.wire.dashboard import stop_program
 from weldcal.systems.drivers.ur.worker import Phase, WorkerConfig
 from weldcal.systems.messages import UrStatus
 

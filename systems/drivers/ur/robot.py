@@ -12,15 +12,15 @@ import numpy as np
 
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian
 from weldcal.systems.drivers.ur.clock import ClockMap
-from weldcal.systems.drivers.ur.dashboard import SCRIPT_PORT
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.line import Line
-from weldcal.systems.drivers.ur.off_switch import OffSwitch
 from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, UPPER_OFFSET, register_names
-from weldcal.systems.drivers.ur.rtde_stream import RtdeStream
-from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe, Value
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
+from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
+from weldcal.systems.drivers.ur.wire.line import Line
+from weldcal.systems.drivers.ur.wire.off_switch import OffSwitch
+from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
 
 # of the guard: commands in the integer register, with at most eight numbers; what it answers
 NO_COMMAND, VELOCITY, SPEED_STOP, SET_PAYLOAD, STOP_SCRIPT = 0, 9, 15, 17, 255

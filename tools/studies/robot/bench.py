@@ -15,11 +15,11 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, kinematics_and_jacobian, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError, WeldcalError
-from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.link import LinkState, UrLink
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.drivers.ur.wire.dashboard import ask
 from weldcal.systems.pacing import real_time_priority
 from weldcal.tools.emulators.ur.main import HOME
 from weldcal.tools.emulators.ur.process import Emulator

@@ -12,7 +12,7 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_li
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.errors import RobotRefused
-from weldcal.systems.drivers.ur.line import Line
+from weldcal.systems.drivers.ur.wire.line import Line
 
 PRIMARY_PORT = 30001
 # With the right calibration FK agrees with the controller to 10-20 um; without it, to millimetres.

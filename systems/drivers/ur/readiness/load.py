@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
-from weldcal.systems.drivers.ur.rtde_wire import Value
+from weldcal.systems.drivers.ur.wire.rtde_client import Value
 
 PAYLOAD_OUTPUTS = ("payload", "payload_cog")
 # A pendant shows hundredths of a kilogram and millimetres; a weighed tool is known no better than this.

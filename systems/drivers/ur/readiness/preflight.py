@@ -13,7 +13,6 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.ur.dashboard import ask
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.readiness.kinematics_info import (
@@ -32,7 +31,8 @@ from weldcal.systems.drivers.ur.readiness.load import (
 )
 from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET, ranges, register_names
 from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported
-from weldcal.systems.drivers.ur.rtde_wire import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
+from weldcal.systems.drivers.ur.wire.dashboard import ask
+from weldcal.systems.drivers.ur.wire.rtde_client import IN_USE, NOT_FOUND, RTDE_PORT, RtdeProbe, Value
 
 RUNNING, NORMAL, REDUCED, STOPPED = 7, 1, 2, 1
 FULL_SPEED = 0.99

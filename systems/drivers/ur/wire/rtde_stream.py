@@ -1,6 +1,6 @@
 """The stream of packages between the worker and the controller: the newest outputs are read, the command registers written.
 
-One connection, no thread: the worker's loop reads what has arrived. Packages as in `rtde_wire`.
+One connection, no thread: the worker's loop reads what has arrived. Packages as in `rtde_client`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import time
 from collections.abc import Sequence
 
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.rtde_wire import CODES, IN_USE, NOT_FOUND, RtdeProbe
+from weldcal.systems.drivers.ur.wire.rtde_client import CODES, IN_USE, NOT_FOUND, RtdeProbe
 
 E_SERIES, FASTEST_HZ, CB3_HZ = 5, 500.0, 125.0
 DATA = ord("U")

@@ -4,7 +4,7 @@ import contextlib
 import struct
 
 from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
-from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
+from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 
 TIMEOUT_S = 2.0
 MASK, VALUE = "standard_digital_output_mask", "standard_digital_output"

@@ -1,7 +1,7 @@
 """Client of the PolyScope 5 dashboard: sends one command line and reads one answer, on a new connection each time."""
 
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
-from weldcal.systems.drivers.ur.line import Line
+from weldcal.systems.drivers.ur.wire.line import Line
 
 DASHBOARD_PORT = 29999
 SCRIPT_PORT = 30003

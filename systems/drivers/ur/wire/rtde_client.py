@@ -10,7 +10,7 @@ import struct
 from collections.abc import Sequence
 from types import TracebackType
 
-from weldcal.systems.drivers.ur.line import Line
+from weldcal.systems.drivers.ur.wire.line import Line
 
 RTDE_PORT = 30004
 IN_USE, NOT_FOUND = "IN_USE", "NOT_FOUND"

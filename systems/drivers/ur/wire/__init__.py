@@ -1,0 +1,1 @@
+"""The connections to a controller: RTDE, dashboard and the line under both."""
