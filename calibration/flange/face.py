@@ -22,6 +22,7 @@ _BORE_SEEN = 0.25
 _FILLED = 0.4  # share of the bore's core that must not be face
 _HOLLOW = 0.7  # share of the ring between the edges that must be face; its holes take up to a seventh of it
 _FULL = 0.85  # and must be where the bore's edge itself was not found
+_MIXED, _MOST_MIXED = 1.5, 0.2  # pitches, and at most this share of the ring
 _SHARED = 1.3  # variance of a labelled edge over the expected one, from simulated scans with noise, gaps and chamfers
 
 
@@ -177,8 +178,8 @@ def _measure(
         ring = _between(
             scene.points - center3,
             plane.normal,
-            inner + 0.5 * pitch,
-            outer.radius - 0.5 * pitch,
+            inner + _margin(pitch, outer.radius - inner),
+            outer.radius - _margin(pitch, outer.radius - inner),
             2.0 * thickness(plane),
         )
         try:
@@ -227,6 +228,12 @@ def _measure(
         / max(full, 1e-9),
     )
     return judge(measured, standard, config, refusal)
+
+
+def _margin(pitch: float, width: float) -> float:
+    """How far (m) from its edges a face ``width`` wide is taken for the plane: points within a pixel of an edge are mixed with what
+    lies behind it, and with 0.5 mm of noise they are not told from the face."""
+    return min(_MIXED * pitch, _MOST_MIXED * width)
 
 
 def _between(d: Array, normal: Array, inner: float, outer: float, height: float) -> NDArray[np.bool_]:

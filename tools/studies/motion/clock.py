@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
@@ -14,6 +14,7 @@ from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.render import write_atomic
+from weldcal.tools.studies.motion.exact import exact_errors
 from weldcal.tools.studies.motion.moves import DELAY_S, cube_moves, observed_frames, recorded_stream
 from weldcal.tools.studies.output import markdown_table
 
@@ -28,7 +29,8 @@ Estimator = Callable[..., MotionEstimate]
 class ClockRuns:
     """Runs of one kind (``device`` times or arrivals), each of ``duration_s``: errors (N, 7) of X_BC's six and the offset (rad, m, s)
     and the same in sigmas ``scaled`` (N, 7); ``nees`` (N,) of X_BC over its six; ``own_ms`` (N,) error of the offset against the mean
-    delay of the recording's own frames; ``work_mm`` (N,) error of a point in the middle of the work; ``turn_deg`` (N,)."""
+    delay of the recording's own frames; ``work_mm`` (N,) error of a point in the middle of the work; ``turn_deg`` (N,). ``exact`` (N, 7) are the errors in
+    sigmas of a least-squares fit that knows the motion exactly, of device times: what the draws themselves are. NaN for arrivals."""
 
     device: bool
     duration_s: float
@@ -38,6 +40,7 @@ class ClockRuns:
     own_ms: Array
     work_mm: Array
     turn_deg: Array
+    exact: Array
 
     @property
     def coverage(self) -> float:
@@ -59,6 +62,9 @@ class ClockRuns:
             "offset_own_mean_worst_ms": float(np.abs(self.own_ms).max()),
             "nees": float(self.nees.mean()),
             "nees_per_unknown": [float(v) for v in (self.scaled**2).mean(axis=0)],
+            "nees_per_unknown_of_exact_fits": [float(v) for v in (self.exact**2).mean(axis=0)] if self.device else None,
+            "offset_coverage_of_exact_fits": float((np.abs(self.exact[:, 6]) < SIGMAS).mean()) if self.device else None,
+            "nees_per_unknown_chance": [float(chi2.ppf(q, len(offset)) / len(offset)) for q in (0.005, 0.995)],
             "work_p95_mm": float(np.percentile(self.work_mm, 95)),
             "work_worst_mm": float(self.work_mm.max()),
             "turn_worst_deg": float(self.turn_deg.max()),
@@ -81,7 +87,7 @@ def run_clock_study(
         for k in range(runs):
             progress(name, (k + runs * device) / (2 * runs))
             rows.append(_one(device, duration_s, np.random.default_rng([seed, k, int(device)]), k % 2 == 1, estimate))
-        parts = [np.array([row[i] for row in rows]) for i in range(6)]
+        parts = [np.array([row[i] for row in rows]) for i in range(7)]
         found[name] = ClockRuns(device, duration_s, *parts)
     if folder is not None:
         write_atomic(folder / "motion_clock.md", clock_table(found))
@@ -90,8 +96,9 @@ def run_clock_study(
 
 def _one(
     device: bool, duration_s: float, rng: np.random.Generator, linear: bool, estimate: Estimator
-) -> tuple[Array, Array, float, float, float, float]:
-    """One run: errors (7,), in sigmas (7,), NEES, error against the recording's own mean delay (ms), at the work (mm), turn (deg)."""
+) -> tuple[Array, Array, float, float, float, float, Array]:
+    """One run: errors (7,), in sigmas (7,), NEES, error against the recording's own mean delay (ms), at the work (mm), turn (deg), and
+    the errors in sigmas (7,) of the exact fit."""
     moves, X_BC = cube_moves(rng, linear=linear)
     stream = recorded_stream(moves, duration_s + 1.0, rng, joints=not linear)
     frames, capture = observed_frames(
@@ -116,7 +123,8 @@ def _one(
     p = np.array([0.0, 0.0, WORK_M])
     work = float(np.linalg.norm(np.asarray(found.X_BC @ p) - np.asarray(X_BC @ p)))
     turn = float(np.degrees(np.linalg.norm(error[:3])))
-    return errors, scaled, nees, 1e3 * (clock.offset_s - own), 1e3 * work, turn
+    exact = exact_errors(frames, capture, moves, X_BC) if device else np.full(7, np.nan)
+    return errors, scaled, nees, 1e3 * (clock.offset_s - own), 1e3 * work, turn, exact
 
 
 def clock_table(found: dict[str, ClockRuns]) -> str:
@@ -127,6 +135,12 @@ def clock_table(found: dict[str, ClockRuns]) -> str:
         cells = []
         for summary in summaries.values():
             value = summary[key]
-            cells.append(" ".join(f"{v:.3g}" for v in value) if isinstance(value, list) else f"{value:.4g}")
+            cells.append(
+                " ".join(f"{v:.3g}" for v in value)
+                if isinstance(value, list)
+                else ""
+                if value is None
+                else f"{value:.4g}"
+            )
         rows.append((key, *cells))
     return markdown_table(("figure", *summaries), rows)
