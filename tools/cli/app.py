@@ -9,6 +9,7 @@ from weldcal.tools.cli import (
     benchmark,
     benchmark_flange,
     calibrate,
+    cell,
     hand_eye,
     monitor,
     motion,
@@ -24,7 +25,7 @@ from weldcal.tools.cli import (
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
 COMMANDS = (
     *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, runs.weld, view.view),
-    *(robots.robots, robots.emulate_ur, robots.check_robot),
+    *(robots.robots, robots.emulate_ur, robots.check_robot, cell.check_cell, cell.print_board),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
     *reproduce.COMMANDS,
