@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, command, option
+from weldcal.tools.cli.options import LOOK, Call, Outcome, command, option
 
 
-@command("check-cell", common=("seed", "json", "debug"), short_help="Check every device of a scenario. Nothing moves.")
+@command("check-cell", common=LOOK, short_help="Check every device of a scenario. Nothing moves.")
 def check_cell(
     call: Call,
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Name of a scenario, or path of its YAML file.")],
@@ -22,7 +22,7 @@ def check_cell(
     from weldcal.tools.commands import check_cell as checking
     from weldcal.tools.commands.check_robot import emit_table
 
-    report = checking.check_cell(load_scenario(scenario), scenario, call.seed, call.progress)
+    report = checking.check_cell(load_scenario(scenario), scenario, progress=call.progress)
     rows = tuple(
         check if device == check.name else replace(check, name=f"{device.replace('_', ' ')}: {check.name}")
         for device, check in report.rows
@@ -31,9 +31,7 @@ def check_cell(
     return Outcome(report.summary(), text=partial(emit_table, table), problem=report.first_problem)
 
 
-@command(
-    "print-board", common=("out", "json", "debug"), short_help="Write a calibration board or tags as PDF at true scale."
-)
+@command("print-board", short_help="Write a calibration board or tags as PDF at true scale.")
 def print_board(
     call: Call,
     kind: Annotated[str, typer.Argument(metavar="[KIND]", help="charuco (a board) or tags.")] = "charuco",
