@@ -56,3 +56,7 @@ class FingerCameraConfig(DriverConfig, ABC):
     @abstractmethod
     def camera(self) -> FingerCamera:
         """Image size, focal length, frame rate and latency."""
+
+    def tag_size_m(self) -> float | None:
+        """The measured black side of the tag, m; None: as the tool has it."""
+        return None

@@ -25,7 +25,7 @@ from weldcal.tools.cli import (
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
 COMMANDS = (
     *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, runs.weld, view.view),
-    *(robots.robots, robots.emulate_ur, robots.check_robot, cell.check_cell, cell.print_board),
+    *(robots.robots, robots.emulate_ur, robots.check_robot, cell.check_cell, cell.print_board, cell.finger_calibrate),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
     *reproduce.COMMANDS,
@@ -38,6 +38,7 @@ COMMANDS = (
 GROUPS = {
     "benchmark": "Measure speed and accuracy.",
     "reproduce": "Repeat the published studies.",
+    "finger": "Calibrate the finger camera and the soft tip.",
     "tablet": "Calibrate a wrist camera with a tablet as target.",
     "hand-eye": "Calibrate a camera from pairs of poses.",
     "profiler": "Calibrate a laser profiler and map a seam.",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -66,3 +67,36 @@ def print_board(
         raise InputError(f"There is no board of the kind '{kind}': use charuco or tags.")
     written = printing.write_board(call.folder("print-board", kind), sheet, board)
     return Outcome({"state": "done", "kind": kind, **written, "note": printing.NOTE})
+
+
+@command("finger calibrate", short_help="Calibrate the finger camera, its tag and the soft tip from pictures.")
+def finger_calibrate(
+    call: Call,
+    folder: Annotated[Path, typer.Argument(metavar="PICTURES", help="Folder of pictures of the board, png or jpg.")],
+    board: Annotated[Path, option("--board", "FILE", "board.yaml of the printed board, from print-board.")],
+    touches: Annotated[
+        Path | None, option("--touches", "FILE", "Table of touches on a plate: picture, x_mm, y_mm, z_mm, forces.")
+    ] = None,
+) -> Outcome:
+    """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known plate."""
+    from weldcal.tools.commands.finger_calibrate import calibrate_finger
+
+    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name))
+    found = report.document()
+    camera = found["camera"]
+    values = {
+        "focal length": f"{camera['fx']:.2f}, {camera['fy']:.2f} px, +- {camera['focal_sigma_px']:.2f}",
+        "principal point": f"{camera['cx']:.2f}, {camera['cy']:.2f} px",
+        "reprojection": f"{camera['rms_px']:.3f} px, on held-out pictures {camera['held_out_px']:.3f} px",
+        "pictures": f"{camera['pictures']} used, {camera['held_out_pictures']} held out, {len(report.without_board)} without the board",
+    }
+    if report.tip is not None:
+        tag, tip = found["tag"], found["tip"]
+        values |= {
+            "tag": f"{tag['size_mm']:.3f} mm, +- {tag['sigma_mm']:.3f}",
+            "seat": ", ".join("-" if v is None else f"{v:.3f}" for v in tip["seat_mm"]) + " mm",
+            "touches": f"held-out error {tip['held_out_mm']:.3f} mm",
+            "open": " ".join(tip["unknown"]) or "nothing",
+        }
+    summary = {"state": "done", "out": str(call.written), "without_board": list(report.without_board), **found}
+    return Outcome(summary, values=values)
