@@ -17,7 +17,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.background import Background, Inline, OwnProcess
-from weldcal.systems.drivers.config import DEVICES, DriverConfig, NoDevice
+from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
@@ -268,11 +268,13 @@ def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationB
 
 def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
     """The welding tool with the scenario's press deflections and the groove angle of the workpiece."""
-    tool, welding = WeldingTool(), scenario.welding
+    tool, welding, camera = WeldingTool(), scenario.welding, scenario.finger_camera
+    measured = camera.tag_size_m() if isinstance(camera, FingerCameraConfig) else None
     return dc.replace(
         tool,
         press_axial_m=welding.axial_deflection_mm * 1e-3,
         press_lateral_m=welding.deflection_mm * 1e-3,
+        tag_size_m=measured or tool.tag_size_m,
         groove_half_angle_rad=tool.groove_half_angle_rad if cad is None else cad.half_angle_rad,
     )
 

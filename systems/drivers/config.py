@@ -18,7 +18,7 @@ class DriverConfig:
     """Base class of the dataclass that a driver module defines; its name is the tag in the scenario, such as `!SimulatedUr`.
 
     The module also defines `ApplyDriverConfig(config, build)`. A robot driver may define `PrepareRobot(config, nominal)`, and
-    any driver `preflight(config)`, a check that causes no motion.
+    any sensor's driver `preflight(config) -> Sensed`, which looks at the device and causes no motion.
     """
 
     FOR: ClassVar[tuple[str, ...]] = ()  # some of DEVICES
@@ -56,3 +56,7 @@ class FingerCameraConfig(DriverConfig, ABC):
     @abstractmethod
     def camera(self) -> FingerCamera:
         """Image size, focal length, frame rate and latency."""
+
+    def tag_size_m(self) -> float | None:
+        """The measured black side of the tag, m; None: as the tool has it."""
+        return None

@@ -9,6 +9,7 @@ from weldcal.tools.cli import (
     benchmark,
     benchmark_flange,
     calibrate,
+    cell,
     emulate_cell,
     hand_eye,
     monitor,
@@ -27,6 +28,7 @@ PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then wel
 COMMANDS = (
     *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, plan_motion.plan_motion, runs.weld, view.view),
     *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
+    *(cell.check_cell, cell.print_board, cell.finger_calibrate),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
     *reproduce.COMMANDS,
@@ -39,6 +41,7 @@ COMMANDS = (
 GROUPS = {
     "benchmark": "Measure speed and accuracy.",
     "reproduce": "Repeat the published studies.",
+    "finger": "Calibrate the finger camera and the soft tip.",
     "tablet": "Calibrate a wrist camera with a tablet as target.",
     "hand-eye": "Calibrate a camera from pairs of poses.",
     "profiler": "Calibrate a laser profiler and map a seam.",

@@ -87,6 +87,13 @@ def _dictionary(name: str) -> Any:
     return cv2.aruco.getPredefinedDictionary(_DICTIONARIES[name])
 
 
+def dictionary_named(name: str) -> Any:
+    """OpenCV's dictionary of a name that TagModel takes. Raises TagError for another name."""
+    if name not in _DICTIONARIES:
+        raise TagError(f"Unknown tag dictionary '{name}'; use one of {', '.join(_DICTIONARIES)}.")
+    return _dictionary(name)
+
+
 @lru_cache(maxsize=8)
 def _detector(name: str, refine: bool) -> Any:
     parameters = cv2.aruco.DetectorParameters()

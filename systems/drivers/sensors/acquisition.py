@@ -130,7 +130,10 @@ class _Seen:
 
 
 class Acquisition(Generic[Datum]):
-    """Takes a source's frames in a thread of its own; the newest `kept` of them can be read at any time without waiting."""
+    """Takes a source's frames in a thread of its own; the newest `kept` of them can be read at any time without waiting.
+
+    `prepare` is applied to each frame in that thread.
+    """
 
     def __init__(
         self,
@@ -139,10 +142,10 @@ class Acquisition(Generic[Datum]):
         *,
         kept: int = 2,
         latency_s: float = 0.0,
-        check: Callable[[Datum], None] | None = None,
+        prepare: Callable[[Datum], Datum] | None = None,
     ) -> None:
         self.source, self.rules = source, rules
-        self._kept, self._latency_s, self._check = kept, latency_s, check
+        self._kept, self._latency_s, self._prepare = kept, latency_s, prepare
         self.clock = DeviceClock(latency_s, rules.late_s)
         self._frames: tuple[Frame[Datum], ...] = ()
         self._seen = _Seen()
@@ -293,8 +296,8 @@ class Acquisition(Generic[Datum]):
                     self.source.ask(seen.asked)
             delivery = self.source.next(POLL_S)
             if delivery is not None:
-                if self._check is not None:
-                    self._check(delivery.datum)
+                if self._prepare is not None:
+                    delivery = replace(delivery, datum=self._prepare(delivery.datum))
                 self._take(delivery)
         except Garbage as error:
             seen.trouble = str(error)

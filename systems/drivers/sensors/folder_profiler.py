@@ -8,8 +8,15 @@ import numpy as np
 from weldcal.calibration.data.tables import read_rows
 from weldcal.models.array_files import read_npy
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.sensors.folder_source import FolderSource
-from weldcal.systems.drivers.sensors.wired_profiler import Profile, WiredProfiler, add_profiler, checked_profile
+from weldcal.systems.drivers.sensors.files.source import FolderSource
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
+from weldcal.systems.drivers.sensors.wired_profiler import (
+    Profile,
+    WiredProfiler,
+    acquire_profiles,
+    add_profiler,
+    checked_profile,
+)
 from weldcal.systems.drivers.station_build import StationBuild
 
 SUFFIXES = (".csv", ".npy")
@@ -50,6 +57,11 @@ def read_profile(path: Path) -> Profile:
     except ValueError as error:
         raise InputError(f"'{path.name}' holds words where numbers are needed.") from error
     return np.array(points, dtype=np.float64).reshape(-1, 2)
+
+
+def preflight(config: FolderProfiler) -> Sensed:
+    """Take one profile. Raises InputError for keys that cannot be used."""
+    return look_at_scanner(acquire_profiles(config, config.source()), streams=False, what="profile")
 
 
 def ApplyDriverConfig(config: FolderProfiler, build: StationBuild) -> None:

@@ -4,8 +4,9 @@ import dataclasses as dc
 from pathlib import Path
 
 from weldcal.calibration.data.clouds import NO_NOTES, read_cloud
-from weldcal.systems.drivers.sensors.folder_source import FolderSource
-from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, add_scanner, checked_cloud
+from weldcal.systems.drivers.sensors.files.source import FolderSource
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
+from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild
 
 
@@ -30,6 +31,11 @@ class FolderScanner(WiredScanner):
             return checked_cloud(read_cloud(path), metres, far_m)
 
         return FolderSource("The scanner", self.folder, self.trigger, NO_NOTES, read, self.settle_s, self.remove_read)
+
+
+def preflight(config: FolderScanner) -> Sensed:
+    """Take one scan. Raises InputError for keys that cannot be used."""
+    return look_at_scanner(acquire(config, config.source()), streams=config.streams)
 
 
 def ApplyDriverConfig(config: FolderScanner, build: StationBuild) -> None:

@@ -13,7 +13,8 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceLost, Garbage, Source
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
-from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, add_scanner, checked_cloud
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
+from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild
 
 INSTALL = "pip install 'weldcal[realsense]'"
@@ -200,6 +201,11 @@ class RealSenseClouds(Source[Cloud]):
                 sensor.set_option(option, float(value))
             except RuntimeError as error:
                 raise DeviceLost(f"it does not accept {value:g} for its option {name} ({error})") from error
+
+
+def preflight(config: RealSense) -> Sensed:
+    """Take one scan. Raises InputError for keys that cannot be used."""
+    return look_at_scanner(acquire(config, config.source()), streams=config.streams)
 
 
 def ApplyDriverConfig(config: RealSense, build: StationBuild) -> None:

@@ -12,7 +12,14 @@ import numpy as np
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceLost, Garbage, Source
 from weldcal.systems.drivers.sensors.mjpeg import MjpegStream
-from weldcal.systems.drivers.sensors.wired_camera import Picture, WiredFingerCamera, add_camera, checked_picture
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera
+from weldcal.systems.drivers.sensors.wired_camera import (
+    Picture,
+    WiredFingerCamera,
+    acquire_pictures,
+    add_camera,
+    checked_picture,
+)
 from weldcal.systems.drivers.station_build import StationBuild
 
 STAMPS = ("host", "device", "none")
@@ -160,6 +167,11 @@ class CaptureSource(Source[Picture]):
     def _must_set(self, key: int, value: float, name: str) -> None:
         if not self._set(key, value):
             raise DeviceLost(f"it does not accept finger_camera.{name}: leave it at null")
+
+
+def preflight(config: VideoFingerCamera) -> Sensed:
+    """Take the pictures of a second. Raises InputError for keys that cannot be used."""
+    return look_at_camera(acquire_pictures(config, config.open_source()), config.rate_hz)
 
 
 def ApplyDriverConfig(config: VideoFingerCamera, build: StationBuild) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses as dc
 import time
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,6 +15,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import FingerCamera
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.finger_file import FingerFile, read_finger_file
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
@@ -34,13 +36,35 @@ class WiredFingerCamera(FingerCameraConfig):
     latency_s: float = 0.0  # from the middle of the exposure to the arrival; with stamps: that of the earliest pictures
     exposure_ms: float | None = None  # null: as the camera has it
     gain: float | None = None
+    calibration: str = (
+        ""  # file of `weldcal finger calibrate`: its focal length, distortion and tag take the place of focal_px
+    )
     silent_s: float = 0.5  # without a usable picture: a fault
     frozen_s: float = 0.5  # with identical pictures: a fault
     late_s: float = 0.5  # that a picture comes late: a fault
 
     def camera(self) -> FingerCamera:
         """Image size, focal length, frame rate and latency."""
-        return FingerCamera(self.width, self.height, self.focal_px, self.rate_hz, self.latency_s, 0.0)
+        found = self.calibrated()
+        focal = self.focal_px if found is None else found.focal_px
+        return FingerCamera(self.width, self.height, focal, self.rate_hz, self.latency_s, 0.0)
+
+    def calibrated(self) -> FingerFile | None:
+        """The calibration that the scenario names. Raises InputError where it cannot be used with these pictures."""
+        if not self.calibration:
+            return None
+        found = read_finger_file(Path(self.calibration))
+        if (found.width, found.height) != (self.width, self.height):
+            raise InputError(
+                f"'{self.calibration}' was made with pictures of {found.width} x {found.height}, and finger_camera has "
+                f"{self.width} x {self.height}: calibrate again, or set width and height."
+            )
+        return found
+
+    def tag_size_m(self) -> float | None:
+        """The tag's measured side, m; None where there is no calibration of it."""
+        found = self.calibrated()
+        return None if found is None else found.tag_size_m
 
     def rules(self) -> Rules:
         """When this camera is at fault. Raises InputError for times within which no picture can come."""
@@ -113,7 +137,9 @@ class WiredPictures(LeafSystem):
 
 def acquire_pictures(config: WiredFingerCamera, source: Source[Picture]) -> Acquisition[Picture]:
     """The acquisition of a camera's pictures, not started yet."""
-    return Acquisition(source, config.rules(), kept=3, latency_s=config.latency_s)
+    found = config.calibrated()
+    prepare = None if found is None else found.rectifier()
+    return Acquisition(source, config.rules(), kept=3, latency_s=config.latency_s, prepare=prepare)
 
 
 def add_camera(config: WiredFingerCamera, source: Source[Picture], build: StationBuild, start_s: float = 10.0) -> None:

@@ -7,7 +7,14 @@ from weldcal.systems.drivers.sensors.genicam.components import picture_of
 from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
-from weldcal.systems.drivers.sensors.wired_camera import Picture, WiredFingerCamera, add_camera, checked_picture
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera
+from weldcal.systems.drivers.sensors.wired_camera import (
+    Picture,
+    WiredFingerCamera,
+    acquire_pictures,
+    add_camera,
+    checked_picture,
+)
 from weldcal.systems.drivers.station_build import StationBuild
 
 
@@ -65,6 +72,11 @@ class GenicamPictures(Source[Picture]):
     def close(self) -> None:
         """See Source."""
         self.device.close()
+
+
+def preflight(config: GenicamFingerCamera) -> Sensed:
+    """Take the pictures of a second. Raises InputError for keys that cannot be used."""
+    return look_at_camera(acquire_pictures(config, config.source()), config.rate_hz)
 
 
 def ApplyDriverConfig(config: GenicamFingerCamera, build: StationBuild) -> None:

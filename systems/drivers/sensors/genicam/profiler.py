@@ -8,7 +8,14 @@ from weldcal.systems.drivers.sensors.genicam.components import UNIT_SCALING, pro
 from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
-from weldcal.systems.drivers.sensors.wired_profiler import Profile, WiredProfiler, add_profiler, checked_profile
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
+from weldcal.systems.drivers.sensors.wired_profiler import (
+    Profile,
+    WiredProfiler,
+    acquire_profiles,
+    add_profiler,
+    checked_profile,
+)
 from weldcal.systems.drivers.station_build import StationBuild
 
 _METRES = {"m": 1.0, "mm": 1e-3}
@@ -91,6 +98,11 @@ class GenicamProfiles(Source[Profile]):
     def close(self) -> None:
         """See Source."""
         self.device.close()
+
+
+def preflight(config: GenicamProfiler) -> Sensed:
+    """Take one profile. Raises InputError for keys that cannot be used."""
+    return look_at_scanner(acquire_profiles(config, config.source()), streams=False, what="profile")
 
 
 def ApplyDriverConfig(config: GenicamProfiler, build: StationBuild) -> None:

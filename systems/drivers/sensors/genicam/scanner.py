@@ -7,7 +7,8 @@ from weldcal.systems.drivers.sensors.genicam.components import cloud_of
 from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
-from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, add_scanner, checked_cloud
+from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
+from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
 from weldcal.systems.drivers.station_build import StationBuild
 
 GENICAM_UNIT_M = 1e-3  # of a device that does not say its unit
@@ -91,6 +92,11 @@ class GenicamClouds(Source[Cloud]):
     def close(self) -> None:
         """See Source."""
         self.device.close()
+
+
+def preflight(config: GenicamScanner) -> Sensed:
+    """Take one scan. Raises InputError for keys that cannot be used."""
+    return look_at_scanner(acquire(config, config.source()), streams=config.streams)
 
 
 def ApplyDriverConfig(config: GenicamScanner, build: StationBuild) -> None:

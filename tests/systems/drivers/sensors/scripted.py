@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -85,7 +85,8 @@ class MjpegCamera:
     def __init__(self, rate_hz: float = 50.0) -> None:
         self.rate_hz = rate_hz
         self.frozen = self.garbage = self.silent = self.lengthless = False
-        self.delay_s = 0.0
+        self.delay_s = self.blur_px = 0.0
+        self.draws: Callable[[int], np.ndarray] = speckle
         self.epoch_s: float | None = 0.0  # of the stamps: 0 for Unix time, None for no stamp
         self.taken: dict[int, float] = {}  # when (s, monotonic) each number was taken
         self._listener: socket.socket | None = None
@@ -97,6 +98,10 @@ class MjpegCamera:
     @property
     def url(self) -> str:
         return f"http://127.0.0.1:{self.port}/stream"
+
+    def blurred(self, picture: np.ndarray) -> np.ndarray:
+        """The picture out of focus by `blur_px`."""
+        return cv2.GaussianBlur(picture, (0, 0), self.blur_px) if self.blur_px else picture
 
     def plug_in(self) -> None:
         """Listen at the same port as before."""
@@ -142,7 +147,7 @@ class MjpegCamera:
                     client.sendall(under_way.popleft()[1])
 
     def _part(self, number: int) -> bytes:
-        jpeg = bytes(cv2.imencode(".jpg", speckle(number))[1])
+        jpeg = bytes(cv2.imencode(".jpg", self.draws(number))[1])
         if self.garbage:
             jpeg = bytes(np.random.default_rng(number).integers(0, 255, len(jpeg), dtype=np.uint8))
         stamp = b"" if self.epoch_s is None else f"X-Timestamp: {self.epoch_s + time.time():.6f}\r\n".encode()

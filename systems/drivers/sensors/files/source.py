@@ -11,8 +11,8 @@ from typing import TypeVar
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.systems.drivers.sensors.acquisition import Delivery, DeviceLost, Garbage, Source
-from weldcal.systems.drivers.sensors.new_files import NewFiles
-from weldcal.systems.drivers.sensors.triggers import Trigger, trigger_of
+from weldcal.systems.drivers.sensors.files.new import NewFiles
+from weldcal.systems.drivers.sensors.files.triggers import Trigger, trigger_of
 
 Datum = TypeVar("Datum")
 POLL_S = 0.01
