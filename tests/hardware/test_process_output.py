@@ -17,10 +17,10 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.faults import Fault
-from weldcal.systems.drivers.ur.off_switch import MASK, VALUE
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
 from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
+from weldcal.systems.drivers.ur.torch.off_switch import MASK, VALUE
 from weldcal.systems.station import make_station
 from weldcal.systems.wall_clock import WallClock
 from weldcal.tools.emulators.ur.controller.core import Controller
