@@ -29,7 +29,7 @@ from weldcal.tools.outcomes.options import RunOptions
 from weldcal.welding.servo.state import Phase
 
 SEED = 3
-SEAM_MM = 12.0
+SEAM_MM = 20.0
 X_BC = "{xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
 WELD_ONLY = f"job: {{calibrate: false, X_BC: {X_BC}}}\nwelding: {{seam_length_mm: {SEAM_MM}}}"
 WORLD = """

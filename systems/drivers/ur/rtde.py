@@ -59,7 +59,7 @@ class UrRtde(DriverConfig):
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
         if self.follow:
-            return limits.in_lockstep(FOLLOWING_PATIENCE_S)
+            return limits.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0)
         return limits.in_lockstep() if self.lockstep else limits
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:

@@ -74,6 +74,7 @@ class Worker:
         self._worst = 0.0
         self._late = 0
         self._put_out = False
+        self._driven = 0  # number of the newest command that was sent
         self._gas = Gas(config.gas_before_s, config.gas_after_s)
         self._gas_on = False
         self._ringed = -1.0
@@ -150,8 +151,10 @@ class Worker:
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
-            if command.qd.any() and now - command.given_at > self._config.limits.hold_s:
+            old = command.number == self._driven and now - command.given_at > self._config.limits.hold_s
+            if command.qd.any() and old:
                 return  # the controller waits for the cell's next command
+            self._driven = command.number
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
             process = command.process and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.scaled_qd, ACCELERATION, process):

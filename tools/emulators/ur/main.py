@@ -26,7 +26,7 @@ from weldcal.tools.emulators.ur.addresses import (
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
-from weldcal.tools.emulators.ur.lockstep import Lockstep
+from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, World
@@ -44,6 +44,7 @@ SLOWEST, FASTEST = 0.05, 1.0
 PARENT_CHECK_S = 0.2
 WAIT_S = 0.01
 KEEP_ALIVE_S = 0.5
+WORLD_AHEAD_FRAMES = 2  # with a world: a command's period, so that no velocity is late
 LONGEST_WAIT_S = 60.0
 
 
@@ -109,7 +110,7 @@ class Emulation:
         self._after_step = after_step
         self._pace = pace
         self._checker = Checker(controller)
-        self._lockstep = Lockstep(controller, lockstep)
+        self._lockstep = Lockstep(controller, lockstep, AHEAD_FRAMES if after_step is None else WORLD_AHEAD_FRAMES)
         self._world = World()
         self._sent_at = 0.0
         self._network = Network(host, seed)
