@@ -11,6 +11,7 @@ from xdist.scheduler.loadfile import LoadFileScheduling
 STREAMING = (
     *("test_same_job.py", "test_other_jobs.py", "test_fault_matrix.py", "test_station_backends.py"),
     *("test_process_output.py", "test_robot_stream.py", "test_emulator_lockstep.py", "test_hold_and_go_on.py"),
+    "test_wired_cell.py",
 )
 # They look at the finished demo. A core that is left with them at the end keeps the other waiting.
 DEMO = ("tests/scenario/test_readme.py", "tests/scenario/test_cell.py")

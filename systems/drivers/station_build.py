@@ -73,8 +73,12 @@ class StationBuild:
 
     @property
     def may_wait(self) -> bool:
-        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait for it."""
-        return self.robot is None or self.robot.clock is None or self.robot.waits
+        """Whether the Diagram may wait for a device; it may not while it keeps the pace of a robot that does not wait for it.
+
+        Nor while it follows a robot that waits for it: a device of that robot's world may need the robot's time to go on.
+        """
+        clock = None if self.robot is None else self.robot.clock
+        return clock is None or (self.robot is not None and self.robot.waits and not clock.follows)
 
     def find(self, kind: type[Part]) -> Part | None:
         """The part of this type; None where the station has none."""

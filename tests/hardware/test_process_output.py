@@ -19,7 +19,7 @@ from weldcal.systems.drivers.ur.errors import RobotRefused
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.robot import guard_script
 from weldcal.systems.drivers.ur.rtde import PrepareRobot, UrRtde
-from weldcal.systems.drivers.ur.wire.off_switch import MASK, VALUE
+from weldcal.systems.drivers.ur.torch.off_switch import MASK, VALUE
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.station import make_station
 from weldcal.systems.wall_clock import WallClock

@@ -281,11 +281,17 @@ robot: !UrRtde
   rate_hz: 500.0
   pace: 0.5
   lockstep: true
+  follow: true
   velocity_share: 0.3
   upper_registers: false
   payload_kg: 2.0
   payload_cog_m: [0.01, 0.02, 0.06]
   process_output: 3
+  arc_input: 1
+  arc_fault_input: 2
+  gas_output: 4
+  gas_before_s: 0.2
+  gas_after_s: 2.0
 """
 
 

@@ -130,6 +130,9 @@ class UrLink:
         process_output: int | None = None,
         arc_input: int | None = None,
         arc_fault_input: int | None = None,
+        gas_output: int | None = None,
+        gas_before_s: float = 0.0,
+        gas_after_s: float = 0.0,
     ) -> UrLink:
         """Start the worker, upload the guard, and wait until it is active. The arm does not move, `process_output` is off.
 
@@ -148,6 +151,9 @@ class UrLink:
             process_output,
             arc_input,
             arc_fault_input,
+            gas_output,
+            gas_before_s,
+            gas_after_s,
         )
         link = cls(config)
         until = time.monotonic() + START_LIMIT_S / limits.pace

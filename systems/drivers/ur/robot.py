@@ -5,7 +5,6 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 
 import numpy as np
@@ -16,9 +15,10 @@ from weldcal.systems.drivers.ur.errors import RobotRefused, RobotUnreachable
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.readiness.registers import DOUBLES, UPPER_OFFSET, register_names
 from weldcal.systems.drivers.ur.supervisor import PLAYING, STALE_REGISTER, RobotSample
+from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
+from weldcal.systems.drivers.ur.torch.off_switch import OffSwitch
 from weldcal.systems.drivers.ur.wire.dashboard import SCRIPT_PORT
 from weldcal.systems.drivers.ur.wire.line import Line
-from weldcal.systems.drivers.ur.wire.off_switch import OffSwitch
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe, Value
 from weldcal.systems.drivers.ur.wire.rtde_stream import RtdeStream
 
@@ -45,27 +45,6 @@ def same_payload(found: Mapping[str, Value], mass_kg: float, cog_m: Sequence[flo
         return False
     mass, cog = np.array(found["payload"]), np.array(found["payload_cog"])
     return bool(abs(mass - mass_kg) <= 0.0101 and np.abs(cog - np.array(cog_m)).max() <= 1.01e-3)
-
-
-@dataclass(frozen=True)
-class ArcInputs:
-    """Standard digital inputs of the power source: arc established, arc fault; None where one is not wired."""
-
-    established: int | None = None
-    arc_fault: int | None = None
-
-    @property
-    def wired(self) -> bool:
-        """Whether there is one."""
-        return self.established is not None or self.arc_fault is not None
-
-    def arc(self, bits: int) -> bool | None:
-        """Whether the arc is established; None where that is not wired."""
-        return None if self.established is None else bool(bits >> self.established & 1)
-
-    def fault(self, bits: int) -> bool:
-        """Whether the power source reports a fault."""
-        return self.arc_fault is not None and bool(bits >> self.arc_fault & 1)
 
 
 class Refused(Exception):
@@ -104,6 +83,7 @@ class Robot:
         arm: ArmModel,
         output: int | None = None,
         arc_inputs: ArcInputs | None = None,
+        gas: int | None = None,
     ) -> None:
         self._host = host
         base = UPPER_OFFSET if upper else 0
@@ -123,7 +103,7 @@ class Robot:
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.CONTROL_REFUSED) from error
-        self._switch = None if output is None else self._off_switch(host, output)
+        self._switch = None if output is None else self._off_switch(host, output, gas)
         self._fresh_at, self._robot_time = time.monotonic(), -1.0
         self._excused = 0.0
         self._sent: dict[float, float] = {}
@@ -132,9 +112,9 @@ class Robot:
         self._heard = self._first_unheard = 0.0
         self.echo_latency = 0.0
 
-    def _off_switch(self, host: str, output: int) -> OffSwitch:
+    def _off_switch(self, host: str, output: int, gas: int | None) -> OffSwitch:
         try:
-            return OffSwitch(host, output)
+            return OffSwitch(host, output, gas)
         except (RobotUnreachable, RobotRefused) as error:
             sys.stderr.write(f"{error}\n")
             raise Refused(Fault.OUTPUT_IN_USE) from error
@@ -283,6 +263,11 @@ class Robot:
         """Turn the process output off without the guard, which may have stopped."""
         if self._switch is not None:
             self._switch.off()
+
+    def gas(self, on: bool) -> None:
+        """Open or close the gas valve, where one is wired."""
+        if self._switch is not None:
+            self._switch.gas(on)
 
     @property
     def process_on(self) -> bool:

@@ -47,6 +47,11 @@ class UrRtde(DriverConfig):
     # and a fault ends it
     arc_input: int | None = None
     arc_fault_input: int | None = None
+    # standard digital output of the gas valve; null: the power source does it. Gas flows gas_before_s before the torch is on,
+    # for which the weld stands only where arc_input is wired, and gas_after_s after it
+    gas_output: int | None = None
+    gas_before_s: float = 0.5
+    gas_after_s: float = 1.0
 
     def limits(self, arm: ArmModel) -> Limits:
         """The limits against which the worker checks commands."""
@@ -54,7 +59,7 @@ class UrRtde(DriverConfig):
             arm.position_lower, arm.position_upper, self.velocity_share * arm.velocity_limit, arm.acceleration_limit
         ).slowed(self.pace)
         if self.follow:
-            return limits.in_lockstep(FOLLOWING_PATIENCE_S)
+            return limits.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0)
         return limits.in_lockstep() if self.lockstep else limits
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
@@ -181,6 +186,15 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
     for name in ("arc_input", "arc_fault_input"):
         if (n := getattr(config, name)) is not None and not 0 <= n < N_OUTPUTS:
             raise InputError(f"robot.{name} must be a standard digital input from 0 to 7, not {n}.")
+    if config.gas_output is not None:
+        if config.process_output is None or config.arc_input is None or not 0 <= config.gas_output < N_OUTPUTS:
+            raise InputError(
+                "robot.gas_output must be a standard digital output from 0 to 7, and it needs process_output and arc_input."
+            )
+        if config.gas_output == config.process_output:
+            raise InputError("robot.gas_output and robot.process_output must be two outputs.")
+        if not (0.0 <= config.gas_before_s <= 1.5 and 0.0 <= config.gas_after_s <= 10.0):
+            raise InputError("robot.gas_before_s must be from 0 to 1.5, and gas_after_s from 0 to 10.")
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
@@ -198,6 +212,9 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
         process_output=config.process_output,
         arc_input=config.arc_input,
         arc_fault_input=config.arc_fault_input,
+        gas_output=config.gas_output,
+        gas_before_s=config.gas_before_s,
+        gas_after_s=config.gas_after_s,
     )
     clock = WallClock.following(link.robot_time) if config.follow else WallClock(config.pace)
     return PreparedRobot(arm, link.state().q, link, clock, config.lockstep)

@@ -84,7 +84,7 @@ class Limits:
             pace=pace,
         )
 
-    def in_lockstep(self, patience_s: float = PATIENCE_S) -> Limits:
+    def in_lockstep(self, patience_s: float = PATIENCE_S, held_s: float = HELD_S) -> Limits:
         """The limits for an emulated controller in lockstep: while this computer is late the arm waits and needs no stop."""
         return replace(
             self,
@@ -94,7 +94,7 @@ class Limits:
             lost_s=max(self.lost_s, patience_s),
             deaf_s=max(self.deaf_s, patience_s),
             jump_s=max(self.jump_s, patience_s),
-            hold_s=HELD_S / self.pace,
+            hold_s=held_s / self.pace,
         )
 
 

@@ -19,10 +19,12 @@ import numpy as np
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.systems.drivers.ur.faults import Fault
 from weldcal.systems.drivers.ur.precedence import take_priority
-from weldcal.systems.drivers.ur.robot import ArcInputs, Refused, Robot
+from weldcal.systems.drivers.ur.robot import Refused, Robot
 from weldcal.systems.drivers.ur.shared import Memory, TornRead
 from weldcal.systems.drivers.ur.supervisor import Action, Command, Decision, Limits, RobotSample, Supervisor
 from weldcal.systems.drivers.ur.time_scale import TimeScale
+from weldcal.systems.drivers.ur.torch.arc_inputs import ArcInputs
+from weldcal.systems.drivers.ur.torch.gas import Gas
 
 ACCELERATION = 40.0  # rad/s^2 of speedj: the cell ramps the stream, the controller only follows
 LATE_PASS_S = 0.020
@@ -55,6 +57,9 @@ class WorkerConfig:
     process_output: int | None = None
     arc_input: int | None = None
     arc_fault_input: int | None = None
+    gas_output: int | None = None
+    gas_before_s: float = 0.0
+    gas_after_s: float = 0.0
 
 
 class Worker:
@@ -69,6 +74,9 @@ class Worker:
         self._worst = 0.0
         self._late = 0
         self._put_out = False
+        self._driven = 0  # number of the newest command that was sent
+        self._gas = Gas(config.gas_before_s, config.gas_after_s)
+        self._gas_on = False
         self._ringed = -1.0
         self._newest: tuple[float, ...] | None = None
         self._rest_since: float | None = None
@@ -92,13 +100,14 @@ class Worker:
                 self._supervisor.excuse()
             last, deadline = now, max(deadline + period, now)
             sample = robot.sample(now)
-            command = self._scaled(self._command(), now, sample)
+            command = self._with_gas(self._scaled(self._command(), now, sample), robot, sample)
             decision = self._supervisor.step(now, sample, command)
             if decision.fault is not Fault.NONE and self._fault_time == 0.0:
                 self._fault_time = now
             if decision.action is not Action.SEND and (robot.process_on or not self._put_out):
                 robot.torch_off()
                 self._put_out = True
+                self._valve(robot, False)
             if decision.action is Action.LEAVE:
                 self._publish(now, robot, sample, decision)
                 return LEFT
@@ -106,6 +115,7 @@ class Worker:
                 self._drive(now, robot, sample, command, decision)
             self._publish(now, robot, sample, decision)
             if (command.stop or command.orphaned) and self._phase is not Phase.OBEYING:
+                self._valve(robot, False)
                 self._phase = Phase.ENDED
                 self._publish(now, robot, sample, decision)
                 return 0
@@ -120,6 +130,19 @@ class Worker:
         number, given_at, stop, process, *qd = found
         return Command(int(number), given_at, np.array(qd), bool(stop), orphaned, bool(process))
 
+    def _with_gas(self, command: Command, robot: Robot, sample: RobotSample) -> Command:
+        """The command whose torch waits for the gas, where a valve is wired."""
+        if self._config.gas_output is None:
+            return command
+        flows, torch = self._gas.step(sample.robot_time, command.process)
+        self._valve(robot, flows and not self._put_out)
+        return replace(command, process=torch)
+
+    def _valve(self, robot: Robot, on: bool) -> None:
+        if on != self._gas_on:
+            robot.gas(on)
+            self._gas_on = on
+
     def _scaled(self, command: Command, now: float, sample: RobotSample) -> Command:
         """The command with the factor that slows the arm while command or state is late, but not under a burning torch, which goes out first."""
         factor = self._scale.step(now, now - min(command.given_at, sample.fresh_at))
@@ -128,8 +151,10 @@ class Worker:
 
     def _drive(self, now: float, robot: Robot, sample: RobotSample, command: Command, decision: Decision) -> None:
         if decision.action is Action.SEND:
-            if command.qd.any() and now - command.given_at > self._config.limits.hold_s:
+            old = command.number == self._driven and now - command.given_at > self._config.limits.hold_s
+            if command.qd.any() and old:
                 return  # the controller waits for the cell's next command
+            self._driven = command.number
             # while the cell computes without a limit the arm may stay at rest, but the process is not enabled
             process = command.process and now - command.given_at <= self._config.limits.late_s
             if not robot.send(command.scaled_qd, ACCELERATION, process):
@@ -187,6 +212,7 @@ def main() -> None:
             arm=config.arm,
             output=config.process_output,
             arc_inputs=ArcInputs(config.arc_input, config.arc_fault_input),
+            gas=config.gas_output,
         )
         robot.start_guard()
         robot.set_load(config.payload_kg, list(config.payload_cog_m))

@@ -343,6 +343,15 @@ def test_an_arm_that_follows_as_late_as_a_network_is_not_accused(lag_s: float) -
         assert rig.one() == Decision(Action.SEND)
 
 
+def test_a_power_sources_fault_ends_the_weld_and_says_nothing_while_no_torch_is_asked_for() -> None:
+    assert Rig(process=False).one(arc_fault=True) == Decision(Action.SEND)
+    rig = Rig(process=True)
+    assert rig.one() == Decision(Action.SEND)
+    found = rig.one(arc_fault=True)
+    assert (found.action, found.fault) == (Action.BRAKE, Fault.ARC_FAULT)
+    assert rig.one().fault is Fault.ARC_FAULT, "latched"
+
+
 def test_a_slow_controller_has_longer_deadlines_by_its_own_clock() -> None:
     rig = Rig(LIMITS.slowed(0.25))
     assert rig.passes(2.0) == Decision(Action.SEND)
@@ -355,7 +364,7 @@ def test_every_fault_has_a_sentence_and_those_of_the_worker_an_action() -> None:
     assert all(sentence(fault, 1.0).endswith(".") for fault in SENTENCES)
     seen = {fault for _, fault in OF_THE_SAMPLE} | {fault for _, fault in COMMANDS}
     seen |= {Fault.LINK_STALE, Fault.COMMAND_LATE, Fault.SPEED_SLIDER, Fault.JOINT_LIMIT, Fault.TRACKING}
-    seen |= {Fault.PROCESS_OUTPUT}
+    seen |= {Fault.PROCESS_OUTPUT, Fault.ARC_FAULT}
     of_the_start = {fault for fault in Fault if fault >= Fault.GUARD_REFUSED}
     assert seen == set(Fault) - of_the_start - {Fault.NONE, Fault.WORKER_DIED}, "every fault is tested here"
     assert seen <= set(ACTIONS)

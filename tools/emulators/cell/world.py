@@ -131,7 +131,7 @@ class _World:
             self._programs = c.script_count
         physics.step(c.arm.q, c.arm.qd, self._arc)
         self._expose()
-        self._answer_scanner()
+        self.answer_scanner()
         rests = float(np.abs(c.arm.qd).max()) < REST_RAD_S
         self._rests_s = self._rests_s + STEP_S if rests else 0.0
         self._dirty |= burned != self._arc.burns or not rests
@@ -166,7 +166,8 @@ class _World:
                     self._finger.send(picture)
                     self._unshown = True
 
-    def _answer_scanner(self) -> None:
+    def answer_scanner(self) -> None:
+        """Tell the scanner how the world stands, where it has asked."""
         with contextlib.suppress(OSError, EOFError):
             if self._scanner.poll(0.0):
                 self._scanner.recv()
@@ -239,6 +240,7 @@ def run_world(
             WAITS_S,
             seed,
             after_step=inside.step,
+            while_waiting=inside.answer_scanner,
         )
         stack.callback(inside.write)
         for child in (scanner, finger):

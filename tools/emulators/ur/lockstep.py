@@ -7,8 +7,10 @@ from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.wire.net import Connection
 
-AHEAD_FRAMES = 5  # so far the controller goes past a stream's newest package
-STREAM_PACKAGES = 5  # of one recipe and never further apart: from then on it is a stream
+AHEAD_FRAMES = (
+    5  # so far the controller goes past a stream's newest package, and no further apart are those of a stream
+)
+STREAM_PACKAGES = 5  # of one recipe: from then on it is a stream
 
 
 class Lockstep:
@@ -17,11 +19,11 @@ class Lockstep:
     A stream is a run of input packages of one recipe. It ends with a package of another recipe, with its connection, with
     the program, and where the client stays silent for `bound_s`. A client that has let a watchdog be set has promised to
     write, too: half of the watchdog's period passes without it. A connection that a fault keeps from being heard is not
-    waited for.
+    waited for. `ahead`: frames that the controller may go past a stream's newest package.
     """
 
-    def __init__(self, controller: Controller, bound_s: float) -> None:
-        self._controller = controller
+    def __init__(self, controller: Controller, bound_s: float, ahead: int = AHEAD_FRAMES) -> None:
+        self._controller, self._ahead = controller, ahead
         self._bound_s = bound_s
         self._client: Connection | None = None
         self._silenced: Connection | None = None
@@ -73,7 +75,7 @@ class Lockstep:
 
     def _is_late(self) -> bool:
         frame = self._controller.frame
-        if self._run >= STREAM_PACKAGES and frame - self._frame >= AHEAD_FRAMES:
+        if self._run >= STREAM_PACKAGES and frame - self._frame >= self._ahead:
             return True
         watchdogs = self._controller.watchdogs.values()
         return any(2.0 * (frame - watchdog.fed_at) * STEP_S >= watchdog.period_s for watchdog in watchdogs)

@@ -26,7 +26,7 @@ from weldcal.tools.emulators.ur.addresses import (
 from weldcal.tools.emulators.ur.checker import Checker
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
-from weldcal.tools.emulators.ur.lockstep import Lockstep
+from weldcal.tools.emulators.ur.lockstep import AHEAD_FRAMES, Lockstep
 from weldcal.tools.emulators.ur.process import CONTROL_PORT, READY
 from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.emulators.ur.wire.control_channel import ControlServer, World
@@ -44,6 +44,7 @@ SLOWEST, FASTEST = 0.05, 1.0
 PARENT_CHECK_S = 0.2
 WAIT_S = 0.01
 KEEP_ALIVE_S = 0.5
+WORLD_AHEAD_FRAMES = 2  # with a world: a command's period, so that no velocity is late
 LONGEST_WAIT_S = 60.0
 
 
@@ -92,7 +93,8 @@ def run_emulator(
 
 class Emulation:
     """A controller's ports and its loop. `after_step` is called with the host's time (s) after every step of the controller,
-    before its frame is sent: what it does belongs to the same time, and the controller waits for it.
+    before its frame is sent: what it does belongs to the same time, and the controller waits for it. `while_waiting` is called
+    while the controller's time waits for its client.
     """
 
     def __init__(
@@ -104,12 +106,13 @@ class Emulation:
         lockstep: float,
         seed: int,
         after_step: Callable[[float], None] | None = None,
+        while_waiting: Callable[[], None] | None = None,
     ) -> None:
         self._controller = controller
-        self._after_step = after_step
+        self._after_step, self._while_waiting = after_step, while_waiting
         self._pace = pace
         self._checker = Checker(controller)
-        self._lockstep = Lockstep(controller, lockstep)
+        self._lockstep = Lockstep(controller, lockstep, AHEAD_FRAMES if after_step is None else WORLD_AHEAD_FRAMES)
         self._world = World()
         self._sent_at = 0.0
         self._network = Network(host, seed)
@@ -183,6 +186,8 @@ class Emulation:
                 if now - self._sent_at > KEEP_ALIVE_S:  # clients close a connection on which nothing comes for seconds
                     self._sent_at = now
                     self._rtde.frame(now)
+                if self._while_waiting is not None:
+                    self._while_waiting()
                 network.flush(now)
                 network.poll(WAIT_S, clock)
                 deadline = max(deadline, clock())  # what was waited is not made up for

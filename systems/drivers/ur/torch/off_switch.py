@@ -1,4 +1,4 @@
-"""Turns a digital output off over a separate RTDE connection, independent of the program on the controller."""
+"""Turns the torch off, and the gas on and off, over a separate RTDE connection, independent of the program on the controller."""
 
 import contextlib
 import struct
@@ -11,7 +11,7 @@ MASK, VALUE = "standard_digital_output_mask", "standard_digital_output"
 
 
 class OffSwitch:
-    """Turns the output off; only the guard script turns it on, because it detects a lost client.
+    """Turns the torch's output off; only the guard script turns it on, because it detects a lost client.
 
     The connection is opened at the start and held, so that turning off takes one package of five bytes.
 
@@ -19,15 +19,26 @@ class OffSwitch:
         RobotRefused: another client writes the outputs; RobotUnreachable: no RTDE server answers.
     """
 
-    def __init__(self, host: str, output: int) -> None:
+    def __init__(self, host: str, output: int, gas: int | None = None) -> None:
         self._probe = RtdeProbe(host, TIMEOUT_S)
         recipe = self._probe.grant((MASK, VALUE))
         if recipe is None:
             self._probe.close()
             raise RobotRefused("Another RTDE client or a fieldbus writes the controller's digital outputs.")
         self._package = struct.pack(">BBB", recipe, 1 << output, 0)
+        self._gas = (
+            {} if gas is None else {on: struct.pack(">BBB", recipe, 1 << gas, on << gas) for on in (False, True)}
+        )
 
     def off(self) -> None:
         """Send the package. A broken connection is ignored: the guard and the controller turn the output off then."""
+        self._write(self._package)
+
+    def gas(self, on: bool) -> None:
+        """Open or close the gas valve, where one is wired. As `off`."""
+        if self._gas:
+            self._write(self._gas[on])
+
+    def _write(self, package: bytes) -> None:
         with contextlib.suppress(RobotUnreachable):
-            self._probe.write(self._package)
+            self._probe.write(package)

@@ -1,0 +1,261 @@
+"""A whole job by wire: the world is another process, its truth is in a file, and a device that is gone ends the job by name."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.systems.framework import Diagram
+
+from weldcal.systems.cell import build_cell
+from weldcal.systems.drivers.simulated.world import SimulatedWorld
+from weldcal.systems.scenario.loading import SCENARIO_FOLDER, load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.demo import run_scenario
+from weldcal.tools.emulators.ur.process import Emulator
+from weldcal.tools.outcomes.demo import DemoResult
+from weldcal.tools.outcomes.options import RunOptions
+from weldcal.welding.servo.state import Phase
+
+SEED = 3
+SEAM_MM = 20.0
+X_BC = "{xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -90.0]}"
+WELD_ONLY = f"job: {{calibrate: false, X_BC: {X_BC}}}\nwelding: {{seam_length_mm: {SEAM_MM}}}"
+WORLD = """
+description: a straight groove, its scanner where the drawing has it
+robot: !SimulatedUr {}
+scanner: !RenderedScanner
+  preset: ideal
+  width: 824
+  height: 616
+  mounting_translation_mm: 0.0
+  mounting_rotation_deg: 0.0
+finger_camera: !RenderedFingerCamera {}
+workpiece:
+  shape: straight
+  pose_guess: {xyz_m: [0.65, 0.0, 0.02], rpy_deg: [0.0, 0.0, 90.0]}
+  placement_error: {translation_mm: 3.0, rotation_deg: 0.5}
+  groove_error: {translation_mm: 1.0, rotation_deg: 0.2}
+home_deg: [190.0, -120.0, 135.0, -105.0, -90.0, 90.0]
+"""
+
+
+@dataclass
+class Played:
+    """A world that plays a cell's devices: its process, those of its devices, the cell's scenario and the truth file."""
+
+    process: subprocess.Popen[str]
+    children: list[int]
+    host: str
+    cell: Path
+    truth: Path
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """One request to the controller's control channel."""
+        emulator = Emulator(self.process, self.host, 30090)
+        try:
+            return emulator.ask(**request)
+        finally:
+            emulator._socket.close()
+
+    def scenario(self, overrides: str = "") -> Scenario:
+        """The cell's scenario, which only welds."""
+        return load_scenario(str(self.cell), f"{WELD_ONLY}\n{overrides}")
+
+
+def ends(pid: int, within_s: float) -> bool:
+    until = time.monotonic() + within_s
+    while time.monotonic() < until:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except OSError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
+    folder = tmp_path_factory.mktemp("world")
+    host = f"127.33.{os.getpid() // 250 % 250}.{1 + os.getpid() % 250}"
+    cell, world, truth = folder / "cell.yaml", folder / "world.yaml", folder / "truth.json"
+    text = (SCENARIO_FOLDER / "wired_straight_groove.yaml").read_text()
+    text = text.replace("127.30.0.1", host).replace("/tmp/weldcal-cell/scans", str(folder / "scans"))
+    cell.write_text(text.replace("pace: 0.5", "pace: 1.0"))
+    world.write_text(WORLD)
+    command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(world)]
+    command += ["--cell", str(cell), "--seed", str(SEED), "--truth", str(truth)]
+    with (folder / "log").open("w+") as log:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True)
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            assert line.startswith("ready"), line + (folder / "log").read_text()
+            children = [int(pid) for pid in re.findall(r"process (\d+)", line)]
+            assert len(children) == 2
+            yield Played(process, children, host, cell, truth)
+        finally:
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture(scope="module")
+def welded(played: Played, tmp_path_factory: pytest.TempPathFactory) -> tuple[DemoResult, dict[str, Any]]:
+    """The job without its calibration, on a short seam, and the truth as it is when the job has ended."""
+    options = RunOptions("a test's own", tmp_path_factory.mktemp("job") / "run", SEED, recording=False)
+    result = run_scenario(played.scenario(), options)
+    until = time.monotonic() + 20.0  # the world writes when it has seen the arm at rest
+    while (truth := json.loads(played.truth.read_text()))["state"] != "done" and time.monotonic() < until:
+        time.sleep(0.1)
+    return result, truth
+
+
+def test_the_job_is_done_and_the_truth_file_says_how_well(welded: tuple[DemoResult, dict[str, Any]]) -> None:
+    result, truth = welded
+    assert result.state == "done", result.run.reason
+    assert (truth["state"], truth["collisions"]) == ("done", 0)
+    assert truth["torch_mean_mm"] <= 0.10
+    assert truth["torch_max_mm"] <= 0.35
+    assert truth["welded_mm"] == pytest.approx(SEAM_MM, abs=1.0)
+    assert truth["arc_on_s"] == pytest.approx(SEAM_MM / 8.0, abs=0.4)
+    assert np.array(truth["X_BC"])[:3, 3] == pytest.approx([0.65, 0.0, 0.95])
+
+
+def test_the_cell_knows_nothing_of_the_truth(welded: tuple[DemoResult, dict[str, Any]]) -> None:
+    result, _ = welded
+    station, summary = result.run.cell.station, result.summary()
+    assert station.world is None
+    assert (station.truth.X_BC, station.truth.workpiece, station.truth.X_BP) == (None, None, None)
+    ports = [station.diagram.get_output_port(k).get_name() for k in range(station.diagram.num_output_ports())]
+    assert [name for name in ports if name.startswith("cheat")] == []
+    assert not any(isinstance(value, SimulatedWorld) for value in vars(station).values())
+    assert not {"torch_mean_mm", "X_BC_error_mm", "plan_mean_mm"} & set(summary)
+    assert (result.folder / "report.html").exists()
+    assert (result.folder / "weld.csv").exists()
+
+
+def test_the_weld_stood_until_the_arc_was_there(welded: tuple[DemoResult, dict[str, Any]]) -> None:
+    log = welded[0].weld.log  # type: ignore[union-attr]
+    lit = np.flatnonzero(log.torch_on)[0]
+    track = float(list(Phase).index(Phase.TRACK))
+    speed = np.linalg.norm(np.diff(log.p_BRobot, axis=0), axis=1) / np.diff(log.time)
+    stood = speed[lit : lit + 60] < 1e-4
+    assert log.telemetry["phase"][lit] == track
+    assert 0.04 < 0.008 * stood.sum() < 0.4, "the arc needs 0.12 s, of which the ramp to rest takes some"
+    assert speed[lit + 100 : lit + 150].mean() > 4e-3
+
+
+def structure(diagram: Diagram, without: set[str]) -> tuple[set[str], set[tuple[str, str, str, str]]]:
+    """The names of a cell's systems and its connections by the names of systems and ports."""
+    names = {system.get_name() for system in diagram.GetSystems()}
+    found = set()
+    for (system, k), (source, port) in diagram.connection_map().items():
+        wire = (
+            source.get_name(),
+            source.get_output_port(port).get_name(),
+            system.get_name(),
+            system.get_input_port(k).get_name(),
+        )
+        if not {wire[1], wire[3]} & without:
+            found.add(wire)
+    return names, found
+
+
+def test_the_wired_cell_is_the_simulated_one_but_for_the_stations_inside(
+    welded: tuple[DemoResult, dict[str, Any]],
+) -> None:
+    simulated = build_cell(load_scenario("straight_groove", WELD_ONLY), 0)
+    try:
+        torch = {
+            "process_on",
+            "arc_established",
+            "ur10e.process_on",
+            "ur10e.arc_established",
+        }  # wired to a real one only
+        wired, rendered = (structure(cell.diagram, torch) for cell in (welded[0].run.cell, simulated))
+        logged = {wire for wire in rendered[1] if wire[1].startswith("cheat.")}
+        assert rendered[1] - logged == wired[1]
+        assert wired[0] == rendered[0] - {wire[2] for wire in logged}
+    finally:
+        simulated.station.close()
+
+
+def held_by(played: Played, folder: Path, stage: str, happens: Callable[[], object], overrides: str) -> str:
+    """The reason with which a job is held when something happens at the begin of a phase."""
+    seen: list[str] = []
+
+    def watch(phase: str, _: float) -> None:
+        if phase == stage and not seen:
+            seen.append(phase)
+            happens()
+
+    options = RunOptions("a test's own", folder, SEED, recording=False)
+    result = run_scenario(played.scenario(overrides), options, watch)
+    assert seen, "the phase has come"
+    assert result.state == "held"
+    return str(result.run.reason)
+
+
+def test_pictures_that_stop_end_the_job_by_name(
+    played: Played, welded: tuple[DemoResult, dict[str, Any]], tmp_path: Path
+) -> None:
+    finger = played.children[-1]
+    source = f"source: http://{played.host}:8081/stream, stamps: host"
+    try:
+        reason = held_by(
+            played,
+            tmp_path / "run",
+            "start",
+            lambda: os.kill(finger, signal.SIGSTOP),
+            f"finger_camera: !VideoFingerCamera {{{source}, silent_s: 2.0, frozen_s: 10.0, late_s: 10.0}}",
+        )
+    finally:
+        os.kill(finger, signal.SIGCONT)
+    assert "finger camera" in reason
+    state = played.ask(ask="state")
+    assert np.abs(state["qd"]).max() < 1e-3
+    assert (state["digital_outputs"], state["program"]) == (0, None)
+
+
+def test_a_scanner_that_does_not_answer_ends_the_job_by_name(
+    played: Played, welded: tuple[DemoResult, dict[str, Any]], tmp_path: Path
+) -> None:
+    scanner = played.children[0]
+    folder = played.cell.parent / "scans"
+    wires = f"folder: {folder}, trigger: 'tcp://{played.host}:5020', preset: phoxi_m, width: 824, height: 616"
+    try:
+        reason = held_by(
+            played,
+            tmp_path / "run",
+            "scan workpiece",
+            lambda: os.kill(scanner, signal.SIGSTOP),
+            f"scanner: !FolderScanner {{{wires}, scan_timeout_s: 2.0}}",
+        )
+    finally:
+        os.kill(scanner, signal.SIGCONT)
+    assert "scanner" in reason
+    assert "2 s" in reason
+    state = played.ask(ask="state")
+    assert (state["digital_outputs"], state["program"]) == (0, None)
+
+
+def test_a_world_that_ends_takes_its_devices_with_it_and_the_job_is_held(
+    played: Played, welded: tuple[DemoResult, dict[str, Any]], tmp_path: Path
+) -> None:
+    reason = held_by(played, tmp_path / "run", "park", lambda: played.process.send_signal(signal.SIGTERM), "")
+    assert "LINK" in reason
+    assert played.process.wait(20.0) == 0
+    assert all(ends(pid, 10.0) for pid in played.children)
+    assert json.loads(played.truth.read_text())["X_BC"]
