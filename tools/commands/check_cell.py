@@ -28,7 +28,7 @@ from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
 from weldcal.systems.drivers.ur.readiness.preflight import Check, preflight
 from weldcal.systems.drivers.ur.rtde import UrRtde
-from weldcal.systems.drivers.ur.rtde_wire import RtdeProbe
+from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.host_timing import measure_host
 from weldcal.systems.jobs.weld.settings import feature_standard, plan_poses
 from weldcal.systems.scenario.schema import Scenario
