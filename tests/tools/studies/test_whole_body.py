@@ -1,0 +1,24 @@
+"""The whole-body study in a short form: a wrist link is tracked by its mesh and by a fused model, no worse than twice the flange."""
+
+import json
+from pathlib import Path
+
+from weldcal.tools.studies.motion.whole_body import run_whole_body
+from weldcal.tools.studies.motion.world import MotionOptions
+
+
+def test_a_wrist_link_is_tracked_as_well_as_the_flange(tmp_path: Path) -> None:
+    options = MotionOptions(
+        "ur10e", size=(400, 300), frames=20, noise_mm=0.25, exposure_samples=2, surroundings=False, seed=1
+    )
+    found, targets = run_whole_body(tmp_path, options)
+    assert found["state"] == "done"
+    assert all(t.met for t in targets)
+    for name in ("mesh", "fused"):
+        row = found[name]
+        assert isinstance(row, dict)
+        assert row["frames"] + row["dropped"] == 20
+        assert row["dropped"] <= 2
+        assert row["rms_mm"] < 0.3
+        assert row["spread_mm"] < 0.1
+    assert json.loads((tmp_path / "result.json").read_text())["mesh"] == found["mesh"]
