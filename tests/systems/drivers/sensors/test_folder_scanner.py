@@ -113,6 +113,7 @@ def test_a_text_file_that_still_grows_is_not_taken_though_its_first_half_could_b
             file.flush()
             time.sleep(0.1)
     assert answer(scanner, 1).shape == (192, 3)
+    assert scanner.counts.received == 1
 
 
 def test_a_damaged_file_is_named_and_the_timeout_says_so(start: Start, tmp_path: Path) -> None:
