@@ -47,6 +47,10 @@ class ScannerConfig(DriverConfig, ABC):
     def scanner(self) -> ScannerPreset:
         """Intrinsics, range and noise, used by pose planning."""
 
+    def stream_delay_s(self) -> float | None:
+        """Nominal time from capture to arrival, s, of a scanner that streams; None for one that scans when it is asked."""
+        return None
+
 
 class FingerCameraConfig(DriverConfig, ABC):
     """Base class of all finger camera configurations."""

@@ -49,6 +49,10 @@ class WiredScanner(ScannerConfig):
         fx = 0.5 * preset.width / np.tan(np.deg2rad(0.5 * self.field_of_view_deg))
         return dc.replace(preset, fx=float(fx), fy=float(fx * preset.fy / preset.fx))
 
+    def stream_delay_s(self) -> float | None:
+        """The latency, where the scanner runs freely."""
+        return self.latency_s if self.streams else None
+
     @property
     def metres(self) -> float:
         """Metres of one unit of the points. Raises InputError for an unknown unit."""

@@ -12,7 +12,6 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.systems.drivers.simulated.streaming.scanner import StreamingScanner
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
 from weldcal.systems.jobs.motion.collector import MotionCollector
@@ -92,6 +91,12 @@ class AddedMotion(AddedJob):
         return self.drift(root).summary or phases[-1][0], 0.05 + 0.85 * min(share, 1.0)
 
 
+def _stream_delay_s(scenario: Scenario) -> float | None:
+    """Nominal delay (s) of the scenario's scanner; None where it does not stream."""
+    scanner = scenario.scanner_config()
+    return None if scanner is None else scanner.stream_delay_s()
+
+
 class Motion(Job[MotionPlanned]):
     """The job of a scenario with a `motion` part."""
 
@@ -100,13 +105,13 @@ class Motion(Job[MotionPlanned]):
 
     def check(self, scenario: Scenario) -> None:
         """See Job."""
-        job, streams = scenario.part(MotionJob), isinstance(scenario.scanner, StreamingScanner)
+        job, streams = scenario.part(MotionJob), _stream_delay_s(scenario) is not None
         if job is None:
             if streams and any(
                 getattr(scenario, key, None) is not None for key in ("mounting", "profiler_job", "tablet")
             ):
                 raise InputError(
-                    "A !StreamingScanner belongs to a motion job or to the weld job: write motion: {} or another scanner."
+                    "A scanner that streams, such as !StreamingScanner, belongs to a motion job or to the weld job: write motion: {} or another scanner."
                 )
             return
         check_motion(job)
@@ -119,13 +124,13 @@ class Motion(Job[MotionPlanned]):
 
     def plan(self, scenario: Scenario, station: Station, seed: int) -> MotionPlanned:
         """See Job."""
-        job, scanner = scenario.part(MotionJob), scenario.scanner
+        job, delay_s = scenario.part(MotionJob), _stream_delay_s(scenario)
         assert job is not None
-        assert isinstance(scanner, StreamingScanner)
+        assert delay_s is not None
         home = np.deg2rad(scenario.home_deg)
         watched = load_result(Path(job.watch)) if job.watch else None
         corners = plan_corners(scenario, station, job, home, np.random.default_rng([seed, 16]))
-        return MotionPlanned(corners, home, scanner.stream().delay_s, watched)
+        return MotionPlanned(corners, home, delay_s, watched)
 
     def add(self, wiring: Wiring, spine: Spine, plan: MotionPlanned) -> AddedMotion:
         """See Job."""

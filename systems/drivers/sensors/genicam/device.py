@@ -3,7 +3,6 @@
 import glob
 import importlib.util
 import os
-import threading
 import time
 from collections.abc import Mapping
 from contextlib import suppress
@@ -53,38 +52,6 @@ def producer_path(given: str) -> str:
     )
 
 
-class _Producers:
-    """Producers that are open in this process: one can be open once only, and serves all its devices."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._open: dict[str, tuple[Any, int]] = {}
-
-    def take(self, path: str) -> Any:
-        """The Harvester of a producer."""
-        from harvesters.core import Harvester
-
-        with self._lock:
-            harvester, users = self._open.get(path, (None, 0))
-            if harvester is None:
-                harvester = Harvester()
-                harvester.add_file(path)
-            self._open[path] = (harvester, users + 1)
-            return harvester
-
-    def give_back(self, path: str) -> None:
-        """Close the producer with its last user."""
-        with self._lock:
-            harvester, users = self._open.pop(path, (None, 0))
-            if users > 1:
-                self._open[path] = (harvester, users - 1)
-            elif harvester is not None:
-                harvester.reset()
-
-
-PRODUCERS = _Producers()
-
-
 @dataclass(frozen=True, eq=False)
 class Component:
     """A component of a frame: pixel format by its GenICam name, and values as the device sent them."""
@@ -106,7 +73,10 @@ class Taken:
 
 
 class GenicamDevice:
-    """A device and its image acquirer. `wanted` is its serial number, model, name or id; empty where there is only one."""
+    """A device and its image acquirer. `wanted` is its serial number, model, name or id; empty where there is only one.
+
+    A process opens one device of a producer at a time: to look for devices harvesters closes the producer and opens it again.
+    """
 
     def __init__(self, producer: str, wanted: str, features: Mapping[str, str], alive: str = "") -> None:
         require_harvesters()
@@ -114,6 +84,7 @@ class GenicamDevice:
         self._features, self._alive = dict(features), alive
         self.metres: float | None = None  # of a coordinate's unit; None: the device does not say it
         self.stamped: bool | None = None  # whether its buffers have time stamps; None: not known yet
+        self._harvester: Any = None
         self._acquirer: Any = None
         self._looked = 0.0
 
@@ -124,17 +95,19 @@ class GenicamDevice:
 
     def open(self) -> None:
         """Find the device, write its features and start. Raises DeviceLost."""
-        harvester = PRODUCERS.take(self._producer)
+        from harvesters.core import Harvester
+
+        self._harvester = Harvester()
         try:
-            self._acquirer = self._create(harvester)
+            self._harvester.add_file(self._producer)
+            self._acquirer = self._create(self._harvester)
             self._write()
             self.metres = _UNITS.get(str(self.read("Scan3dDistanceUnit")))
             with suppress(Exception):  # a device may fix the number
                 self._acquirer.num_buffers = max(BUFFERS, int(self._acquirer.min_num_buffers))
             self._acquirer.start()
         except BaseException:
-            self._destroy()
-            PRODUCERS.give_back(self._producer)
+            self.close()
             raise
 
     def take(self, timeout_s: float) -> Taken | None:
@@ -176,9 +149,11 @@ class GenicamDevice:
 
     def close(self) -> None:
         """Stop and let the device go; a second call has no effect."""
-        if self._acquirer is not None:
-            self._destroy()
-            PRODUCERS.give_back(self._producer)
+        self._destroy()
+        if self._harvester is not None:
+            with suppress(Exception):
+                self._harvester.reset()
+            self._harvester = None
 
     def _create(self, harvester: Any) -> Any:
         with suppress(Exception):  # a producer that cannot look again still has the devices of its last look

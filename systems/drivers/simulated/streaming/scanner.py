@@ -61,6 +61,10 @@ class StreamingScanner(RenderedScanner):
         known: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         return dc.replace(get_stream(self.preset), exposure_s=self.exposure_s, **known)
 
+    def stream_delay_s(self) -> float | None:
+        """The mean delay of the stream."""
+        return self.stream().delay_s
+
 
 @dc.dataclass(frozen=True, eq=False)
 class _Streaming(Message):

@@ -100,6 +100,22 @@ def test_a_file_is_taken_only_when_it_is_whole(start: Start, tmp_path: Path) -> 
     assert scanner.counts.garbled == 0
 
 
+def test_a_text_file_that_still_grows_is_not_taken_though_its_first_half_could_be_read(
+    start: Start, tmp_path: Path
+) -> None:
+    scanner = start(settle_s=0.3)
+    scanner.request(1)
+    time.sleep(0.05)
+    lines = [f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in cloud(3).reshape(-1, 3)]
+    with (tmp_path / "slow.xyz").open("w") as file:
+        for half in (lines[:96], lines[96:]):
+            file.writelines(half)
+            file.flush()
+            time.sleep(0.1)
+    assert answer(scanner, 1).shape == (192, 3)
+    assert scanner.counts.received == 1
+
+
 def test_a_damaged_file_is_named_and_the_timeout_says_so(start: Start, tmp_path: Path) -> None:
     scanner = start(scan_timeout_s=2.6)
     scanner.request(1)

@@ -18,7 +18,7 @@ from weldcal.models.errors import InputError
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, DeviceFault, DeviceLost, Garbage
 from weldcal.systems.drivers.sensors.genicam.components import cloud_of, picture_of, profile_of
 from weldcal.systems.drivers.sensors.genicam.device import Component
-from weldcal.systems.drivers.sensors.genicam.finger_camera import GenicamFingerCamera, GenicamPictures
+from weldcal.systems.drivers.sensors.genicam.finger_camera import GenicamFingerCamera
 from weldcal.systems.drivers.sensors.genicam.profiler import GenicamProfiler, GenicamProfiles
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile, profiles
 from weldcal.systems.drivers.sensors.genicam.scanner import GenicamClouds, GenicamScanner
@@ -184,7 +184,7 @@ def test_a_library_that_crashes_is_a_lost_device_and_the_next_process_opens_it_a
 def test_two_devices_of_one_producer_are_open_at_a_time(start: Start) -> None:
     _, first = scanner(streams=True)
     camera = GenicamFingerCamera(400, 400, rate_hz=20.0, producer=producer(), device="2", frozen_s=5.0)
-    second = acquire_pictures(camera, GenicamPictures(camera))
+    second = acquire_pictures(camera, camera.source())  # in a process of its own, as in a cell
     start(first, True)
     start(second, True)
     assert wait_until(lambda: second.counts.received > 3)
