@@ -71,7 +71,7 @@ class Played:
 
     def scenario(self, overrides: str = "") -> Scenario:
         """The cell's scenario, which only welds."""
-        return load_scenario(str(self.cell), f"{WELD_ONLY}\n{overrides}")
+        return load_scenario(str(self.cell), overrides)
 
 
 def ends(pid: int, within_s: float) -> bool:
@@ -93,7 +93,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     cell, world, truth = folder / "cell.yaml", folder / "world.yaml", folder / "truth.json"
     text = (SCENARIO_FOLDER / "wired_straight_groove.yaml").read_text()
     text = text.replace("127.30.0.1", host).replace("/tmp/weldcal-cell/scans", str(folder / "scans"))
-    cell.write_text(text.replace("pace: 0.5", "pace: 1.0"))
+    cell.write_text(text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY + "\n")
     world.write_text(WORLD)
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(world)]
     command += ["--cell", str(cell), "--seed", str(SEED), "--truth", str(truth)]
