@@ -147,13 +147,14 @@ def test_the_cell_knows_nothing_of_the_truth(welded: tuple[DemoResult, dict[str,
     assert (result.folder / "weld.csv").exists()
 
 
-def test_the_weld_stood_until_the_arc_was_there(welded: tuple[DemoResult, dict[str, Any]]) -> None:
+def test_the_weld_waits_for_the_arc(welded: tuple[DemoResult, dict[str, Any]]) -> None:
     log = welded[0].weld.log  # type: ignore[union-attr]
     lit = np.flatnonzero(log.torch_on)[0]
     speed = np.linalg.norm(np.diff(log.p_BRobot, axis=0), axis=1) / np.diff(log.time)
-    stood = speed[lit : lit + 60] < 1e-4
-    assert 0.04 < 0.008 * stood.sum() < 0.4, "the arc needs 0.12 s, of which the ramp to rest takes some"
-    assert speed[lit + 100 : lit + 150].mean() > 4e-3
+    # the arc takes 0.12 s, and a stop 0.15 s: the tool has almost come to rest
+    assert speed[lit - 30 : lit].mean() > 5e-3
+    assert speed[lit : lit + 40].min() < 3e-3
+    assert speed[lit + 60 : lit + 120].mean() > 5e-3
 
 
 def structure(diagram: Diagram, without: set[str]) -> tuple[set[str], set[tuple[str, str, str, str]]]:
@@ -187,7 +188,7 @@ def test_the_wired_cell_is_the_simulated_one_but_for_the_stations_inside(
         }  # wired to a real one only
         wired, rendered = (structure(cell.diagram, torch) for cell in (welded[0].run.cell, simulated))
         assert rendered == wired
-        assert len(wired[0]) > 15
+        assert len(wired[0]) > 10
         assert len(wired[1]) > 40
     finally:
         simulated.station.close()
