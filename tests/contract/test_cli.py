@@ -51,7 +51,7 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
     assert command.help
     assert all(parameter.help for parameter in command.params)
     assert "--debug" in options
-    if name in ("weldcal emulate-ur", "weldcal emulate-cell"):  # a server: it has no result, only a seed
+    if name in ("weldcal emulate-ur", "weldcal emulate-cell"):  # servers: they have no result, only a seed
         assert "--seed" in options
         return
     if name == "weldcal tablet serve":  # a server of one page: no result, nothing random

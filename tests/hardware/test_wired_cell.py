@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydrake.systems.framework import Diagram
+from pydrake.systems.primitives import VectorLogSink
 
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.simulated.world import SimulatedWorld
@@ -26,7 +27,6 @@ from weldcal.tools.commands.demo import run_scenario
 from weldcal.tools.emulators.ur.process import Emulator
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
-from weldcal.welding.servo.state import Phase
 
 SEED = 3
 SEAM_MM = 20.0
@@ -71,7 +71,7 @@ class Played:
 
     def scenario(self, overrides: str = "") -> Scenario:
         """The cell's scenario, which only welds."""
-        return load_scenario(str(self.cell), f"{WELD_ONLY}\n{overrides}")
+        return load_scenario(str(self.cell), overrides)
 
 
 def ends(pid: int, within_s: float) -> bool:
@@ -93,7 +93,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Played]:
     cell, world, truth = folder / "cell.yaml", folder / "world.yaml", folder / "truth.json"
     text = (SCENARIO_FOLDER / "wired_straight_groove.yaml").read_text()
     text = text.replace("127.30.0.1", host).replace("/tmp/weldcal-cell/scans", str(folder / "scans"))
-    cell.write_text(text.replace("pace: 0.5", "pace: 1.0"))
+    cell.write_text(text.replace("pace: 0.5", "pace: 1.0") + WELD_ONLY + "\n")
     world.write_text(WORLD)
     command = [sys.executable, "-P", "-m", "weldcal.tools", "emulate-cell", "--scenario", str(world)]
     command += ["--cell", str(cell), "--seed", str(SEED), "--truth", str(truth)]
@@ -128,8 +128,9 @@ def test_the_job_is_done_and_the_truth_file_says_how_well(welded: tuple[DemoResu
     assert (truth["state"], truth["collisions"]) == ("done", 0)
     assert truth["torch_mean_mm"] <= 0.10
     assert truth["torch_max_mm"] <= 0.35
-    assert truth["welded_mm"] == pytest.approx(SEAM_MM, abs=1.0)
-    assert truth["arc_on_s"] == pytest.approx(SEAM_MM / 8.0, abs=0.4)
+    # the weld begins where the groove is felt to begin, some mm from where it is drawn
+    assert 0.95 * SEAM_MM <= truth["welded_mm"] <= SEAM_MM + 8.0
+    assert truth["arc_on_s"] == pytest.approx(truth["welded_mm"] / 8.0, abs=0.5)
     assert np.array(truth["X_BC"])[:3, 3] == pytest.approx([0.65, 0.0, 0.95])
 
 
@@ -146,22 +147,23 @@ def test_the_cell_knows_nothing_of_the_truth(welded: tuple[DemoResult, dict[str,
     assert (result.folder / "weld.csv").exists()
 
 
-def test_the_weld_stood_until_the_arc_was_there(welded: tuple[DemoResult, dict[str, Any]]) -> None:
+def test_the_weld_waits_for_the_arc(welded: tuple[DemoResult, dict[str, Any]]) -> None:
     log = welded[0].weld.log  # type: ignore[union-attr]
     lit = np.flatnonzero(log.torch_on)[0]
-    track = float(list(Phase).index(Phase.TRACK))
     speed = np.linalg.norm(np.diff(log.p_BRobot, axis=0), axis=1) / np.diff(log.time)
-    stood = speed[lit : lit + 60] < 1e-4
-    assert log.telemetry["phase"][lit] == track
-    assert 0.04 < 0.008 * stood.sum() < 0.4, "the arc needs 0.12 s, of which the ramp to rest takes some"
-    assert speed[lit + 100 : lit + 150].mean() > 4e-3
+    # the arc takes 0.12 s, and a stop 0.15 s: the tool has almost come to rest
+    assert speed[lit - 30 : lit].mean() > 5e-3
+    assert speed[lit : lit + 40].min() < 3e-3
+    assert speed[lit + 60 : lit + 120].mean() > 5e-3
 
 
 def structure(diagram: Diagram, without: set[str]) -> tuple[set[str], set[tuple[str, str, str, str]]]:
     """The names of a cell's systems and its connections by the names of systems and ports."""
-    names = {system.get_name() for system in diagram.GetSystems()}
+    names = {system.get_name() for system in diagram.GetSystems() if not isinstance(system, VectorLogSink)}
     found = set()
     for (system, k), (source, port) in diagram.connection_map().items():
+        if isinstance(system, VectorLogSink):  # without a name; what is logged is the truth's or as here
+            continue
         wire = (
             source.get_name(),
             source.get_output_port(port).get_name(),
@@ -185,9 +187,9 @@ def test_the_wired_cell_is_the_simulated_one_but_for_the_stations_inside(
             "ur10e.arc_established",
         }  # wired to a real one only
         wired, rendered = (structure(cell.diagram, torch) for cell in (welded[0].run.cell, simulated))
-        logged = {wire for wire in rendered[1] if wire[1].startswith("cheat.")}
-        assert rendered[1] - logged == wired[1]
-        assert wired[0] == rendered[0] - {wire[2] for wire in logged}
+        assert rendered == wired
+        assert len(wired[0]) > 10
+        assert len(wired[1]) > 40
     finally:
         simulated.station.close()
 

@@ -31,7 +31,7 @@ from weldcal.tools.emulators.cell.scanner_process import ScannerSetup, run_scann
 from weldcal.tools.emulators.cell.score import score
 from weldcal.tools.emulators.ur.addresses import take_address
 from weldcal.tools.emulators.ur.controller.core import Controller
-from weldcal.tools.emulators.ur.main import Emulation
+from weldcal.tools.emulators.ur.main import FASTEST, SLOWEST, Emulation
 from weldcal.tools.emulators.ur.process import CONTROL_PORT
 from weldcal.tools.emulators.ur.versions import parse_version
 
@@ -200,6 +200,9 @@ def run_world(
     """
     world, cell = load_scenario(world_name), load_scenario(cell_name)
     wires = wires_of(cell)
+    fastest = wires.pace if pace is None else pace
+    if not SLOWEST <= fastest <= FASTEST:
+        raise InputError(f"The pace must be from {SLOWEST} to {FASTEST:.0f}, not {fastest:g}.")
     camera, device = world.finger_camera, world.robot
     if not isinstance(camera, RenderedFingerCamera):
         raise InputError("The world's finger camera is !RenderedFingerCamera.")
@@ -236,7 +239,7 @@ def run_world(
             controller,
             wires.host,
             control_port,
-            wires.pace if pace is None else pace,
+            fastest,
             WAITS_S,
             seed,
             after_step=inside.step,
