@@ -17,19 +17,14 @@ from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_datas
 from weldcal.calibration.errors import DatasetError, UndeterminedPoses
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate import calibrate_dataset
 from weldcal.tools.studies.flange.frames import flange_frame
-from weldcal.tools.studies.motion.moves import (
-    SeenFromHand,
-    closed_moves,
-    hand_moves,
-    observed_frames,
-    recorded_stream,
-)
+from weldcal.tools.studies.motion.moves import SeenFromHand, hand_moves, observed_frames
 
 SECONDS, EVERY = 12.0, 3
 TARGET = "iso9409-1-50-4-m6"

@@ -17,6 +17,7 @@ from weldcal.calibration.data.header import DatasetHeader
 from weldcal.calibration.data.motion_dataset import FrameTime, save_motion_dataset
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.errors import DatasetError, TooFewPoses
+from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
@@ -24,7 +25,7 @@ from weldcal.models.scanners import get_scanner
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.calibrate_motion import calibrate_motion
 from weldcal.tools.studies.flange.frames import empty_frame, flange_frame
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames, recorded_stream
+from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
 
 SECONDS = 6.0
 FLANGE = "iso9409-1-50-4-m6"

@@ -11,6 +11,7 @@ from weldcal.calibration.data.motion_dataset import read_stream
 from weldcal.calibration.data.results import load_result
 from weldcal.calibration.motion.expected import Expected, expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.moves import closed_moves, recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.jobs.motion.config import MotionJob
@@ -20,7 +21,6 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.report.files import write_json
-from weldcal.tools.studies.motion.moves import closed_moves, recorded_stream
 
 _EDGES, _LEANS = (0.5, 1.0, 1.25), (5.0, 15.0, 25.0)  # of the scenario's cube; degrees
 _SPEED_M_S = 0.25  # of a part to be scanned: what an error of the clock costs

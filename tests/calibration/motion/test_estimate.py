@@ -15,8 +15,9 @@ from weldcal.calibration.motion.clock import choose_clock
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.arrays import Array
-from weldcal.tools.studies.motion.moves import Moves, cube_moves, observed_frames, recorded_stream
+from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
 
 SECONDS = 13.0
 WORK = np.array([0.0, 0.0, 0.75])

@@ -9,8 +9,9 @@ from weldcal.calibration.data.motion_dataset import RobotStream
 from weldcal.calibration.motion.estimate import estimate_in_motion
 from weldcal.calibration.motion.expected import best_motion, expected_of_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.moves import Moves, recorded_stream
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.motion.moves import Moves, cube_moves, observed_frames, recorded_stream
+from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
 
 NOISE = {"centre_sigma_m": 4.2e-5, "normal_sigma": 5e-4}
 

@@ -14,8 +14,9 @@ from weldcal.calibration.motion.drift.watch import watch
 from weldcal.calibration.motion.observed import ObservedFrames
 from weldcal.calibration.motion.stream import ContinuousMotion
 from weldcal.calibration.motion.synchronise import synchronise
+from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.models.errors import InputError
-from weldcal.tools.studies.motion.moves import cube_moves, observed_frames, recorded_stream
+from weldcal.tools.studies.motion.moves import cube_moves, observed_frames
 
 DELAY_S = 0.140
 

@@ -11,11 +11,12 @@ from scipy.stats import binom, chi2
 from weldcal.calibration.geometry.se3 import difference
 from weldcal.calibration.motion.estimate import MotionEstimate, estimate_in_motion
 from weldcal.calibration.motion.stream import ContinuousMotion
+from weldcal.calibration.planning.moves import recorded_stream
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.report.render import write_atomic
 from weldcal.tools.studies.motion.exact import exact_errors
-from weldcal.tools.studies.motion.moves import DELAY_S, cube_moves, observed_frames, recorded_stream
+from weldcal.tools.studies.motion.moves import DELAY_S, cube_moves, observed_frames
 from weldcal.tools.studies.output import markdown_table
 
 LEVEL, SIGMAS = 0.95, 1.959964

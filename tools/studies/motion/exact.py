@@ -5,8 +5,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.geometry.se3 import difference, exp_rotation, skew
 from weldcal.calibration.motion.observed import ObservedFrames
+from weldcal.calibration.planning.moves import Moves
 from weldcal.models.arrays import Array
-from weldcal.tools.studies.motion.moves import Moves
 
 _STEP_S = 1e-4
 _ROUNDS = 3

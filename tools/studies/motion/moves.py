@@ -1,4 +1,4 @@
-"""Generates robot motions exactly: moveJ and moveL with trapezoidal speed through corners of a cube, and what a scanner sees."""
+"""Draws motions through corners of a cube, and what a streaming scanner sees of them."""
 
 from dataclasses import dataclass
 
@@ -6,14 +6,13 @@ import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from weldcal.calibration.data.motion_dataset import RobotStream
-from weldcal.calibration.geometry.se3 import inverse, pose
+from weldcal.calibration.geometry.se3 import inverse
 from weldcal.calibration.motion.observed import ObservedFrames
-from weldcal.models.arms.chain import chain_inverse, chain_poses, load_chain
+from weldcal.calibration.planning.moves import ROBOT, Moves, closed_moves
+from weldcal.models.arms.chain import chain_inverse, load_chain
 from weldcal.models.arrays import Array
 
-ROBOT = "ur10e"
-CUBE_M, SPEED, ACCELERATION = 0.2, 0.25, 1.2  # edge m, m/s, m/s^2
+CUBE_M = 0.2  # edge
 CORNERS = np.array([[0, 0, 0], [1, 1, 0], [1, 0, 1], [0, 1, 1]]) * CUBE_M
 CENTRE_SIGMA_M = (
     5e-5,
@@ -22,53 +21,7 @@ CENTRE_SIGMA_M = (
 )  # of a centre, across and along the normal: 0.5 mm of noise in some ten thousand points
 NORMAL_SIGMA = 5e-4
 FRAME_S, DELAY_S, JITTER_S = 0.05, 0.140, 0.015
-PAUSE_S = 0.1
 _SHAPE = 4.0  # of the gamma law of the transport's tail: skewness 1
-
-
-@dataclass(frozen=True, eq=False)
-class Moves:
-    """Moves between waypoints ``q`` (n, J) rad, one after the other and round again: each trapezoidal in one path parameter,
-    straight in joints (moveJ) or in space (moveL); ``lengths`` (n,) m are those of the paths of the flange."""
-
-    q: Array
-    poses: Array
-    lengths: Array
-    linear: bool
-    speed: float = SPEED
-
-    def at(self, t: Array) -> Array:
-        """Flange poses X_BF (..., 4, 4) at times (...) s, exact."""
-        k, s = self._progress(np.ravel(t))
-        j = (k + 1) % len(self.q)
-        if not self.linear:
-            X = chain_poses(load_chain(ROBOT), self.q[k] + s[:, None] * (self.q[j] - self.q[k]))
-        else:
-            R = Rotation.from_matrix(self.poses[:, :3, :3])
-            turn = (R[k].inv() * R[j]).as_rotvec()
-            p = self.poses[:, :3, 3]
-            X = pose((R[k] * Rotation.from_rotvec(s[:, None] * turn)).as_matrix(), p[k] + s[:, None] * (p[j] - p[k]))
-        return X.reshape(*np.shape(t), 4, 4)
-
-    def joints(self, t: Array) -> Array:
-        """Joint angles (N, J) rad of a moveJ at times (N,) s."""
-        k, s = self._progress(t)
-        return np.asarray(self.q[k] + s[:, None] * (self.q[(k + 1) % len(self.q)] - self.q[k]))
-
-    def _progress(self, t: Array) -> tuple[np.ndarray, Array]:
-        """Which move, and the share 0..1 of it done."""
-        ramp = self.speed / ACCELERATION
-        cruise = self.lengths / self.speed - ramp
-        duration = 2.0 * ramp + cruise + PAUSE_S
-        ends = np.cumsum(duration)
-        t = np.mod(t, ends[-1])
-        k = np.minimum(np.searchsorted(ends, t, side="right"), len(ends) - 1)
-        x = t - (ends - duration)[k]
-        c = cruise[k]
-        up = 0.5 * ACCELERATION * np.minimum(x, ramp) ** 2
-        steady = self.speed * np.clip(x - ramp, 0.0, c)
-        y = np.clip(x - ramp - c, 0.0, ramp)
-        return k, (up + steady + self.speed * y - 0.5 * ACCELERATION * y**2) / self.lengths[k]
 
 
 def cube_moves(
@@ -92,27 +45,6 @@ def cube_moves(
     R_BC = down.as_matrix()
     X_BC = RigidTransform(RotationMatrix(R_BC), middle - 0.75 * R_BC[:, 2])
     return closed_moves(np.array(q), linear=linear), X_BC
-
-
-def recorded_stream(
-    moves: Moves,
-    duration_s: float,
-    rng: np.random.Generator,
-    *,
-    rate: float = 500.0,
-    jitter_s: float = 1e-4,
-    joints: bool = False,
-) -> RobotStream:
-    """The robot's stream: times late by an exponential law of mean ``jitter_s``, numbers rounded to six digits."""
-    t = np.arange(0.0, duration_s, 1.0 / rate)
-    told = np.round(t + jitter_s * rng.exponential(size=len(t)) - jitter_s, 6)
-    order = np.argsort(told, kind="stable")
-    if joints:
-        q = np.round(moves.joints(t), 6)
-        return RobotStream(told[order], chain_poses(load_chain(ROBOT), q)[order], q[order], ROBOT)
-    X = moves.at(t)
-    X[:, :3, 3] = np.round(X[:, :3, 3], 6)
-    return RobotStream(told[order], X[order], None, ROBOT)
 
 
 def observed_frames(
@@ -222,17 +154,3 @@ def hand_moves(
             near = near + np.mod(found - near + np.pi, 2.0 * np.pi) - np.pi
             q.append(near)
     return closed_moves(np.array(q), linear=linear), X_FC, X_BT
-
-
-def closed_moves(way: Array, *, linear: bool) -> Moves:
-    """Moves through waypoints (n, J) rad and back to the first one."""
-    chain = load_chain(ROBOT)
-    poses = chain_poses(chain, way)
-    after = np.roll(np.arange(len(way)), -1)
-    steps = np.linspace(0.0, 1.0, 200)
-    lengths = np.linalg.norm(poses[after, :3, 3] - poses[:, :3, 3], axis=1)
-    if not linear:
-        for k in range(len(way)):
-            path = chain_poses(chain, way[k] + steps[:, None] * (way[after[k]] - way[k]))[:, :3, 3]
-            lengths[k] = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
-    return Moves(way, poses, lengths, linear)
