@@ -23,6 +23,7 @@ from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.sensors.preflight import Sensed
+from weldcal.systems.drivers.sensors.wired_camera import WiredFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
@@ -151,6 +152,9 @@ def _sensed(scenario: Scenario, device: str, config: DriverConfig, seed: int, q:
         look = partial(_simulated, scenario, device, seed, q)
     if look is None:
         return Sensed((_unknown(device.replace("_", " "), config),))
+    if isinstance(scenario.robot, UrRtde) and isinstance(config, WiredFingerCamera):
+        # an emulated cell's camera runs at the emulator's pace, which is 1 for a robot
+        config = dc.replace(config, rate_hz=config.rate_hz * scenario.robot.pace)
     try:
         found: Sensed = look(config)
     except WeldcalError as error:

@@ -12,7 +12,7 @@ from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TorchControl, TouchConfig
 
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
@@ -52,6 +52,7 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
             delta_d_m=welding.deflection_mm * 1e-3, axial_d_m=welding.axial_deflection_mm * 1e-3
         ),
         law=welding.law,
+        torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
     )
 
 
