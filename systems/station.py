@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource
 
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
@@ -27,6 +28,7 @@ from weldcal.systems.drivers.station_build import Closable, PreparedRobot, Stati
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 
@@ -58,6 +60,7 @@ class Station:
     second: ArmModel | None = None
     background: Background = dc.field(default_factory=Inline)
     devices: tuple[Closable, ...] = ()
+    surroundings: Surroundings = dc.field(default_factory=Surroundings)
 
     @property
     def arm(self) -> ArmModel:
@@ -186,6 +189,7 @@ def _make_station(
 ) -> Station:
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
+    surroundings = surroundings_of(scenario)
     tool = _tool(scenario, cad) if scenario.tool == "welding" else None
     devices: dict[str, DriverConfig] = {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
@@ -212,6 +216,7 @@ def _make_station(
             foot=furnishing.foot,
             profiler=furnishing.profiler,
             time_step_s=furnishing.time_step_s,
+            surroundings=surroundings,
         )
         build.parts = (world, *furnishing.parts)
     X_LC = None
@@ -235,13 +240,13 @@ def _make_station(
         build.find(TrueScanner),
         None if world is None else true_arm,
     )
-    _export(build, world, truth, scenario)
+    _export(build, world, truth, scenario, surroundings)
     diagram = builder.Build()
     diagram.set_name("station")
     second = None if furnishing.second is None else furnishing.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
-    return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened))
+    return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened), surroundings)
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
@@ -311,7 +316,9 @@ def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: f
     return RigidTransform(RollPitchYaw(0.0, 0.0, sign * rotation_rad), p)
 
 
-def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, scenario: Scenario) -> None:
+def _export(
+    build: StationBuild, world: SimulatedWorld | None, truth: Truth, scenario: Scenario, surroundings: Surroundings
+) -> None:
     builder = build.builder
     for name, port in build.inputs.items():
         builder.ExportInput(port, name)
@@ -325,6 +332,7 @@ def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, sce
             scenario.flange,
             scenario.calibration.table_z_m,
             build.outputs["ur10e.position_measured"],
+            surroundings,
         )
         builder.ExportOutput(drawn.get_query_output_port(), "query_object")
         return

@@ -30,6 +30,7 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
 from weldcal.models.tool import WeldingTool
@@ -41,6 +42,7 @@ DARK = (0.16, 0.18, 0.21, 1.0)
 COPPER = (0.80, 0.45, 0.20, 1.0)
 SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
+SURROUNDINGS = (0.55, 0.50, 0.42, 1.0)
 CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of it
 # A camera pixel integrates light over its area through a lens; a renderer samples one point of it. The blur of lens and pixel,
 # in texels, is applied to the print. Without it, edges parallel to the pixel rows would be off by a tenth of a pixel.
@@ -63,6 +65,13 @@ def show(
 ) -> None:
     """Register visual geometry on a body, for Meshcat and for rendered images."""
     plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
+
+
+def add_surroundings(plant: MultibodyPlant, surroundings: Surroundings) -> None:
+    """Add the cell's surroundings to the world as visual geometry."""
+    for k, obstacle in enumerate(surroundings.obstacles):
+        shape = mesh_shape(obstacle.mesh, f"surroundings_{k}.obj")
+        show(plant, plant.world_body(), RigidTransform(), shape, f"surroundings_{k}", SURROUNDINGS)
 
 
 def add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> None:

@@ -64,8 +64,20 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
         except Exception as error:  # Drake's loader raises several types, and not every message names the key
             what = " ".join(str(error).split())
             raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+    resolve_files(scenario, path.parent)
     check_scenario(scenario)
     return scenario
+
+
+def resolve_files(config: Any, folder: Path) -> None:
+    """Replace each relative path in a tree of configurations by the file beside the scenario, where there is one."""
+    for field in dc.fields(config):
+        value = getattr(config, field.name)
+        for item in value if isinstance(value, list) else [value]:
+            if dc.is_dataclass(item):
+                resolve_files(item, folder)
+        if field.metadata.get("file") and value and not Path(value).is_absolute() and (folder / value).exists():
+            setattr(config, field.name, str(folder / value))
 
 
 def _part_at_fault(text: str) -> str:

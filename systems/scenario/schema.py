@@ -12,6 +12,8 @@ from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
 
 JobConfigOf = TypeVar("JobConfigOf")
+FILE = {"file": True}
+"""Metadata of a key that names a file: a relative path is looked for beside the scenario first."""
 
 
 @dc.dataclass
@@ -73,6 +75,18 @@ class WorkpieceConfig:
     hole_from_mm: float | None = (
         None  # from this arc length on the true groove has no walls, which the scan does not show: contact is lost
     )
+
+
+@dc.dataclass
+class ObstacleConfig:
+    """A part of the cell's surroundings that the arm must not touch: a box, or the surface in a mesh file."""
+
+    name: str = ""  # in messages; empty: surroundings and a number
+    box_m: list[float] | None = None  # length along x, y and z of a box about the origin of its pose
+    mesh: str | None = dc.field(default=None, metadata=FILE)  # STL, OBJ or PLY file
+    unit: str = "mm"  # of the mesh: m or mm
+    pose: PoseConfig = dc.field(default_factory=PoseConfig)  # in the robot's base
+    margin_m: float = 0.02  # how far the arm keeps away
 
 
 @dc.dataclass
@@ -146,7 +160,9 @@ class Scenario:
 
     description: str = ""
     arm: str = "ur10e"
-    kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
+    kinematics: str | None = dc.field(
+        default=None, metadata=FILE
+    )  # a factory calibration in Universal Robots' kinematics.yaml schema
     flange: str = "iso9409-1-50-4-m6"  # of the arm
     tool: str = "welding"  # welding, pen or none
     robot: DriverConfig = dc.field(default_factory=NoDevice)
@@ -159,6 +175,7 @@ class Scenario:
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
+    surroundings: list[ObstacleConfig] = dc.field(default_factory=list)
     planning: PlanningConfig = dc.field(default_factory=PlanningConfig)
     welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
     job: JobConfig = dc.field(default_factory=JobConfig)

@@ -6,8 +6,10 @@ import dataclasses as dc
 import re
 import types
 import typing
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
@@ -18,6 +20,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
 from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
+from weldcal.systems.scenario.surroundings import surroundings_of
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.
@@ -188,6 +191,13 @@ workpiece:
   hole_from_mm: 200.0
   bend_radius_mm: 250.0
   located_by: drawing
+surroundings:
+- name: fence
+  box_m: [0.02, 2.0, 1.0]
+  mesh: fence.stl
+  unit: m
+  pose: {xyz_m: [1.2, 0.1, 0.5], rpy_deg: [1.0, 2.0, 3.0]}
+  margin_m: 0.05
 planning: {method: cloud, search: anywhere, start_m: [0.6, -0.1, 0.0]}
 welding:
   speed_mm_s: 6.0
@@ -235,6 +245,10 @@ def compare(schema: type, text: dict[str, Any], value: Any, default: Any, where:
             assert isinstance(loaded, tuple(sections(hints[key])))
             below = {k: v for k, v in written.items() if k != "_tag"}
             wrong += compare(type(loaded), below, loaded, type(loaded)(), f"{where}{key}.")
+            continue
+        if isinstance(loaded, list) and loaded and all(dc.is_dataclass(item) for item in loaded):
+            for k, (words, item) in enumerate(zip(written, loaded, strict=True)):
+                wrong += compare(type(item), words, item, type(item)(), f"{where}{key}[{k}].")
             continue
         if loaded != written:
             wrong.append(f"{where}{key} was lost: {written} became {loaded}")
@@ -447,3 +461,40 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
 def test_a_law_or_workpiece_that_is_not_to_be_had_is_refused(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         load_scenario("s_groove", text)
+
+
+FENCED = """
+surroundings:
+- {name: fence, box_m: [0.02, 2.0, 1.0], pose: {xyz_m: [1.2, 0.0, 0.5]}}
+- {mesh: %s, unit: mm, pose: {xyz_m: [0.3, -0.6, 0.0]}, margin_m: 0.05}
+"""
+
+
+def test_surroundings_are_boxes_and_mesh_files_in_the_base(tmp_path: Path) -> None:
+    (tmp_path / "fixture.obj").write_text("v 0 0 0\nv 100 0 0\nv 0 100 0\nf 1 2 3\n")
+    (tmp_path / "my.yaml").write_text(FENCED % "fixture.obj")
+    fence, fixture = surroundings_of(
+        load_scenario(str(tmp_path / "my.yaml"), "robot: !SimulatedUr {}\njob: {weld: false}")
+    ).obstacles
+    assert (fence.name, fixture.name) == ("fence", "surroundings 2")
+    assert fence.mesh.bounds == pytest.approx(np.array([[1.19, -1.0, 0.0], [1.21, 1.0, 1.0]]))
+    assert fixture.mesh.bounds == pytest.approx(np.array([[0.3, -0.6, 0.0], [0.4, -0.5, 0.0]]))
+    assert fixture.margin_m == 0.05
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "named"),
+    [
+        ("{}", r"surroundings\[0\] needs either box_m: \[x, y, z\] or mesh: FILE"),
+        ("{box_m: [1.0, 1.0, 0.0]}", r"surroundings\[0\].box_m needs three positive lengths"),
+        ("{box_m: [1.0, 1.0]}", r"surroundings\[0\].box_m must hold 3 numbers, not 2"),
+        ("{box_m: [1.0, 1.0, .nan]}", r"surroundings\[0\].box_m must be finite"),
+        ("{mesh: nowhere.stl}", "There is no mesh file 'nowhere.stl'"),
+        ("{mesh: README.md}", "README.md is no mesh that can be read"),
+        ("{mesh: nowhere.stl, unit: km}", "unit of nowhere.stl must be one of m, mm, inch"),
+        ("{box_m: [1.0, 1.0, 1.0], margin_m: -0.1}", r"surroundings\[0\].margin_m must not be negative"),
+    ],
+)
+def test_an_obstacle_that_cannot_be_built_is_refused_in_a_sentence(obstacle: str, named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        surroundings_of(load_scenario("s_groove", f"surroundings: [{obstacle}]"))

@@ -14,13 +14,23 @@ from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
-from weldcal.systems.bodies.tool import STEEL, TABLE, TIP_FRICTION, add_flange, add_tool, mesh_shape, show
+from weldcal.systems.bodies.tool import (
+    STEEL,
+    TABLE,
+    TIP_FRICTION,
+    add_flange,
+    add_surroundings,
+    add_tool,
+    mesh_shape,
+    show,
+)
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
@@ -81,6 +91,7 @@ def build_world(
     time_step_s: float = 0.002,
     second: PlacedArm | None = None,
     foot: BaseCircle | None = None,
+    surroundings: Surroundings | None = None,
 ) -> SimulatedWorld:
     """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
@@ -109,6 +120,8 @@ def build_world(
         ring = mesh_shape(flange_mesh(foot.standard, foot.standard.bore_depth_m), "foot.obj")
         show(plant, plant.GetBodyByName("base", instance), foot.X_BR, ring, "base_circle", STEEL)
     show(plant, world_body, RigidTransform([0.45, 0.0, table_z_m - 0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    if surroundings is not None:
+        add_surroundings(plant, surroundings)
     if workpiece is not None and X_BP is not None:
         show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
         rigid = ProximityProperties()

@@ -24,6 +24,7 @@ from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
@@ -168,6 +169,7 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, Fl
         arm_2=None if second is None else load_arm(second.arm),
         X_BD=None if second is None else second.pose(),
         q_home_2=None if second is None else np.deg2rad(second.home_deg),
+        surroundings=surroundings_of(scenario),
     )
     return scene, standard
 

@@ -216,6 +216,7 @@ def _add_welding(
                 welding.clearance_mm * 1e-3,
                 None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
                 scenario.planning.planning_method(),
+                station.surroundings,
             ),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
             station.background,

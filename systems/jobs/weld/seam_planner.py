@@ -1,15 +1,19 @@
 """SeamPlanner: plans the seam in the base, and the arm's approach, from a scan of the workpiece."""
 
 import dataclasses as dc
+import itertools
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.planning.clearance import arm_bodies
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
@@ -23,6 +27,8 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
+
+CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -38,15 +44,20 @@ class SeamPlanning:
     clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
+    surroundings: Surroundings = dc.field(default_factory=Surroundings)
 
     def waypoints(self, seam: SeamCurve) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Joint positions of the approach; see arm_waypoints.
 
         Raises:
-            WeldcalError: the seam is not feasible, or out of reach.
+            WeldcalError: the seam is not feasible, out of reach, or something is in the arm's way.
         """
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        return arm_waypoints(self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m)
+        q_start, q_above, q_retract = arm_waypoints(
+            self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m
+        )
+        check_weld_path(self, seam, q_start, q_above, q_retract)
+        return q_start, q_above, q_retract
 
 
 class SeamPlanner(BackgroundSystem):
@@ -125,6 +136,47 @@ def plan_seam(
         sigma_m=found.sigma_m,
         summary=found.summary,
     )
+
+
+def check_weld_path(
+    planning: SeamPlanning,
+    seam: SeamCurve,
+    q_start: NDArray[np.float64],
+    q_above: NDArray[np.float64],
+    q_retract: NDArray[np.float64],
+) -> None:
+    """Check that approach, weld and retreat keep away from the cell's surroundings.
+
+    Raises:
+        SeamObstructed: something is in the way; SeamOutOfReach: the arm cannot follow the seam.
+    """
+    if not planning.surroundings.obstacles:
+        return
+    X_BT = touch_start_pose(seam, planning.config)
+    along, q = [planning.q_near, q_above, q_start], q_start
+    first = seam.frame(0.0)
+    for s in np.arange(CHECKED_EVERY_M, seam.length, CHECKED_EVERY_M):
+        at = seam.frame(float(s))
+        turn = math.atan2(
+            float(np.dot(np.cross(first.tangent, at.tangent), first.up)), float(np.dot(first.tangent, at.tangent))
+        )
+        R = RotationMatrix(AngleAxis(turn, np.asarray(first.up) / np.linalg.norm(first.up))) @ X_BT.rotation()
+        found = nearest_solution(planning.arm, RigidTransform(R, at.position) @ planning.tool.X_FT.inverse(), q)
+        if found is None:
+            raise SeamOutOfReach(f"The arm cannot follow the seam at {1e3 * s:.0f} mm: move the workpiece.")
+        along.append(found)
+        q = found
+    bodies = arm_bodies(planning.arm, planning.tool.capsules())
+    for a, b in itertools.pairwise([*along, q_retract, planning.q_near]):
+        if name := planning.surroundings.touched_on_path(planning.arm, bodies, a, b):
+            raise SeamObstructed(
+                f"The arm or its tool would come too close to '{name}' on its way along the seam: move it or the workpiece, or "
+                "correct surroundings in the scenario."
+            )
+
+
+class SeamObstructed(WeldcalError):
+    """Something in the cell's surroundings is in the arm's way along the seam."""
 
 
 class SeamOutOfReach(WeldcalError):

@@ -74,6 +74,7 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
         margin_m=c.clearance_m,
         feature_radius_m=0.5 * feature_standard(scenario).outer_m,
         work_point_B=tuple(work_point(scenario)),
+        surroundings=station.surroundings,
     )
     poses = plan_calibration_poses(
         station.arm,
