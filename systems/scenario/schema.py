@@ -159,6 +159,9 @@ class Scenario:
     """
 
     description: str = ""
+    extends: str = (
+        ""  # a shipped scenario, or a YAML file beside this one: its values are used for the keys left out here
+    )
     arm: str = "ur10e"
     kinematics: str | None = dc.field(
         default=None, metadata=FILE

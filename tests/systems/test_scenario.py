@@ -24,6 +24,7 @@ from weldcal.systems.scenario.surroundings import surroundings_of
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.
+extends: s_groove
 arm: ur10e
 kinematics: my_robot/kinematics.yaml
 flange: iso9409-1-80-6-m8
@@ -382,8 +383,11 @@ def test_a_number_that_no_cell_can_work_with_is_named(overrides: str, named: str
         ("speeling: 1", "'speeling'"),
         ("welding: {speed_mm_per_s: 3}", "'speed_mm_per_s'"),
         ("robot: !SimulatedUr {following_eror_rad: 1}", "'following_eror_rad'"),
-        ("robot: !RealUr {}", "'RealUr'.*'robot'"),
-        ("scanner: !RenderedFingerCamera {}", "'RenderedFingerCamera'.*'scanner'"),
+        ("robot: !RealUr {}", "robot: there is no driver '!RealUr'"),
+        (
+            "scanner: !RenderedFingerCamera {}",
+            "scanner: there is no driver '!RenderedFingerCamera'; the nearest one is '!RenderedScanner'",
+        ),
         ("job: {calibrate: maybe}", "'calibrate'.*maybe"),
         ("calibration: {minimum_scans: 4.5}", "'minimum_scans'.*4.5"),
         ("description: 3", "'description'"),
@@ -498,3 +502,49 @@ def test_surroundings_are_boxes_and_mesh_files_in_the_base(tmp_path: Path) -> No
 def test_an_obstacle_that_cannot_be_built_is_refused_in_a_sentence(obstacle: str, named: str) -> None:
     with pytest.raises(InputError, match=named):
         surroundings_of(load_scenario("s_groove", f"surroundings: [{obstacle}]"))
+
+
+def test_a_scenario_extends_a_shipped_one_or_a_file_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("extends: s_groove\nwelding: {speed_mm_s: 5.0}\n")
+    (tmp_path / "slow.yaml").write_text("extends: mine.yaml\njob: {speed_factor: 0.5}\n")
+    shipped, slow = load_scenario("s_groove"), load_scenario(str(tmp_path / "slow.yaml"))
+    assert (slow.welding.speed_mm_s, slow.job.speed_factor) == (5.0, 0.5)
+    assert slow.scanner == shipped.scanner
+    assert slow.workpiece == shipped.workpiece
+
+
+def test_a_file_named_in_a_base_is_looked_for_beside_the_base(tmp_path: Path) -> None:
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "clamp.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "cell" / "base.yaml").write_text("extends: s_groove\nsurroundings: [{mesh: clamp.obj}]\n")
+    (tmp_path / "job.yaml").write_text("extends: cell/base.yaml\n")
+    loaded = load_scenario(str(tmp_path / "job.yaml"))
+    assert loaded.surroundings[0].mesh == str(tmp_path / "cell" / "clamp.obj")
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("extends: nowhere\n", "mine.yaml extends 'nowhere', which does not exist: choose one of"),
+        ("extends: mine.yaml\n", "mine.yaml extends itself by way of mine.yaml"),
+    ],
+)
+def test_a_base_that_cannot_be_used_is_named(tmp_path: Path, text: str, named: str) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(InputError, match=named):
+        load_scenario(str(tmp_path / "mine.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ("weldin: {speed_mm_s: 5}", "the key 'weldin' is not known; the nearest one is 'welding'"),
+        ("welding: {speed_mm: 5}", "the key 'speed_mm' in welding is not known; the nearest one is 'speed_mm_s'"),
+        ("robot: !UrRtde {hots: a}", "the key 'hots' in robot is not known; the nearest one is 'host'"),
+        ("surroundings: [{nam: a}]", r"the key 'nam' in surroundings\[0\] is not known; the nearest one is 'name'"),
+        ("workpiece: {pose_guess: {xyz: [0, 0, 0]}}", "'xyz' in workpiece.pose_guess .* nearest one is 'xyz_m'"),
+    ],
+)
+def test_an_unknown_key_is_answered_with_the_nearest_known_one(overrides: str, named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        load_scenario("s_groove", overrides)
