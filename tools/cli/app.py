@@ -19,6 +19,7 @@ from weldcal.tools.cli import (
     reproduce,
     robots,
     runs,
+    scenarios,
     tablet,
     verify,
     view,
@@ -28,6 +29,7 @@ PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then wel
 COMMANDS = (
     *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, plan_motion.plan_motion, runs.weld, view.view),
     *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
+    *(scenarios.new, scenarios.schema),
     *(cell.check_cell, cell.print_board, cell.finger_calibrate),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
