@@ -21,7 +21,7 @@ from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraCo
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
-from weldcal.systems.drivers.simulated.second_arm import SECOND, PlacedArm
+from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND, PlacedArm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
@@ -157,8 +157,8 @@ def make_station(
     `robot` is an already prepared robot; None: the driver in the scenario prepares it. `furnish` is the job's method.
     A station without simulated devices has no simulated world: the arm is displayed at its measured joints.
 
-    Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
-    `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
+    Ports: in `arm.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
+    `arm.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
     `finger_camera.image`, `.capture_time`, `query_object`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`,
     `cheat.torch`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
     profiler: in `profiler.trigger`, out `profiler.profile`, `torch.touch`.
@@ -203,7 +203,7 @@ def _make_station(
             true_arm,
             tool,
             robot.q_start,
-            flange=scenario.flange,
+            flange=scenario.flange_name(),
             table_z_m=scenario.calibration.table_z_m,
             workpiece=real,
             X_BP=X_BP,
@@ -261,9 +261,14 @@ def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationB
     apply_driver_config(config, own)
     for system in build.builder.GetSystems():
         if id(system) not in before:
-            system.set_name(system.get_name().replace("ur10e", SECOND))
-    build.inputs |= {name.replace("ur10e", SECOND): port for name, port in own.inputs.items()}
-    build.outputs |= {name.replace("ur10e", SECOND): port for name, port in own.outputs.items()}
+            system.set_name(_of_second(system.get_name()))
+    build.inputs |= {_of_second(name): port for name, port in own.inputs.items()}
+    build.outputs |= {_of_second(name): port for name, port in own.outputs.items()}
+
+
+def _of_second(name: str) -> str:
+    """The name of a port or system of the second arm, from that which its driver gave it."""
+    return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
 
 
 def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
@@ -322,9 +327,9 @@ def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, sce
             builder,
             build.arm,
             build.tool,
-            scenario.flange,
+            scenario.flange_name(),
             scenario.calibration.table_z_m,
-            build.outputs["ur10e.position_measured"],
+            build.outputs["arm.position_measured"],
         )
         builder.ExportOutput(drawn.get_query_output_port(), "query_object")
         return

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.published.algorithm1 import COST_AXES
+from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
@@ -145,9 +146,9 @@ class Scenario:
     """
 
     description: str = ""
-    arm: str = "ur10e"
+    arm: str = "ur10e"  # a Universal Robots arm, ur3e to ur30
     kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
-    flange: str = "iso9409-1-50-4-m6"  # of the arm
+    flange: str = ""  # ISO 9409-1 designation of the arm's flange; empty: that of the arm (`weldcal robots`)
     tool: str = "welding"  # welding, pen or none
     robot: DriverConfig = dc.field(default_factory=NoDevice)
     robot_2: DriverConfig = dc.field(default_factory=NoDevice)
@@ -168,6 +169,10 @@ class Scenario:
         """The part of the scenario of this type, such as a job's configuration; None where it has none."""
         found = (getattr(self, field.name) for field in dc.fields(self))
         return next((value for value in found if isinstance(value, kind)), None)
+
+    def flange_name(self) -> str:
+        """Designation of the arm's flange: the scenario's, or that of the arm's maker."""
+        return self.flange or get_robot(self.arm).flange
 
     def scanner_config(self) -> ScannerConfig | None:
         """The scanner's configuration; None where there is no scanner."""

@@ -27,8 +27,15 @@ from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_a
 from weldcal.systems.messages import Message
 
 SCANNER_RENDERER = "scanner"
-JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of the arm's joint servos
+JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of a UR10e's joint servos
 JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
+SERVO_EFFORT = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)  # N m, of that arm: another arm's servos are stiff in proportion
+
+
+def servo_gains(arm: ArmModel) -> tuple[list[float], list[float]]:
+    """Stiffness (6) N m / rad and damping (6) N m s / rad of an arm's joint servos, in proportion to its joints' torques."""
+    share = arm.effort_limit / np.array(SERVO_EFFORT)
+    return list(share * JOINT_STIFFNESS), list(share * JOINT_DAMPING)
 
 
 @dataclass(frozen=True)
@@ -100,7 +107,7 @@ def build_world(
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     add_flange(plant, instance, flange)
     tool_instance, tip_joints = (None, ()) if tool is None else add_tool(plant, instance, tool, tool.tip_radius_m / 2)
-    second_arm = None if second is None else add_second_arm(plant, second, JOINT_STIFFNESS, JOINT_DAMPING)
+    second_arm = None if second is None else add_second_arm(plant, second, *servo_gains(second.arm))
     if second_arm is not None:
         add_flange(plant, second_arm, flange)
     touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, table_z_m)
@@ -119,9 +126,10 @@ def build_world(
                 world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
             )
     fitted = [fitting.add(plant, instance) for fitting in fittings]
+    stiffness, damping = servo_gains(arm)
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
-        servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
+        servo.set_controller_gains(PdControllerGains(p=stiffness[k], d=damping[k]))
     plant.Finalize()
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):

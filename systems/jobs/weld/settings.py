@@ -28,7 +28,7 @@ def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
 
 def feature_standard(scenario: Scenario) -> FlangeStandard:
     """Dimensions of that feature."""
-    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange)
+    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange_name())
 
 
 def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
