@@ -143,6 +143,22 @@ ROBOTS: dict[str, Robot] = {
 }  # fmt: skip
 """Every robot known by name; the ISO 9409-1 designation of each in one place."""
 
+CONTROLLER_MODELS: dict[str, tuple[str, int]] = {
+    "ur3e": ("UR3", 3),
+    "ur5": ("UR5", 1),
+    "ur5e": ("UR5", 1),
+    "ur7e": ("UR5", 1),
+    "ur10": ("UR10", 2),
+    "ur10e": ("UR10", 2),
+    "ur12e": ("UR10", 2),
+    "ur16e": ("UR16", 4),
+    "ur20": ("UR20", 7),
+    "ur30": ("UR30", 8),
+}
+"""What a Universal Robots controller calls its arm: `get robot model` of the dashboard, and robot_type of the primary interface
+(numbers: RobotType of UniversalRobots/Universal_Robots_Client_Library). UR7e and UR12e are assumed to answer as the UR5e and UR10e,
+or with their own names."""
+
 ALIASES = {"franka": "franka_panda", "panda": "franka_panda", "fr3": "franka_fr3", "aubo": "aubo_i5"}
 """Shorter names that datasets use."""
 

@@ -83,7 +83,7 @@ def chosen_robot(
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
     with emulator_process(
-        host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
+        host=wanted, robot=scenario.arm, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
     ) as emulator:
         load = (scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(emulator.host, scenario)).load()
         emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))

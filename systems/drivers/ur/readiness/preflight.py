@@ -21,6 +21,7 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KinematicsInfo,
     calibrated_arm,
     cross_check,
+    model_finding,
     read_kinematics,
 )
 from weldcal.systems.drivers.ur.readiness.load import (
@@ -29,6 +30,7 @@ from weldcal.systems.drivers.ur.readiness.load import (
     mode_finding,
     payload_finding,
 )
+from weldcal.systems.drivers.ur.readiness.needs import OUTPUTS, WAITS_FOR
 from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET, ranges, register_names
 from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported
 from weldcal.systems.drivers.ur.wire.dashboard import ask
@@ -41,17 +43,6 @@ LOCAL = "LOCAL"
 LIMIT_MARGIN_RAD = float(np.deg2rad(5.0))
 REST_RAD_S = 0.005
 
-OUTPUTS = (
-    "runtime_state",
-    "robot_mode",
-    "safety_mode",
-    "speed_scaling",
-    "target_speed_fraction",
-    "actual_q",
-    "actual_qd",
-    "actual_TCP_pose",
-    "tcp_offset",
-)
 CHECKS = (
     "answer",
     "version",
@@ -64,21 +55,12 @@ CHECKS = (
     "payload",
     "speed slider",
     "registers",
+    "model",
     "kinematics",
     "flange pose",
     "operational mode",
     "remote control",
 )
-
-# Without power there are no joint positions and no kinematics; without a dashboard remote control cannot be checked.
-WAITS_FOR = {
-    "standstill": ("power",),
-    "joint limits": ("power",),
-    "kinematics": ("power",),
-    "flange pose": ("power", "kinematics"),
-    "operational mode": ("program",),
-    "remote control": ("program",),
-}
 
 
 @dataclass(frozen=True)
@@ -225,6 +207,7 @@ class _Look:
             self._check_standstill()
             self._check_limits()
             self._check_kinematics()
+        self._check_model()
         self._check_remote()
 
     @property
@@ -338,6 +321,19 @@ class _Look:
         # driver clears it, and the guard script ignores all commands until it has read zero there.
         stale = f"; command {command} is left over, the driver clears it" if command else ""
         self._ok("registers", f"{ranges(list(claims))} free{stale}")
+
+    def _check_model(self) -> None:
+        """Whether the controller's arm is the scenario's, as far as their names tell them apart."""
+        wanted = self._nominal.name
+        if self._is_x():
+            self._ok("model", "not readable on PolyScope X; the kinematics tell")
+            return
+        try:
+            told = self._ask("get robot model")
+        except RobotUnreachable as problem:
+            self._bad("model", "the dashboard does not answer", str(problem))
+            return
+        self._state("model", *model_finding(told, wanted))
 
     def _check_kinematics(self) -> None:
         try:
