@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 import inspect
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource
 
-from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
@@ -26,6 +25,7 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
@@ -105,6 +105,9 @@ def prepare_robot(config: Any, nominal: ArmModel, q_home: np.ndarray) -> Prepare
     return found
 
 
+TABLE_MIDDLE_M = 0.45  # along the world's x
+
+
 class CheatPoses(LeafSystem):
     """Outputs the true positions of tip and torch.
 
@@ -169,8 +172,7 @@ def make_station(
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     if robot is None:
-        nominal = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
-        robot = prepare_robot(scenario.robot, nominal, np.deg2rad(scenario.home_deg))
+        robot = prepare_robot(scenario.robot, nominal_arm(scenario), np.deg2rad(scenario.home_deg))
     opened: list[Closable] = []
     try:
         return _make_station(scenario, seed, robot, furnish, opened)
@@ -204,7 +206,7 @@ def _make_station(
             tool,
             robot.q_start,
             flange=scenario.flange_name(),
-            table_z_m=scenario.calibration.table_z_m,
+            table=table_in_base(scenario),
             workpiece=real,
             X_BP=X_BP,
             fittings=furnishing.fittings,
@@ -306,6 +308,11 @@ def _workpieces(
     return cad, real, spec.pose_guess.pose() @ placed
 
 
+def table_in_base(scenario: Scenario) -> RigidTransform:
+    """Pose in the base of the table's frame: its top's middle, z up."""
+    return scenario.base.pose().inverse() @ RigidTransform([TABLE_MIDDLE_M, 0.0, scenario.calibration.table_z_m])
+
+
 def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
     """Draw the pose error of a plate on its fixture: a translation and a rotation in its plane."""
     error = random_pose_error(rng, translation_m, rotation_rad)
@@ -328,7 +335,7 @@ def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, sce
             build.arm,
             build.tool,
             scenario.flange_name(),
-            scenario.calibration.table_z_m,
+            table_in_base(scenario),
             build.outputs["arm.position_measured"],
         )
         builder.ExportOutput(drawn.get_query_output_port(), "query_object")

@@ -8,7 +8,7 @@ factory calibration has the same schema as the nominal numbers, so nothing else 
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +70,7 @@ class ArmModel:
     centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
     tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the radii
     of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or None for the nominal numbers.
+    up (3,) is the unit vector against gravity in B: +z of an arm that stands.
     """
 
     name: str
@@ -91,6 +92,7 @@ class ArmModel:
     dh: DenavitHartenberg
     housings: Housings
     calibration: str | None = None
+    up: Array = field(default_factory=lambda: _frozen([0.0, 0.0, 1.0]))
 
     @property
     def transforms(self) -> tuple[RigidTransform, ...]:
@@ -157,9 +159,16 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
         inertias=_frozen([R @ tensor @ R.T for R, tensor in zip(rotations, tensors, strict=True)]),
         tube_offsets=(_number(offsets, "shoulder_offset"), _number(offsets, "elbow_offset")),
         dh=DenavitHartenberg(**{k: _number(dh, k) for k in ("d1", "a2", "a3", "d4", "d5", "d6")}),
-        housings=Housings(**{field.name: _number(radii, field.name) for field in fields(Housings)}),
+        housings=Housings(**{f.name: _number(radii, f.name) for f in fields(Housings)}),
         calibration=calibration,
     )
+
+
+def mounted(arm: ArmModel, X_WB: RigidTransform) -> ArmModel:
+    """The same arm with its base at X_WB in a world whose z points up: on a ceiling, a wall or a pedestal."""
+    # exactly +z for an upright base: rounding must not change a plan
+    up = X_WB.rotation().matrix()[2]
+    return replace(arm, up=_frozen(np.where(np.abs(up - np.round(up)) < 1e-12, np.round(up), up)))
 
 
 def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, source: str) -> ArmModel:

@@ -24,7 +24,7 @@ def station_bodies(station: Station) -> list[Body]:
 def clear_move(scenario: Scenario, station: Station, bodies: list[Body], q_a: Joints, q_b: Joints) -> bool:
     """Whether a straight move in joint space stays above the table and free of self-collision; (6,) rad."""
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
-    return lowest > scenario.calibration.table_z_m and gap > 0.0
+    return lowest > scenario.table_height_m() and gap > 0.0
 
 
 def check_way_home(scenario: Scenario, station: Station) -> None:

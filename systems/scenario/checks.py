@@ -10,7 +10,7 @@ from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
 from weldcal.systems.scenario.numbers import check_numbers
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
@@ -54,6 +54,11 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     found = job_of(scenario)  # raises for the parts of two jobs
     check_numbers(scenario)
+    if found.key and scenario.base != PoseConfig():
+        raise InputError(
+            f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or calibrate with "
+            "the default job (job.weld: false)."
+        )
     for job in jobs():
         job.check(scenario)
     if not found.key and not scenario.job.calibrate and not scenario.job.weld:

@@ -55,7 +55,7 @@ class CalibrationConfig:
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
     work_radius_mm: float = 200.0  # section 4.2: distance from the flange centre at which a rotation is weighted
     cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: the weighted axes
-    table_z_m: float = 0.0
+    table_z_m: float = 0.0  # height of the table in the world W, whose origin is the base where `base` is not given
     clearance_m: float = 0.05
     work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # used where there is no workpiece
 
@@ -147,6 +147,9 @@ class Scenario:
 
     description: str = ""
     arm: str = "ur10e"  # a Universal Robots arm, ur3e to ur30
+    base: PoseConfig = dc.field(
+        default_factory=PoseConfig
+    )  # X_WB: the robot's base in a world whose z points up; all other poses of a scenario are in B
     kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
     flange: str = ""  # ISO 9409-1 designation of the arm's flange; empty: that of the arm (`weldcal robots`)
     tool: str = "welding"  # welding, pen or none
@@ -169,6 +172,10 @@ class Scenario:
         """The part of the scenario of this type, such as a job's configuration; None where it has none."""
         found = (getattr(self, field.name) for field in dc.fields(self))
         return next((value for value in found if isinstance(value, kind)), None)
+
+    def table_height_m(self) -> float:
+        """Height of the table over the base's origin, against gravity, m."""
+        return self.calibration.table_z_m - self.base.xyz_m[2]
 
     def flange_name(self) -> str:
         """Designation of the arm's flange: the scenario's, or that of the arm's maker."""

@@ -11,6 +11,7 @@ from tests.hardware.emulator_process import emulator_process
 from weldcal.models.arms.kinematics import known_arms, load_arm
 from weldcal.models.robots import CONTROLLER_MODELS, get_robot
 from weldcal.systems.drivers.ur.readiness.kinematics_info import model_finding, read_kinematics
+from weldcal.systems.drivers.ur.readiness.load import mounting_finding
 from weldcal.systems.drivers.ur.readiness.preflight import CHECKS, preflight
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.main import HOME
@@ -60,3 +61,16 @@ def test_the_preflight_wants_the_scenarios_arm() -> None:
         assert "not a ur10e" in refused.checks[CHECKS.index("kinematics")].found
         assert read_kinematics(robot.host).a[1] == pytest.approx(load_arm("ur20").dh.a2)
     assert get_robot("ur20").flange == "iso9409-1-80-6-m8"
+
+
+def test_the_mounting_is_compared_with_the_scenarios() -> None:
+    ceiling = np.array([0.0, 0.0, -1.0])
+    hangs = mounting_finding({"target_gravity": (0.0, 0.1, -9.8)}, ceiling)
+    assert hangs[0]
+    stands = mounting_finding({"target_gravity": (0.0, 0.0, 9.82)}, ceiling)
+    assert not stands[0]
+    assert "up is (0.00, 0.00, 1.00) in the base, not (0.00, 0.00, -1.00)" in stands[1]
+    assert "Installation > General > Mounting" in stands[2]
+    unknown = mounting_finding({}, ceiling)
+    assert unknown[0]
+    assert "not readable" in unknown[1]

@@ -22,6 +22,7 @@ from weldcal.systems.scenario.schema import PoseConfig, Scenario
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.
 arm: ur10e
+base: {xyz_m: [0.1, 0.2, 0.3], rpy_deg: [180.0, 1.0, 2.0]}
 kinematics: my_robot/kinematics.yaml
 flange: iso9409-1-80-6-m8
 tool: pen

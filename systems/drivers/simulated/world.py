@@ -9,7 +9,13 @@ from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties,
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import JointActuatorIndex, ModelInstanceIndex, PdControllerGains, PrismaticJoint
+from pydrake.multibody.tree import (
+    JointActuatorIndex,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    UniformGravityFieldElement,
+)
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
@@ -80,7 +86,7 @@ def build_world(
     q_start: np.ndarray,
     *,
     flange: str,
-    table_z_m: float,
+    table: RigidTransform,
     workpiece: Workpiece | None,
     X_BP: RigidTransform | None,
     fittings: Sequence[Fittings] = (),
@@ -91,6 +97,7 @@ def build_world(
 ) -> SimulatedWorld:
     """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
+    Gravity pulls against the arm's `up`. `table` is the pose in B of the table's top, z up.
     A robot driver sets the servos' reference: the simulated controller, or a real arm that the simulated one follows.
     Frame: the world is the robot base B. `workpiece` is the true part (it may differ from its CAD), placed at X_BP.
     `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
@@ -103,6 +110,7 @@ def build_world(
         ),
         builder,
     )
+    plant.mutable_gravity_field().set_gravity_vector(-UniformGravityFieldElement.kDefaultStrength * arm.up)
     (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     add_flange(plant, instance, flange)
@@ -110,12 +118,12 @@ def build_world(
     second_arm = None if second is None else add_second_arm(plant, second, *servo_gains(second.arm))
     if second_arm is not None:
         add_flange(plant, second_arm, flange)
-    touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, table_z_m)
+    touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, float(table.translation()[2]))
     world_body = plant.world_body()
     if foot is not None:
         ring = mesh_shape(flange_mesh(foot.standard, foot.standard.bore_depth_m), "foot.obj")
         show(plant, plant.GetBodyByName("base", instance), foot.X_BR, ring, "base_circle", STEEL)
-    show(plant, world_body, RigidTransform([0.45, 0.0, table_z_m - 0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    show(plant, world_body, table @ RigidTransform([0.0, 0.0, -0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
     if workpiece is not None and X_BP is not None:
         show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
         rigid = ProximityProperties()

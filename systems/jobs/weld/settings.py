@@ -69,7 +69,7 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
     config = PlannerConfig(
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),
-        table_z_m=c.table_z_m,
+        table_z_m=scenario.table_height_m(),
         margin_m=c.clearance_m,
         feature_radius_m=0.5 * feature_standard(scenario).outer_m,
         work_point_B=tuple(work_point(scenario)),

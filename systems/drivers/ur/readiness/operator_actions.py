@@ -114,6 +114,14 @@ def payload(owner: str, text: str) -> str:
     )
 
 
+def mounting(wanted: str) -> str:
+    """The operator action where the robot is mounted in another way than in the scenario."""
+    return (
+        "The robot's mounting is not that of the scenario: set it under Installation > General > Mounting on the pendant, or correct "
+        f"base.rpy_deg in the scenario, by which up is {wanted} in the robot's base."
+    )
+
+
 def model(told: str, wanted: str) -> str:
     """The operator action where the controller's arm is another model than the scenario's."""
     return (

@@ -25,9 +25,11 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     read_kinematics,
 )
 from weldcal.systems.drivers.ur.readiness.load import (
+    GRAVITY_OUTPUT,
     PAYLOAD_OUTPUTS,
     ExpectedLoad,
     mode_finding,
+    mounting_finding,
     payload_finding,
 )
 from weldcal.systems.drivers.ur.readiness.needs import OUTPUTS, WAITS_FOR
@@ -53,6 +55,7 @@ CHECKS = (
     "joint limits",
     "TCP",
     "payload",
+    "mounting",
     "speed slider",
     "registers",
     "model",
@@ -202,6 +205,7 @@ class _Look:
         self._check_program()
         self._check_tcp()
         self._state("payload", *payload_finding(self._seen, self._load))
+        self._state("mounting", *mounting_finding(self._seen, self._nominal.up))
         self._check_speed()
         if self._done["power"].ok:
             self._check_standstill()
@@ -221,7 +225,7 @@ class _Look:
             if not self._check_version(rtde.version):
                 return {}
             claims = rtde.claim(register_names(self._offset))
-            self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, f"input_int_register_{self._offset}"))
+            self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, GRAVITY_OUTPUT, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
             self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
         return claims
