@@ -140,9 +140,9 @@ def _candidates(
         X_BF = X_BR @ X_RF
         if (
             float(np.linalg.norm(X_BF.translation())) > reach
-            or float(X_BR.translation()[2]) < config.table_z_m + config.margin_m
+            or float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m
         ):
-            low = float(X_BR.translation()[2]) < config.table_z_m + config.margin_m
+            low = float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m
             why["the table is in the way" if low else "the scanner's working range is out of the arm's reach"] += 1
             continue
         q = nearest_solution(arm, X_BF, q_start)
@@ -200,7 +200,7 @@ def _refuse(
     if sigma_min(jacobian(arm, q)) < config.min_sigma:
         return "the arm would stand in a singularity"
     frames = link_frames(arm, q)
-    if lowest_point(bodies, frames) < config.table_z_m + config.margin_m:
+    if lowest_point(bodies, frames, arm.up) < config.table_z_m + config.margin_m:
         return "the table is in the way"
     if self_distance(bodies, frames) < config.self_clearance_m:
         return "the arm would touch itself"

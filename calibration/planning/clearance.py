@@ -12,6 +12,7 @@ from weldcal.models.arrays import Array
 
 TOOL = 7  # bodies of the tool: on the flange, one link further than wrist 3
 STANDING = (0, 1)  # links: base and shoulder stand on the table by design
+_UP = np.array([0.0, 0.0, 1.0])
 _SAMPLES = np.linspace(0.0, 1.0, 5)
 
 
@@ -38,10 +39,10 @@ def body_ends(body: Body, frames: list[RigidTransform]) -> tuple[Array, Array]:
     return np.asarray(X @ body.p_start), np.asarray(X @ body.p_end)
 
 
-def lowest_point(bodies: list[Body], frames: list[RigidTransform]) -> float:
-    """Lowest z (m, in B) of all bodies that move."""
+def lowest_point(bodies: list[Body], frames: list[RigidTransform], up: Array = _UP) -> float:
+    """Lowest height (m over B's origin, along ``up`` (3,), a unit vector in B) of all bodies that move."""
     moving = [b for b in bodies if b.link not in STANDING]
-    return min(min(float(e[2]) for e in body_ends(b, frames)) - b.radius for b in moving)
+    return min(min(float(e @ up) for e in body_ends(b, frames)) - b.radius for b in moving)
 
 
 def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
@@ -61,13 +62,13 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
 def path_clearance(
     arm: ArmModel, bodies: list[Body], q_a: Array, q_b: Array, step_rad: float = 0.1
 ) -> tuple[float, float]:
-    """Lowest z (m, in B) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
+    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
 
     ``q_a``, ``q_b`` (6,) rad; the path is sampled so that no joint turns by more than ``step_rad`` between samples.
     """
     n = int(np.ceil(float(np.abs(q_b - q_a).max()) / step_rad)) + 1
     placed = [link_frames(arm, q_a + u * (q_b - q_a)) for u in np.linspace(0.0, 1.0, max(n, 2))]
-    return min(lowest_point(bodies, f) for f in placed), min(self_distance(bodies, f) for f in placed)
+    return min(lowest_point(bodies, f, arm.up) for f in placed), min(self_distance(bodies, f) for f in placed)
 
 
 def occludes(

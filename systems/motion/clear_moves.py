@@ -26,7 +26,7 @@ def clear_move(scenario: Scenario, station: Station, bodies: list[Body], q_a: Jo
     if station.surroundings.touched_on_path(station.arm, bodies, q_a, q_b):
         return False
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
-    return lowest > scenario.calibration.table_z_m and gap > 0.0
+    return lowest > scenario.table_height_m() and gap > 0.0
 
 
 def check_way_home(scenario: Scenario, station: Station) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.published.algorithm1 import COST_AXES
+from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
@@ -56,7 +57,7 @@ class CalibrationConfig:
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
     work_radius_mm: float = 200.0  # section 4.2: distance from the flange centre at which a rotation is weighted
     cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: the weighted axes
-    table_z_m: float = 0.0
+    table_z_m: float = 0.0  # height of the table in the world W, whose origin is the base where `base` is not given
     clearance_m: float = 0.05
     work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # used where there is no workpiece
 
@@ -159,14 +160,14 @@ class Scenario:
     """
 
     description: str = ""
-    extends: str = (
-        ""  # a shipped scenario, or a YAML file beside this one: its values are used for the keys left out here
-    )
-    arm: str = "ur10e"
-    kinematics: str | None = dc.field(
-        default=None, metadata=FILE
-    )  # a factory calibration in Universal Robots' kinematics.yaml schema
-    flange: str = "iso9409-1-50-4-m6"  # of the arm
+    # a shipped scenario, or a YAML file beside this one: its values are used for the keys left out here
+    extends: str = ""
+    arm: str = "ur10e"  # a Universal Robots arm, ur3e to ur30
+    # X_WB: the robot's base in a world whose z points up; all other poses of a scenario are in B
+    base: PoseConfig = dc.field(default_factory=PoseConfig)
+    # a factory calibration in Universal Robots' kinematics.yaml schema
+    kinematics: str | None = dc.field(default=None, metadata=FILE)
+    flange: str = ""  # ISO 9409-1 designation of the arm's flange; empty: that of the arm (`weldcal robots`)
     tool: str = "welding"  # welding, pen or none
     robot: DriverConfig = dc.field(default_factory=NoDevice)
     robot_2: DriverConfig = dc.field(default_factory=NoDevice)
@@ -188,6 +189,14 @@ class Scenario:
         """The part of the scenario of this type, such as a job's configuration; None where it has none."""
         found = (getattr(self, field.name) for field in dc.fields(self))
         return next((value for value in found if isinstance(value, kind)), None)
+
+    def table_height_m(self) -> float:
+        """Height of the table over the base's origin, against gravity, m."""
+        return self.calibration.table_z_m - self.base.xyz_m[2]
+
+    def flange_name(self) -> str:
+        """Designation of the arm's flange: the scenario's, or that of the arm's maker."""
+        return self.flange or get_robot(self.arm).flange
 
     def scanner_config(self) -> ScannerConfig | None:
         """The scanner's configuration; None where there is no scanner."""

@@ -279,13 +279,13 @@ def test_the_cells_process_output_reaches_the_terminal_where_one_is_wired(bench:
     described.robot = UrRtde(host=bench.host, process_output=output)
     station = make_station(described, 0)
     with closing(station):
-        wired = station.diagram.HasInputPort("ur10e.process_on")
+        wired = station.diagram.HasInputPort("arm.process_on")
         assert wired == (output is not None)
         if not wired:
             return
         drive = Drive(station)
         clock = WallClock(1.0)
-        drive.set("ur10e.process_on", [1.0])
+        drive.set("arm.process_on", [1.0])
         for _ in range(50):
             drive.run(0.004)
             clock.wait_for(drive.time, moving=True)

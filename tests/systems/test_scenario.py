@@ -26,6 +26,7 @@ ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.
 extends: s_groove
 arm: ur10e
+base: {xyz_m: [0.1, 0.2, 0.3], rpy_deg: [180.0, 1.0, 2.0]}
 kinematics: my_robot/kinematics.yaml
 flange: iso9409-1-80-6-m8
 tool: pen
@@ -343,7 +344,8 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [
-        ("arm: ur3e", "arm must be ur10e"),
+        ("arm: aubo_i5", "'aubo_i5' is none of them"),
+        ("arm: ur3e\nrobot: !UrRtde {payload_kg: 3.5}", "the payload of a ur3e is 3 kg"),
         ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
         ("calibration: {work_point_m: [1, 2]}", "calibration.work_point_m must hold 3 numbers, not 2"),
         ("robot: !UrRtde {payload_cog_m: [1, 2]}", "robot.payload_cog_m must hold 3 numbers, not 2"),

@@ -17,7 +17,7 @@ from pydrake.systems.analysis import Simulator
 
 from weldcal.calibration.errors import FlangeNotFound, UnreachableScanner
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
-from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
@@ -32,6 +32,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.host_timing import measure_host
 from weldcal.systems.jobs.weld.settings import feature_standard, plan_poses
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.commands.check_robot import state_of
@@ -130,7 +131,7 @@ def _alone(scenario: Scenario, device: str) -> Scenario:
 def _robot(scenario: Scenario, q: Array) -> tuple[list[tuple[str, Check]], RigidTransform | None]:
     """The robot's checks, and the pose of its flange where it could be read."""
     config = scenario.robot
-    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+    arm = nominal_arm(scenario)
     if isinstance(config, UrRtde):
         report = preflight(config.host, upper_registers=config.upper_registers, nominal=arm, load=config.load())
         X_BF = None if report.arm is None or report.arm_q is None else forward_kinematics(report.arm, report.arm_q)
@@ -167,7 +168,7 @@ def _simulated(scenario: Scenario, device: str, seed: int, q: Array, config: Dri
     ask, port = {"scanner": ("trigger", "scan"), "finger_camera": ("streaming", "image")}.get(device, ("", ""))
     if not ask:  # a part of a job's furnishing
         return Sensed((Check(device.replace("_", " "), True, "simulated"),))
-    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+    arm = nominal_arm(scenario)
     station = make_station(_alone(scenario, device), seed, PreparedRobot(arm, q))
     try:
         if not station.diagram.HasOutputPort(f"{device}.{port}"):

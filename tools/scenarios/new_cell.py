@@ -56,7 +56,7 @@ def _parts(scenario: Scenario) -> Iterator[str]:
             yield _line(dc.replace(key, meaning=meaning), value, "")
             continue
         tag = f" !{type(value).__name__}" if key.name in DEVICES else ""
-        comment = f"# {key.name}: {meaning}\n" if meaning else ""
+        comment = f"# {meaning}\n" if meaning else ""
         below = "".join(_below(value, "  "))
         yield f"\n{comment}{key.name}:{tag}" + (f"\n{below}" if below else " {}\n")
 

@@ -228,13 +228,13 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     if build.robot is None or not isinstance(build.robot.handle, UrLink) or build.robot.clock is None:
         raise RuntimeError("the robot was not prepared")
     arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, build.robot.clock))
-    arm.set_name("ur10e_link")
+    arm.set_name("arm_link")
     if (world := build.find(SimulatedWorld)) is not None:
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
-    build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
+    build.inputs["arm.velocity_command"] = arm.GetInputPort("velocity_command")
     if config.process_output is not None:
-        build.inputs["ur10e.process_on"] = arm.GetInputPort("process_on")
+        build.inputs["arm.process_on"] = arm.GetInputPort("process_on")
     if config.arc_input is not None:
-        build.outputs["ur10e.arc_established"] = arm.GetOutputPort("arc_established")
+        build.outputs["arm.arc_established"] = arm.GetOutputPort("arc_established")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
-        build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)
+        build.outputs[f"arm.{name}"] = arm.GetOutputPort(name)

@@ -154,7 +154,7 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, Fl
     carrier = scanner.mounted_on
     link = {"base": 0, "flange": FLANGE}.get(carrier, 1 + LINKS.index(carrier) if carrier in LINKS else 0)
     circle = base_circle(scenario.arm) if c.configuration in FOOT else None
-    standard = get_flange(scenario.flange) if circle is None else circle.standard
+    standard = get_flange(scenario.flange_name()) if circle is None else circle.standard
     second = job.second_arm
     scene = MountingScene(
         configuration=c.configuration,

@@ -21,8 +21,9 @@ from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces import Workpiece
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.servo.settings import ServoConfig
@@ -118,7 +119,9 @@ def plan_seam(
     points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
     points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
     try:
-        found = plan_root(points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation())
+        found = plan_root_anyhow(
+            points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
+        )
         seam = seam_above(found, planning.tool, planning.seam_length_m)
         q_start, q_above, q_retract = planning.waypoints(seam)
     except WeldcalError as error:
@@ -225,9 +228,9 @@ def arm_waypoints(
     X_BT = touch_start_pose(seam, config)
     solutions = []
     q = q_near
-    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + np.array([0.0, 0.0, clearance_m]))
+    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * arm.up)
     end = seam.frame(seam.length)
-    X_BE = RigidTransform(X_BT.rotation(), np.asarray(end.position) + np.array([0.0, 0.0, clearance_m + 0.05]))
+    X_BE = RigidTransform(X_BT.rotation(), np.asarray(end.position) + (clearance_m + 0.05) * arm.up)
     for pose in (lifted, X_BT, X_BE):
         found = nearest_solution(arm, pose @ tool.X_FT.inverse(), q)
         if found is None:

@@ -28,7 +28,7 @@ def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
 
 def feature_standard(scenario: Scenario) -> FlangeStandard:
     """Dimensions of that feature."""
-    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange)
+    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange_name())
 
 
 def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
@@ -70,7 +70,7 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
     config = PlannerConfig(
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),
-        table_z_m=c.table_z_m,
+        table_z_m=scenario.table_height_m(),
         margin_m=c.clearance_m,
         feature_radius_m=0.5 * feature_standard(scenario).outer_m,
         work_point_B=tuple(work_point(scenario)),
