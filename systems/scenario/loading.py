@@ -17,7 +17,7 @@ from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
 from weldcal.systems.scenario.checks import check_scenario
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import Scenario, ToolFile
 
 SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
@@ -64,8 +64,24 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
         except Exception as error:  # Drake's loader raises several types, and not every message names the key
             what = " ".join(str(error).split())
             raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+    if isinstance(scenario.tool, ToolFile):
+        scenario.tool.file = str(path.resolve().parent / scenario.tool.file)
+        _use_camera_of(scenario)
     check_scenario(scenario)
     return scenario
+
+
+def _use_camera_of(scenario: Scenario) -> None:
+    """Give the finger camera what the tool's file says of it, where the scenario does not say otherwise."""
+    loaded, camera = scenario.loaded_tool(), scenario.finger_camera
+    if loaded is None:
+        return
+    for key in ("width", "height", "focal_px"):
+        if hasattr(camera, key) and getattr(camera, key) == getattr(type(camera)(), key):
+            setattr(camera, key, getattr(loaded.camera, key))
+    own = vars(camera)
+    if loaded.calibration and "calibration" in own and not own["calibration"]:
+        own["calibration"] = loaded.calibration
 
 
 def _part_at_fault(text: str) -> str:
