@@ -12,10 +12,10 @@ from weldcal.models.arrays import Array
 from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, flange_ring, get_flange
+from weldcal.models.keys import read_part
 from weldcal.models.tool import LAST_LINK, R_FLIPPED, FingerCamera, Placed, ToolShape, WeldingTool
 from weldcal.models.tools.enclosing import enclosing_capsule
 from weldcal.models.tools.finger_file import FingerFile, read_finger_file
-from weldcal.models.tools.keys import read_part
 from weldcal.models.tools.schema import REQUIRED, RingPart, ShapePart, ToolPart, Triple
 
 LEAST_CHORD_M = 0.010  # the servo steers by the line from torch to tip

@@ -13,12 +13,14 @@ from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.models.limits import LARGEST_DOCUMENT
+from weldcal.models.scanners import get_scanner, is_scanner_file
 from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario, ToolFile
 
+LARGEST_WIDTH = 4096
 SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
 
@@ -64,11 +66,26 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
         except Exception as error:  # Drake's loader raises several types, and not every message names the key
             what = " ".join(str(error).split())
             raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+    _find_scanner_file(scenario, path.resolve().parent)
     if isinstance(scenario.tool, ToolFile):
         scenario.tool.file = str(path.resolve().parent / scenario.tool.file)
         _use_camera_of(scenario)
     check_scenario(scenario)
     return scenario
+
+
+def _find_scanner_file(scenario: Scenario, folder: Path) -> None:
+    """Make the path of a scanner file absolute, and its image as wide as a preset's by default, in the file's shape."""
+    config = scenario.scanner
+    own = vars(config)
+    for key in [key for key in own if key.endswith("preset") and isinstance(own[key], str)]:
+        if not is_scanner_file(own[key]):
+            continue
+        own[key] = str(folder / own[key])
+        default = vars(type(config)())
+        if "width" in own and (own["width"], own["height"]) == (default["width"], default["height"]):
+            narrow = min(default["width"] or LARGEST_WIDTH, get_scanner(own[key]).width)
+            own["width"], own["height"] = narrow, None
 
 
 def _use_camera_of(scenario: Scenario) -> None:

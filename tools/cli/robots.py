@@ -54,6 +54,7 @@ def check_robot(
 def emulate_ur(
     call: Call,
     polyscope: Annotated[str, option("--polyscope", "VERSION", "Controller version: 5.12, 5.21, 10.7 ...")] = "5.21",
+    arm: Annotated[str, option("--arm", "NAME", "The arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")] = "ur10e",
     kinematics: Annotated[Path | None, option("--kinematics", "FILE", "A robot's factory calibration.")] = None,
     host: Annotated[str, option("--host", "ADDRESS", "Loopback address 127.x.y.z.")] = "127.0.0.1",
     control_port: Annotated[
@@ -69,6 +70,7 @@ def emulate_ur(
         host=host,
         control_port=control_port,
         polyscope=polyscope,
+        robot=arm,
         kinematics=kinematics,
         pace=pace,
         lockstep=lockstep,
