@@ -26,7 +26,7 @@ def check_arm(scenario: Scenario) -> None:
     if scenario.arm not in known_arms():
         raise InputError(
             f"A cell runs with an arm of Universal Robots: {', '.join(known_arms())}; '{scenario.arm}' is none of them. "
-            "Other arms can be calibrated from recorded data: weldcal calibrate and weldcal hand-eye."
+            "Other arms, and a URDF, serve recorded data: weldcal calibrate DATASET and weldcal hand-eye --robot my_arm.urdf."
         )
     payload, robot = get_robot(scenario.arm).payload_kg, scenario.robot
     told = getattr(robot, "payload_kg", None)
