@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.arms.chain import Chain, is_urdf, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 
@@ -170,3 +170,8 @@ def get_robot(name: str) -> Robot:
     if robot is None:
         raise InputError(f"Robot '{name}' is not known: use one of {', '.join(ROBOTS)}.")
     return robot
+
+
+def get_chain(name: str) -> Chain:
+    """Kinematics and limits of the robot of that name, or of a URDF file. Raises InputError naming the known ones."""
+    return load_chain(name) if is_urdf(name) else get_robot(name).chain

@@ -192,7 +192,7 @@ def _make_station(
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
     surroundings = surroundings_of(scenario)
-    tool = _tool(scenario, cad) if scenario.tool == "welding" else None
+    tool = _tool(scenario, cad)
     devices: dict[str, DriverConfig] = {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot, closables=opened)
@@ -278,9 +278,12 @@ def _of_second(name: str) -> str:
     return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
 
 
-def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool:
+def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool | None:
     """The welding tool with the scenario's press deflections and the groove angle of the workpiece."""
-    tool, welding, camera = WeldingTool(), scenario.welding, scenario.finger_camera
+    loaded, welding, camera = scenario.loaded_tool(), scenario.welding, scenario.finger_camera
+    if loaded is None:
+        return None
+    tool = loaded.tool
     measured = camera.tag_size_m() if isinstance(camera, FingerCameraConfig) else None
     return dc.replace(
         tool,

@@ -6,14 +6,14 @@ from weldcal.calibration.published.algorithm1 import named_cost
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.errors import InputError
 from weldcal.models.robots import get_robot
-from weldcal.models.tool import WeldingTool
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
 from weldcal.systems.scenario.numbers import check_numbers
-from weldcal.systems.scenario.schema import PoseConfig, Scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
 from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
+MASS_TOLERANCE_KG = 0.05  # as the pre-flight compares a payload
 BEYOND_REACH_M = 0.7  # torch and half a plate add less than this to an arm's reach
 
 
@@ -26,7 +26,7 @@ def check_arm(scenario: Scenario) -> None:
     if scenario.arm not in known_arms():
         raise InputError(
             f"A cell runs with an arm of Universal Robots: {', '.join(known_arms())}; '{scenario.arm}' is none of them. "
-            "Other arms can be calibrated from recorded data: weldcal calibrate and weldcal hand-eye."
+            "Other arms, and a URDF, serve recorded data: weldcal calibrate DATASET and weldcal hand-eye --robot my_arm.urdf."
         )
     payload, robot = get_robot(scenario.arm).payload_kg, scenario.robot
     told = getattr(robot, "payload_kg", None)
@@ -35,7 +35,12 @@ def check_arm(scenario: Scenario) -> None:
             f"robot.payload_kg is {told:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
             "lighter tool."
         )
-    mass = WeldingTool().mass_kg if scenario.tool == "welding" else 0.0
+    loaded = scenario.loaded_tool()
+    mass = 0.0 if loaded is None else loaded.tool.mass_kg
+    if isinstance(scenario.tool, ToolFile) and told is not None and abs(told - mass) > MASS_TOLERANCE_KG:
+        raise InputError(
+            f"robot.payload_kg is {told:g} kg, and the tool of {scenario.tool.file} weighs {mass:g} kg: make them equal."
+        )
     if mass > payload:
         raise InputError(
             f"The tool weighs {mass:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
@@ -77,9 +82,13 @@ def check_scenario(scenario: Scenario) -> None:
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
     named_cost(calibration.cost, 1e-3 * calibration.work_radius_mm, calibration.cost_axes)
-    if scenario.tool not in ("welding", "pen", "none"):
-        raise InputError(f"tool must be welding, pen or none, not '{scenario.tool}'.")
-    if (calibration.feature == "tool_ring") != (scenario.tool == "welding"):
+    if isinstance(scenario.tool, str) and scenario.tool not in ("welding", "pen", "none"):
+        raise InputError(f"tool must be welding, pen, none or {{file: my_tool.yaml}}, not '{scenario.tool}'.")
+    loaded = scenario.loaded_tool()
+    ring = loaded is not None and loaded.tool.ring is not None
+    if loaded is not None and not ring and calibration.feature == "tool_ring":
+        raise InputError(f"The tool of {loaded.file.name} has no ring to measure: write calibration.feature: flange.")
+    if (calibration.feature == "tool_ring") != ring:
         raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
     if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:
         raise InputError("calibration.minimum_scans must be at least 4 and not above calibration.maximum_scans.")

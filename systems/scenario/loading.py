@@ -13,6 +13,7 @@ from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.models.limits import LARGEST_DOCUMENT
+from weldcal.models.scanners import get_scanner, is_scanner_file
 from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
@@ -20,6 +21,7 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.keys import check_keys
 from weldcal.systems.scenario.schema import Scenario
 
+LARGEST_WIDTH = 4096
 SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
 
@@ -52,13 +54,20 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
     scenario = _read(name, ())
     if overrides.strip():
         scenario = _merged(scenario, "the overrides", overrides)
+        resolve_files(scenario, _path_of(name).parent)
+    _use_width_of_scanner_file(scenario)
+    _use_camera_of(scenario)
     check_scenario(scenario)
     return scenario
 
 
+def _path_of(name: str) -> Path:
+    return Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
+
+
 def _read(name: str, before: tuple[Path, ...]) -> Scenario:
     """The scenario of a file over the one that it extends; `before` are the files that have led to it."""
-    path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
+    path = _path_of(name)
     if not path.exists():
         asked = (
             f"{before[-1].name} extends '{name}', which does not exist" if before else f"There is no scenario '{name}'"
@@ -102,8 +111,32 @@ def resolve_files(config: Any, folder: Path) -> None:
         for item in value if isinstance(value, list) else [value]:
             if dc.is_dataclass(item):
                 resolve_files(item, folder)
-        if field.metadata.get("file") and value and not Path(value).is_absolute() and (folder / value).exists():
+        named = field.metadata.get("file") or (field.name.endswith("preset") and is_scanner_file(str(value)))
+        if named and value and not Path(value).is_absolute() and (folder / value).exists():
             setattr(config, field.name, str(folder / value))
+
+
+def _use_width_of_scanner_file(scenario: Scenario) -> None:
+    """Make the image of a scanner from a file as wide as a preset's by default, in the file's shape."""
+    own = vars(scenario.scanner)
+    for key in [key for key in own if key.endswith("preset") and is_scanner_file(str(own[key]))]:
+        default = vars(type(scenario.scanner)())
+        if "width" in own and (own["width"], own["height"]) == (default["width"], default["height"]):
+            narrow = min(default["width"] or LARGEST_WIDTH, get_scanner(own[key]).width)
+            own["width"], own["height"] = narrow, None
+
+
+def _use_camera_of(scenario: Scenario) -> None:
+    """Give the finger camera what the tool's file says of it, where the scenario does not say otherwise."""
+    loaded, camera = scenario.loaded_tool(), scenario.finger_camera
+    if loaded is None:
+        return
+    for key in ("width", "height", "focal_px"):
+        if hasattr(camera, key) and getattr(camera, key) == getattr(type(camera)(), key):
+            setattr(camera, key, getattr(loaded.camera, key))
+    own = vars(camera)
+    if loaded.calibration and "calibration" in own and not own["calibration"]:
+        own["calibration"] = loaded.calibration
 
 
 def _part_at_fault(text: str) -> str:

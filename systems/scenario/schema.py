@@ -1,13 +1,16 @@
 """The schema of a scenario YAML: typed configuration of one cell; devices and jobs add their own keys."""
 
 import dataclasses as dc
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.published.algorithm1 import COST_AXES
+from weldcal.models.flanges import FlangeStandard, get_flange
 from weldcal.models.robots import get_robot
+from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
@@ -27,6 +30,13 @@ class PoseConfig:
     def pose(self) -> RigidTransform:
         """The pose as a RigidTransform."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
+
+
+@dc.dataclass
+class ToolFile:
+    """A tool of one's own: see docs/tool.md."""
+
+    file: str = dc.field(default="", metadata=FILE)
 
 
 @dc.dataclass
@@ -168,7 +178,7 @@ class Scenario:
     # a factory calibration in Universal Robots' kinematics.yaml schema
     kinematics: str | None = dc.field(default=None, metadata=FILE)
     flange: str = ""  # ISO 9409-1 designation of the arm's flange; empty: that of the arm (`weldcal robots`)
-    tool: str = "welding"  # welding, pen or none
+    tool: ToolFile | str = "welding"  # welding, pen or none; or {file: my_tool.yaml}, relative to the scenario
     robot: DriverConfig = dc.field(default_factory=NoDevice)
     robot_2: DriverConfig = dc.field(default_factory=NoDevice)
     scanner: DriverConfig = dc.field(default_factory=NoDevice)
@@ -193,6 +203,23 @@ class Scenario:
     def table_height_m(self) -> float:
         """Height of the table over the base's origin, against gravity, m."""
         return self.calibration.table_z_m - self.base.xyz_m[2]
+
+    @property
+    def welds(self) -> bool:
+        """Whether the tool is one that welds."""
+        return self.tool == "welding" or isinstance(self.tool, ToolFile)
+
+    def loaded_tool(self) -> LoadedTool | None:
+        """The welding tool from its file; None for pen and none. Raises InputError where the file is no tool's."""
+        if not self.welds:
+            return None
+        return load_tool(Path(self.tool.file) if isinstance(self.tool, ToolFile) else WELDING)
+
+    def feature_standard(self) -> FlangeStandard:
+        """Dimensions of the feature that the scanner measures: the tool's ring, or the arm's flange."""
+        loaded = self.loaded_tool() if self.calibration.feature == "tool_ring" else None
+        ring = None if loaded is None else loaded.tool.ring
+        return get_flange(self.flange_name()) if ring is None else ring
 
     def flange_name(self) -> str:
         """Designation of the arm's flange: the scenario's, or that of the arm's maker."""

@@ -243,7 +243,7 @@ def compare(schema: type, text: dict[str, Any], value: Any, default: Any, where:
     wrong = [f"{where}{key} is not in the text" for key in hints.keys() - text.keys()]
     for key in hints.keys() & text.keys():
         written, loaded = text[key], getattr(value, key)
-        if sections(hints[key]):
+        if sections(hints[key]) and not isinstance(loaded, str):
             assert isinstance(loaded, tuple(sections(hints[key])))
             below = {k: v for k, v in written.items() if k != "_tag"}
             wrong += compare(type(loaded), below, loaded, type(loaded)(), f"{where}{key}.")

@@ -101,7 +101,7 @@ def check_cell(
         if device == "scanner" and sensed.datum is not None:
             rows.append((device, _flange(scenario, sensed.datum, X_BF)))
         if device == "finger_camera" and sensed.datum is not None and isinstance(config, FingerCameraConfig):
-            rows.append((device, _tag(config, sensed.datum)))
+            rows.append((device, _tag(scenario, config, sensed.datum)))
     tell("computer", 0.95)
     return CellReport(name, (*rows, *_torch(scenario), *_computer()))
 
@@ -190,9 +190,10 @@ def _simulated(scenario: Scenario, device: str, seed: int, q: Array, config: Dri
 def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) -> Check:
     """Whether the feature of the calibration is in a scan, near where the arm's pose and the scanner's nominal pose put it."""
     standard, on_tool = feature_standard(scenario), scenario.calibration.feature == "tool_ring"
+    loaded = scenario.loaded_tool()
     guess = None
     if X_BF is not None and scenario.calibration.configuration == "eye_on_base":
-        X_BR = X_BF @ (WeldingTool().X_FR if on_tool else RigidTransform())
+        X_BR = X_BF @ (loaded.tool.X_FR if on_tool and loaded is not None else RigidTransform())
         X_CR = scenario.calibration.mounting_guess.pose().InvertAndCompose(X_BR)
         radius = 1e-3 * scenario.calibration.guess_radius_mm + 0.5 * standard.outer_m
         guess = FlangeGuess(X_CR.translation(), radius, X_CR.rotation().matrix()[:, 2])
@@ -209,9 +210,10 @@ def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) ->
     return Check("flange", True, found)
 
 
-def _tag(config: FingerCameraConfig, picture: Array) -> Check:
+def _tag(scenario: Scenario, config: FingerCameraConfig, picture: Array) -> Check:
     """Whether the tag is in a picture, and how sharp its edges are."""
-    tool = WeldingTool()
+    loaded = scenario.loaded_tool()
+    tool = WeldingTool() if loaded is None else loaded.tool
     tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
     pixels = np.asarray(picture, dtype=np.uint8)
     seen = detect_tag(pixels, config.camera().camera_matrix, tag)

@@ -14,7 +14,7 @@ from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.images import read_grey_image
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.drivers.sensors.finger_file import SCHEMA
+from weldcal.models.tools.finger_file import SCHEMA
 from weldcal.tools.commands.print_board import Board
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.servo.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag

@@ -117,7 +117,9 @@ def robot_at(host: str, scenario: Scenario) -> UrRtde:
         return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
     if scenario.tool == "pen":
         return UrRtde(host=host, payload_kg=0.42, payload_cog_m=[0.03, 0.0, 0.02])
-    return UrRtde(host=host)
+    loaded = scenario.loaded_tool()
+    assert loaded is not None
+    return UrRtde(host=host, payload_kg=loaded.tool.mass_kg, payload_cog_m=list(loaded.tool.centre_of_mass_m))
 
 
 def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:

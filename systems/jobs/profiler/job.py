@@ -56,7 +56,7 @@ class Profiler(Job[PlanningContext]):
             scenario.part(ProfilerJob),
             has_profiler=not isinstance(scenario.profiler, NoDevice),
             has_groove=scenario.workpiece is not None,
-            tool=scenario.tool,
+            tool=str(scenario.tool),
         )
 
     def furnish(

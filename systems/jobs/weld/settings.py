@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.flanges import FlangeStandard
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import JobPlan
 from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
@@ -28,7 +28,7 @@ def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
 
 def feature_standard(scenario: Scenario) -> FlangeStandard:
     """Dimensions of that feature."""
-    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange_name())
+    return scenario.feature_standard()
 
 
 def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
