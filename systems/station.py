@@ -12,10 +12,10 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel, load_arm
-from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
+from weldcal.models.workpieces.bent_plate import bend
+from weldcal.models.workpieces.plate import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats

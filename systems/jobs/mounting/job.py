@@ -12,7 +12,7 @@ from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
 from weldcal.models.base_circles import base_circle
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error

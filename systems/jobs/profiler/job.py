@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture

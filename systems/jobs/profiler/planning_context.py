@@ -16,7 +16,7 @@ from weldcal.models.arms.kinematics import LINKS, ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
 from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 

@@ -14,7 +14,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
