@@ -18,6 +18,7 @@ from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.workpiece import resolved
 
 SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
@@ -64,6 +65,8 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
         except Exception as error:  # Drake's loader raises several types, and not every message names the key
             what = " ".join(str(error).split())
             raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+    if scenario.workpiece is not None:
+        scenario.workpiece = resolved(scenario.workpiece, path.resolve().parent)
     check_scenario(scenario)
     return scenario
 
