@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter1d
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.seams import SPACING_M, DrawnSeam
-from weldcal.models.workpieces.section import PROBES_M, Opening, Section, cut, openings, wall_extent
+from weldcal.models.workpieces.section import PROBES_M, Opening, Section, cut, opening_angle, openings, wall_extent
 
 Floats = npt.NDArray[np.float64]
 
@@ -183,14 +183,7 @@ def _start(sections: list[Section], ups: Floats | None, joint: str) -> Floats:
 def _fits(opening: Opening, joint: str) -> bool:
     low, high = OPENINGS_DEG[joint]
     # The walls' normals tell the joint's angle even where the line is drawn beside the root.
-    return low <= math.degrees(_angle(opening)) <= high and math.degrees(opening.width_rad) < 230.0
-
-
-def _angle(opening: Opening) -> float:
-    """Angle between the walls through the free space by their normals, rad; more than pi of a convex edge."""
-    right, left = opening.normal_right, opening.normal_left
-    turn = math.atan2(right[0] * left[1] - right[1] * left[0], float(right @ left))
-    return math.pi + turn
+    return low <= math.degrees(opening_angle(opening)) <= high and math.degrees(opening.width_rad) < 230.0
 
 
 def _chosen(section: Section, joint: str, wanted: Floats) -> tuple[Opening, Floats, float] | None:
@@ -291,7 +284,7 @@ def _even(found: _Fit, joint: str, closed: bool) -> DrawnSeam:
 def _nothing(sections: list[Section], joint: str, points: Floats) -> str:
     """Why no cut shows the joint: the part is elsewhere, or the free space at the line is another."""
     low, high = OPENINGS_DEG[joint]
-    seen = [math.degrees(_angle(o)) for s in sections for o in openings(s, PROBES_M[1])]
+    seen = [math.degrees(opening_angle(o)) for s in sections for o in openings(s, PROBES_M[1])]
     middle = 1e3 * points[len(points) // 2]
     where = f"at ({middle[0]:.1f}, {middle[1]:.1f}, {middle[2]:.1f}) mm"
     if not any(len(s.segments) for s in sections):
@@ -315,10 +308,14 @@ def _smoothed(values: Floats, closed: bool, t: Floats) -> Floats:
     mode: Literal["wrap", "nearest"] = "wrap" if closed and not len(cuts) else "nearest"
     pieces = []
     for part in np.split(values, cuts):
-        # About a straight line, so that the ends are not drawn inwards.
-        line = np.linspace(0.0, 1.0, len(part))[:, None] * (part[-1] - part[0]) + part[0]
-        off = gaussian_filter1d(part - line, _SMOOTH_M / SPACING_M, axis=0, mode=mode)
-        pieces.append(line + off)
+        pad = min(len(part) - 1, math.ceil(4.0 * _SMOOTH_M / SPACING_M))
+        if mode == "wrap" or pad < 1:
+            pieces.append(gaussian_filter1d(part, _SMOOTH_M / SPACING_M, axis=0, mode=mode))
+            continue
+        # Turned about its ends, so that a slope goes on and the ends are not drawn inwards.
+        before, after = 2.0 * part[0] - part[pad:0:-1], 2.0 * part[-1] - part[-2 : -2 - pad : -1]
+        long = np.concatenate([before, part, after])
+        pieces.append(gaussian_filter1d(long, _SMOOTH_M / SPACING_M, axis=0)[pad : pad + len(part)])
     return np.concatenate(pieces)
 
 

@@ -163,6 +163,13 @@ def openings(section: Section, radius: float, centre: Floats | None = None) -> l
     return found
 
 
+def opening_angle(opening: Opening) -> float:
+    """Angle between the walls through the free space by their normals, rad; more than pi of a convex edge."""
+    right, left = opening.normal_right, opening.normal_left
+    turn = math.atan2(right[0] * left[1] - right[1] * left[0], float(right @ left))
+    return math.pi + turn
+
+
 def wall_extent(section: Section, root: Floats, direction: Floats, normal: Floats, tolerance_m: float = 4e-4) -> float:
     """How far a wall continues from a point of the cut along its direction, m, at most the cut's reach.
 

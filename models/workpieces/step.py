@@ -37,7 +37,7 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
             raise InputError(f"'{path.name}' is not a STEP file: it does not begin with ISO-10303-21.")
     shape, unit = _transferred(path)
     if units is not None and unit is not None and unit != units:
-        raise InputError(f"'{path.name}' is in {unit}, and the scenario says {units}: write units: {unit}.")
+        raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
     return PartShape(path.name, mesh, _edges(shape), UNITS_M[unit or units or "mm"], bodies)
 

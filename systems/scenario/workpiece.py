@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from weldcal.models.errors import InputError
 from weldcal.models.workpieces.part import Part, bowed
+from weldcal.models.workpieces.reading import read_shape
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
 from weldcal.models.workpieces.seams import JOINTS
-from weldcal.models.workpieces.shape import UNITS_M, read_shape
+from weldcal.models.workpieces.shape import UNITS_M
 from weldcal.systems.scenario.schema import SeamConfig, WorkpieceConfig
 
 OF_PLATES = ("bend_radius_mm", "hole_from_mm")

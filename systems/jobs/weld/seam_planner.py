@@ -22,6 +22,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
+from weldcal.welding.seam.room import check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
@@ -46,12 +47,17 @@ class SeamPlanning:
             return None
         return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
 
-    def waypoints(self, seam: SeamCurve) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def waypoints(
+        self, seam: SeamCurve, X_BP: RigidTransform | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Joint positions of the approach; see arm_waypoints.
 
         Raises:
-            WeldcalError: the seam is not feasible, or out of reach.
+            WeldcalError: the seam is not feasible, the tool has no room beside the part at X_BP, or it is out of reach.
         """
+        if X_BP is not None:
+            tool = self.tool
+            check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
         return arm_waypoints(self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m)
 
@@ -116,7 +122,7 @@ def plan_seam(
     try:
         found = plan_root(points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation())
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
-        q_start, q_above, q_retract = planning.waypoints(seam)
+        q_start, q_above, q_retract = planning.waypoints(seam, found.X_BP)
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
     return PlannedSeam(
@@ -228,7 +234,7 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
     try:
         seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
-        q_start, q_above, q_retract = planning.waypoints(seam)
+        q_start, q_above, q_retract = planning.waypoints(seam, planning.X_BP_guess)
     except WeldcalError as error:
         return PlannedSeam(sequence=sequence, reason=str(error))
     points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))
