@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +49,15 @@ def draw_seam(
             f"joint: lap does not fit this seam: neither wall ends within {1e3 * SHEET_M:.0f} mm; write joint: fillet."
         )
     return _even(found, joint, closed)
+
+
+def goes_on(mesh: TriMesh, seam: DrawnSeam, by_m: float = 0.004) -> bool:
+    """Whether the joint continues beyond the seam's end, by the cut a little further on."""
+    if seam.closed:
+        return True
+    t, up = seam.tangents_P[-1:], seam.up_P[-1:]
+    (section,) = cut(mesh, seam.points_P[-1:] + by_m * t, t, up)
+    return _chosen(section, seam.joint, seam.up_P[-1]) is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,9 +124,8 @@ def directions(points: Floats, closed: bool, over_m: float = 0.0015) -> Floats:
 def _fitted(mesh: TriMesh, points: Floats, t: Floats, ups: Floats | None, joint: str, closed: bool) -> _Fit:
     """One pass: the cuts at every point, the joint's walls in each, and the roots where they meet."""
     inside = points.copy()
-    if not closed:
-        inside[0] += _NUDGE_M * t[0]
-        inside[-1] -= _NUDGE_M * t[-1]
+    inside[0] += _NUDGE_M * t[0]
+    inside[-1] -= _NUDGE_M * t[-1]
     hint = np.broadcast_to(_across(t[0]), t.shape) if ups is None else ups
     hint = np.where(np.linalg.norm(np.cross(hint, t), axis=1, keepdims=True) < 1e-3, _across_each(t), hint)
     sections = cut(mesh, inside, t, hint)
@@ -305,12 +312,14 @@ def _smoothed(values: Floats, closed: bool, t: Floats) -> Floats:
     """The values along the seam without the facets of its mesh; each leg between corners by itself."""
     turn = np.arccos(np.clip(np.sum(t[1:] * t[:-1], axis=1), -1.0, 1.0))
     cuts = np.flatnonzero(turn > _CORNER_RAD) + 1
-    mode: Literal["wrap", "nearest"] = "wrap" if closed and not len(cuts) else "nearest"
+    if closed and not len(cuts):
+        once = gaussian_filter1d(values[:-1], _SMOOTH_M / SPACING_M, axis=0, mode="wrap")
+        return np.vstack([once, once[:1]])
     pieces = []
     for part in np.split(values, cuts):
         pad = min(len(part) - 1, math.ceil(4.0 * _SMOOTH_M / SPACING_M))
-        if mode == "wrap" or pad < 1:
-            pieces.append(gaussian_filter1d(part, _SMOOTH_M / SPACING_M, axis=0, mode=mode))
+        if pad < 1:
+            pieces.append(part)
             continue
         # Turned about its ends, so that a slope goes on and the ends are not drawn inwards.
         before, after = 2.0 * part[0] - part[pad:0:-1], 2.0 * part[-1] - part[-2 : -2 - pad : -1]

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.workpieces.bent_plate import divided
+from weldcal.models.workpieces.drawing import goes_on
 from weldcal.models.workpieces.seams import DrawnSeam
 from weldcal.models.workpieces.seat import Entry, JointSection, Press, Seated, Tip, check_weldable, press_for, seat
 from weldcal.models.workpieces.shape import PartShape
@@ -24,6 +25,7 @@ FELT_ABOUT_SEAM_M = 0.030
 BOWED_EDGE_M = 0.006
 SELF_GUIDING_RAD = math.radians(29.0)  # half opening above which a pressed tip slides down either wall (friction 0.2)
 GUIDED_DROP_M = 0.002  # from where it may land to the root, for a plan that is as far beside it
+CHOSEN_END_M, FELT_END_M = 0.0003, 0.0015
 BESIDE_M = 0.0017  # between the joint's mouth and the tip's centre as it lands on the face
 
 
@@ -54,6 +56,9 @@ class WeldPart(Protocol):
     def half_angle_rad(self) -> float: ...
     @property
     def depth_m(self) -> float: ...
+    @property
+    def end_window_m(self) -> float:
+        """How far from the drawn end the seam may end."""
 
     def seated(self, tip: Tip, press: Press) -> Seated:
         """Where the centre of the loaded tip rests, from the root."""
@@ -134,6 +139,11 @@ class Part:
     def depth_m(self) -> float:
         """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the faces."""
         return min(self.section.left_m, self.section.right_m) * math.cos(self.half_angle_rad)
+
+    @cached_property
+    def end_window_m(self) -> float:
+        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not felt."""
+        return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
 
     def seated(self, tip: Tip, press: Press) -> Seated:
         """See WeldPart."""

@@ -29,6 +29,7 @@ SEAM_SPACING_M = 0.0005
 GROOVE_BAND_M = 0.012
 PRESS_AXIAL_M, PRESS_LATERAL_M = 0.003, 0.002
 BESIDE_GROOVE_M = 0.005
+END_WINDOW_M = 0.006
 
 
 @dataclass(frozen=True)
@@ -128,6 +129,11 @@ class Workpiece:
             tip_mm, groove_mm = tip_radius_m * 1e3, 2e3 * self.half_width_m
             raise InputError(f"A tip of radius {tip_mm:.3g} mm is too large for a groove {groove_mm:.3g} mm wide.")
         return tip_radius_m / math.sin(self.half_angle_rad)
+
+    @property
+    def end_window_m(self) -> float:
+        """How far from the drawn end the groove may end: the plate's edge is where it is sawn."""
+        return END_WINDOW_M
 
     @property
     def section(self) -> JointSection:

@@ -13,7 +13,7 @@ from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import DeflectionControl, GapConfig, ServoConfig, ToolGeometry, TouchConfig
 
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
@@ -50,6 +50,7 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
     return ServoConfig(
         tool=geometry,
         touch=TouchConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
+        gap=GapConfig(end_window_m=station.cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
