@@ -73,10 +73,27 @@ class CalibrationConfig:
 
 
 @dc.dataclass
+class SeamConfig:
+    """A seam on a part from a file: a polyline or edges."""
+
+    # CSV of x,y,z[,nx,ny,nz] in the part's frame and unit
+    polyline: str | None = dc.field(default=None, metadata=FILE)
+    edges: list[int] = dc.field(default_factory=list)  # numbers from weldcal part FILE, in the order of travel
+    direction: str = "forward"  # forward or reverse
+    start_mm: float = 0.0  # cut off at the start
+    end_mm: float = 0.0  # cut off at the end
+
+
+@dc.dataclass
 class WorkpieceConfig:
     """The nominal workpiece from its CAD, and the deviations of the true one."""
 
-    shape: str = "s"  # s, straight or l
+    shape: str = "s"  # s, straight or l; not used with a file
+    # STEP, STL, OBJ or PLY of a part of your own
+    file: str | None = dc.field(default=None, metadata=FILE)
+    units: str | None = None  # of the file and its seams: mm, m or inch; null: the STEP file's own, mm for a mesh
+    seams: list[SeamConfig] = dc.field(default_factory=list)  # of the file
+    joint: str | None = None  # of the file: v_groove, butt, fillet or lap
     length_mm: float = 300.0
     pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # nominal X_BP from the fixture's drawing
     bend_radius_mm: float | None = None  # bent over a cylinder of this radius, its axis across the plate
@@ -94,8 +111,8 @@ class ObstacleConfig:
 
     name: str = ""  # in messages; empty: surroundings and a number
     box_m: list[float] | None = None  # length along x, y and z of a box about the origin of its pose
-    mesh: str | None = dc.field(default=None, metadata=FILE)  # STL, OBJ or PLY file
-    unit: str = "mm"  # of the mesh: m or mm
+    mesh: str | None = dc.field(default=None, metadata=FILE)  # STEP, STL, OBJ or PLY file
+    unit: str = "mm"  # of the mesh: mm, m or inch
     pose: PoseConfig = dc.field(default_factory=PoseConfig)  # in the robot's base
     margin_m: float = 0.02  # how far the arm keeps away
 
@@ -134,8 +151,8 @@ class WeldingConfig:
     """The welding job."""
 
     speed_mm_s: float = 8.0
-    deflection_mm: float = 2.0  # delta_d of Eq. 16
-    axial_deflection_mm: float = 3.0
+    deflection_mm: float | None = None  # delta_d of Eq. 16; null: 2, less in a wide joint
+    axial_deflection_mm: float | None = None  # null: 3, more in a wide joint
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
     seam_length_mm: float | None = None  # arc length of the seam to weld
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)

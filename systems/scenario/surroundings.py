@@ -7,7 +7,9 @@ import numpy as np
 from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
-from weldcal.models.mesh_files import read_mesh
+from weldcal.models.workpieces.mesh_files import read_surface
+from weldcal.models.workpieces.reading import MESH_SUFFIXES, read_shape
+from weldcal.models.workpieces.shape import UNITS_M
 from weldcal.systems.scenario.schema import ObstacleConfig, Scenario
 
 
@@ -24,8 +26,15 @@ def _obstacle(k: int, config: ObstacleConfig) -> Obstacle:
     name = config.name or f"surroundings {k + 1}"
     if (config.box_m is None) == (config.mesh is None):
         raise InputError(f"surroundings[{k}] needs either box_m: [x, y, z] or mesh: FILE.")
-    mesh = _box(k, config.box_m) if config.mesh is None else read_mesh(Path(config.mesh), config.unit)
+    mesh = _box(k, config.box_m) if config.mesh is None else _mesh(Path(config.mesh), config.unit)
     return Obstacle(name, mesh.transformed(config.pose.pose()), config.margin_m)
+
+
+def _mesh(path: Path, unit: str) -> TriMesh:
+    """The surface of a file; a mesh may be open."""
+    if path.suffix.lower() in MESH_SUFFIXES and unit in UNITS_M:
+        return read_surface(path, UNITS_M[unit])
+    return read_shape(path, unit).mesh
 
 
 def _box(k: int, size_m: list[float] | None) -> TriMesh:

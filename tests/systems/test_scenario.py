@@ -186,6 +186,11 @@ calibration:
   work_point_m: [0.5, 0.1, 0.0]
 workpiece:
   shape: l
+  file: bracket.step
+  units: mm
+  joint: fillet
+  seams:
+    - {polyline: seam.csv, edges: [12, 13], direction: reverse, start_mm: 5.0, end_mm: 6.0}
   length_mm: 250.0
   pose_guess: {xyz_m: [0.6, 0.0, 0.03], rpy_deg: [0.0, 0.0, 80.0]}
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
@@ -495,9 +500,9 @@ def test_surroundings_are_boxes_and_mesh_files_in_the_base(tmp_path: Path) -> No
         ("{box_m: [1.0, 1.0, 0.0]}", r"surroundings\[0\].box_m needs three positive lengths"),
         ("{box_m: [1.0, 1.0]}", r"surroundings\[0\].box_m must hold 3 numbers, not 2"),
         ("{box_m: [1.0, 1.0, .nan]}", r"surroundings\[0\].box_m must be finite"),
-        ("{mesh: nowhere.stl}", "There is no mesh file 'nowhere.stl'"),
-        ("{mesh: README.md}", "README.md is no mesh that can be read"),
-        ("{mesh: nowhere.stl, unit: km}", "unit of nowhere.stl must be one of m, mm, inch"),
+        ("{mesh: nowhere.stl}", "There is no file 'nowhere.stl'"),
+        ("{mesh: README.md}", "'README.md' is no part that can be read"),
+        ("{mesh: nowhere.stl, unit: km}", "units must be mm, m, inch, not 'km'"),
         ("{box_m: [1.0, 1.0, 1.0], margin_m: -0.1}", r"surroundings\[0\].margin_m must not be negative"),
     ],
 )

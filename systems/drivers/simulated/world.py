@@ -26,7 +26,7 @@ from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.bodies.tool import (
     STEEL,
     TABLE,
@@ -97,7 +97,7 @@ def build_world(
     *,
     flange: str,
     table: RigidTransform,
-    workpiece: Workpiece | None,
+    workpiece: WeldPart | None,
     X_BP: RigidTransform | None,
     fittings: Sequence[Fittings] = (),
     profiler: ProfilerFixture | None = None,
