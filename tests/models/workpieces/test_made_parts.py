@@ -12,6 +12,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import Part, bowed
 from weldcal.models.workpieces.seam_input import SeamSource, seam_of
+from weldcal.models.workpieces.step import CHORD_MM
 from weldcal.tools.studies.part_welds.step_parts import PARTS
 
 if TYPE_CHECKING:
@@ -139,7 +140,8 @@ def test_a_closed_edge_gives_a_closed_seam(shelf: Shelf) -> None:
     (id,) = [e.id for e in shape.edges if e.kind == "concave" and e.radius_m == pytest.approx(0.080)]
     seam = seam_of(shape, SeamSource(edges=(id,)), made.joint)
     assert seam.closed
-    assert 1e3 * seam.length_m == pytest.approx(160.0 * math.pi, abs=0.1)
+    assert 1e3 * seam.length_m == pytest.approx(160.0 * math.pi, abs=2.0 * math.pi * CHORD_MM)
+    assert seam.points_P[0] == pytest.approx(seam.points_P[-1], abs=1e-9)
     assert off_root("pipe_on_plate", 1e3 * seam.points_P).max() < 0.03
 
 
@@ -164,7 +166,7 @@ def test_a_line_beside_the_joint_and_off_the_part_is_refused(
     made, shape, _ = shelf.get("straight_web")
     csv = tmp_path_factory.mktemp("lines") / "line.csv"
     for shift, says in ((8.0, "does not run along"), (500.0, "off the part")):
-        np.savetxt(csv, made.line_mm + np.array([0.0, -shift, 0.0]), delimiter=",")
+        np.savetxt(csv, made.line_mm - np.array([0.0, shift, 0.0]), delimiter=",")
         with pytest.raises(InputError, match=says):
             seam_of(shape, SeamSource(csv), made.joint)
     np.savetxt(csv, made.line_mm * 1.2, delimiter=",")  # it runs 20 mm beyond both ends
