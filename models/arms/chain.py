@@ -57,7 +57,7 @@ def load_chain(name: str) -> Chain:
     if is_urdf(name):
         if not Path(name).is_file():
             raise InputError(f"There is no file '{name}' of an arm.")
-        return Chain(name, *read_urdf_chain(Path(name)))
+        return Chain(Path(name).name, *read_urdf_chain(Path(name)))
     if name in known_arms():
         arm = load_arm(name)
         limits = (arm.position_lower, arm.position_upper, arm.velocity_limit)

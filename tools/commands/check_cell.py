@@ -20,7 +20,7 @@ from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
 from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.tool import WeldingTool
+from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.sensors.preflight import Sensed
 from weldcal.systems.drivers.sensors.wired_camera import WiredFingerCamera
@@ -213,7 +213,7 @@ def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) ->
 def _tag(scenario: Scenario, config: FingerCameraConfig, picture: Array) -> Check:
     """Whether the tag is in a picture, and how sharp its edges are."""
     loaded = scenario.loaded_tool()
-    tool = WeldingTool() if loaded is None else loaded.tool
+    tool = (load_tool(WELDING) if loaded is None else loaded).tool
     tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
     pixels = np.asarray(picture, dtype=np.uint8)
     seen = detect_tag(pixels, config.camera().camera_matrix, tag)
