@@ -75,7 +75,9 @@ def test_the_list_of_packages_is_complete() -> None:
         for path in (ROOT / folder).rglob("__init__.py")
     }
     assert sorted(listed) == sorted({"weldcal"} | there)
-    assert [path.name for path in ROOT.glob("*.py")] == ["__init__.py"], "the root is the package weldcal, and nothing else"
+    assert [path.name for path in ROOT.glob("*.py")] == ["__init__.py"], (
+        "the root is the package weldcal, and nothing else"
+    )
 
 
 def test_each_folder_with_python_files_is_a_package() -> None:

@@ -4,6 +4,7 @@ import dataclasses as dc
 import json
 import textwrap
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.scenarios.fields import Key, keys_of
 from weldcal.tools.scenarios.json_schema import json_schema
+from weldcal.tools.scenarios.own_part import add_part, add_tool
 from weldcal.tools.scenarios.values import yaml_of
 
 CELL, SCHEMA = "cell.yaml", "cell.schema.json"
@@ -28,17 +30,31 @@ HEAD = """# yaml-language-server: $schema={schema}
 """
 
 
-def write_cell(folder: Path, base: str) -> Path:
-    """Write cell.yaml and its JSON schema into a folder, and return the path of cell.yaml.
+@dataclass(frozen=True)
+class OwnPart:
+    """A part's file, the numbers of the seam's edges (none: the longest concave one), and the joint (None: by its angle)."""
+
+    file: Path
+    edges: tuple[int, ...] = ()
+    joint: str | None = None
+
+
+def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path | None = None) -> Path:
+    """Write cell.yaml and its JSON schema into a folder, with a part and a tool of one's own, and return the path of cell.yaml.
 
     Raises:
-        InputError: there is one already, or `base` is no scenario.
+        InputError: there is one already, `base` is no scenario, or the part cannot be used.
     """
     scenario = load_scenario(base)
     path = folder / CELL
     if path.exists():
         raise InputError(f"There is a cell in '{folder}' already: choose another folder, or delete {CELL}.")
     folder.mkdir(parents=True, exist_ok=True)
+    if part is not None:
+        scenario.description = f"A cell that welds {part.file.name}."
+        add_part(scenario, folder, part.file, list(part.edges), part.joint)
+    if tool is not None:
+        add_tool(scenario, folder, tool)
     write_atomically(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
     write_atomically(path, HEAD.format(schema=SCHEMA, path=path) + "".join(_parts(scenario)))
     return path
