@@ -11,10 +11,12 @@ from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuil
 from pydrake.systems.primitives import ConstantValueSource
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.models.bent_workpiece import bend
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
+from weldcal.models.workpieces.bent_plate import bend
+from weldcal.models.workpieces.part import WeldPart
+from weldcal.models.workpieces.plate import make_workpiece, seeded_groove_error
+from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Background, Inline, OwnProcess
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
@@ -26,7 +28,8 @@ from weldcal.systems.drivers.station_build import Closable, PreparedRobot, Stati
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
 from weldcal.systems.scenario.arm import nominal_arm
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import Scenario, WorkpieceConfig
+from weldcal.systems.scenario.workpiece import made, part_of
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
 
@@ -36,7 +39,7 @@ class Truth(Message):
 
     X_BC: RigidTransform | None
     X_BP: RigidTransform | None
-    workpiece: Workpiece | None  # the true part
+    workpiece: WeldPart | None  # the true part
     tablet: TabletTruth | None = None  # camera and pen on the wrist and the tablet on the table
     X_LC: RigidTransform | None = None  # the scanner on what carries it, where that is not the base
     X_BD: RigidTransform | None = None  # the second arm's base
@@ -52,7 +55,7 @@ class Station:
     diagram: Diagram
     robot: PreparedRobot
     tool: WeldingTool | None
-    cad: Workpiece | None  # the nominal part
+    cad: WeldPart | None  # the nominal part
     truth: Truth
     world: SimulatedWorld | None  # None where no device is simulated
     second: ArmModel | None = None
@@ -147,7 +150,7 @@ class Furnish(Protocol):
     """The signature of Job.furnish, which adds a job's objects to the simulated world."""
 
     def __call__(
-        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+        self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> Furnishing:
         """Draw the furnishing with the run's random numbers."""
 
@@ -273,17 +276,19 @@ def _of_second(name: str) -> str:
     return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
 
 
-def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool | None:
+def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
     """The welding tool with the scenario's press deflections and the groove angle of the workpiece."""
     loaded, welding, camera = scenario.loaded_tool(), scenario.welding, scenario.finger_camera
     if loaded is None:
         return None
     tool = loaded.tool
+    given = [None if mm is None else 1e-3 * mm for mm in (welding.axial_deflection_mm, welding.deflection_mm)]
+    press = Press(tool.press_axial_m, tool.press_lateral_m) if cad is None else cad.press(tool, given[0], given[1])
     measured = camera.tag_size_m() if isinstance(camera, FingerCameraConfig) else None
     return dc.replace(
         tool,
-        press_axial_m=welding.axial_deflection_mm * 1e-3,
-        press_lateral_m=welding.deflection_mm * 1e-3,
+        press_axial_m=press.axial_m,
+        press_lateral_m=press.lateral_m,
         tag_size_m=measured or tool.tag_size_m,
         groove_half_angle_rad=tool.groove_half_angle_rad if cad is None else cad.half_angle_rad,
     )
@@ -291,11 +296,24 @@ def _tool(scenario: Scenario, cad: Workpiece | None) -> WeldingTool | None:
 
 def _workpieces(
     scenario: Scenario, rng: np.random.Generator
-) -> tuple[Workpiece | None, Workpiece | None, RigidTransform | None]:
+) -> tuple[WeldPart | None, WeldPart | None, RigidTransform | None]:
     """The nominal part, the true part, and the true pose."""
     spec = scenario.workpiece
     if spec is None:
         return None, None, None
+    if spec.file is None:
+        cad, real = _plates(spec, rng)
+    else:
+        drawn = part_of(spec)
+        cad, real = drawn, made(drawn, spec, rng)
+    placed = _lying_error(
+        rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
+    )
+    return cad, real, spec.pose_guess.pose() @ placed
+
+
+def _plates(spec: WorkpieceConfig, rng: np.random.Generator) -> tuple[WeldPart, WeldPart]:
+    """The nominal plate, and the true one."""
     length = spec.length_mm * 1e-3
     cad = make_workpiece(spec.shape, length_m=length)
     X_PG = seeded_groove_error(rng, spec.groove_error.translation_mm * 1e-3, np.deg2rad(spec.groove_error.rotation_deg))
@@ -305,10 +323,7 @@ def _workpieces(
         real = dc.replace(real, groove_mesh=short.groove_mesh)
     if spec.bend_radius_mm is not None:
         cad, real = (bend(part, spec.bend_radius_mm * 1e-3) for part in (cad, real))
-    placed = _lying_error(
-        rng, spec.placement_error.translation_mm * 1e-3, np.deg2rad(spec.placement_error.rotation_deg)
-    )
-    return cad, real, spec.pose_guess.pose() @ placed
+    return cad, real
 
 
 def table_in_base(scenario: Scenario) -> RigidTransform:

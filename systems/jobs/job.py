@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
 from weldcal.models.arms.kinematics import ArmModel
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.messages import JobCommand
 from weldcal.systems.motion.spine import MOVE_ACCELERATION, MOVE_SPEED, JobPorts, Spine
@@ -60,7 +60,7 @@ class Job(ABC, Generic[PlanOf]):
         """Check this job's part of a scenario, present or not; raises InputError."""
 
     def furnish(
-        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+        self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> Furnishing:
         """The objects that the job adds to a simulated world, besides the true workpiece `part` at X_BP."""
         return Furnishing()

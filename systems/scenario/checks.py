@@ -10,6 +10,7 @@ from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
 from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
+from weldcal.systems.scenario.workpiece import check_workpiece
 from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
@@ -98,6 +99,8 @@ def check_scenario(scenario: Scenario) -> None:
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
     workpiece, farthest = scenario.workpiece, get_robot(scenario.arm).reach_m + BEYOND_REACH_M
+    if workpiece is not None:
+        check_workpiece(workpiece)
     if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > farthest:
         raise InputError(
             f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; a {scenario.arm} with "

@@ -19,6 +19,7 @@ from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario, ToolFile
+from weldcal.systems.scenario.workpiece import resolved
 
 LARGEST_WIDTH = 4096
 SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
@@ -70,6 +71,8 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
     if isinstance(scenario.tool, ToolFile):
         scenario.tool.file = str(path.resolve().parent / scenario.tool.file)
         _use_camera_of(scenario)
+    if scenario.workpiece is not None:
+        scenario.workpiece = resolved(scenario.workpiece, path.resolve().parent)
     check_scenario(scenario)
     return scenario
 

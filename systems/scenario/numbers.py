@@ -75,6 +75,10 @@ def check_numbers(config: Any, place: str = "") -> None:
             check_numbers(value, f"{key}.")
             continue
         _check_type(key, field.type, value)
+        if isinstance(value, list) and value and dc.is_dataclass(value[0]):
+            for number, item in enumerate(value):
+                check_numbers(item, f"{key}[{number}].")
+            continue
         if isinstance(value, list) and len(value) != LENGTHS.get(field.name, len(value)):
             raise InputError(f"{key} must hold {LENGTHS[field.name]} numbers, not {len(value)}.")
         for number in value if isinstance(value, list) else [value]:

@@ -71,10 +71,25 @@ class CalibrationConfig:
 
 
 @dc.dataclass
+class SeamConfig:
+    """A seam on a part from a file: a polyline or edges."""
+
+    polyline: str | None = None  # CSV of x,y,z[,nx,ny,nz] in the part's frame and unit, relative to the scenario file
+    edges: list[int] = dc.field(default_factory=list)  # numbers from weldcal part FILE, in the order of travel
+    direction: str = "forward"  # forward or reverse
+    start_mm: float = 0.0  # cut off at the start
+    end_mm: float = 0.0  # cut off at the end
+
+
+@dc.dataclass
 class WorkpieceConfig:
     """The nominal workpiece from its CAD, and the deviations of the true one."""
 
-    shape: str = "s"  # s, straight or l
+    shape: str = "s"  # s, straight or l; not used with a file
+    file: str | None = None  # STEP, STL, OBJ or PLY of a part of your own, relative to the scenario file
+    units: str | None = None  # of the file and its seams: mm, m or inch; null: the STEP file's own, mm for a mesh
+    seams: list[SeamConfig] = dc.field(default_factory=list)  # of the file
+    joint: str | None = None  # of the file: v_groove, butt, fillet or lap
     length_mm: float = 300.0
     pose_guess: PoseConfig = dc.field(default_factory=PoseConfig)  # nominal X_BP from the fixture's drawing
     bend_radius_mm: float | None = None  # bent over a cylinder of this radius, its axis across the plate
@@ -120,8 +135,8 @@ class WeldingConfig:
     """The welding job."""
 
     speed_mm_s: float = 8.0
-    deflection_mm: float = 2.0  # delta_d of Eq. 16
-    axial_deflection_mm: float = 3.0
+    deflection_mm: float | None = None  # delta_d of Eq. 16; null: 2, less in a wide joint
+    axial_deflection_mm: float | None = None  # null: 3, more in a wide joint
     clearance_mm: float = 25.0  # height above the seam at which the approach ends
     seam_length_mm: float | None = None  # arc length of the seam to weld
     process: ProcessConfig = dc.field(default_factory=ProcessConfig)

@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from weldcal.calibration.planning.clearance import arm_bodies, lowest_point
 from weldcal.models.arms.kinematics import link_frames, load_arm, mounted
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import make_workpiece
+from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station, table_in_base

@@ -27,7 +27,7 @@ from tests.systems.drivers.still_link import StillLink
 from weldcal.models.flanges import get_flange
 from weldcal.models.scanner_streams import ScannerStream
 from weldcal.models.scanners import get_scanner
-from weldcal.models.workpieces import make_workpiece
+from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
 from weldcal.systems.drivers.sensors.watch import DeviceWatch

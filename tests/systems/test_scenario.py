@@ -182,6 +182,11 @@ calibration:
   work_point_m: [0.5, 0.1, 0.0]
 workpiece:
   shape: l
+  file: bracket.step
+  units: mm
+  joint: fillet
+  seams:
+    - {polyline: seam.csv, edges: [12, 13], direction: reverse, start_mm: 5.0, end_mm: 6.0}
   length_mm: 250.0
   pose_guess: {xyz_m: [0.6, 0.0, 0.03], rpy_deg: [0.0, 0.0, 80.0]}
   placement_error: {translation_mm: 1.0, rotation_deg: 0.2}
@@ -236,6 +241,10 @@ def compare(schema: type, text: dict[str, Any], value: Any, default: Any, where:
             assert isinstance(loaded, tuple(sections(hints[key])))
             below = {k: v for k, v in written.items() if k != "_tag"}
             wrong += compare(type(loaded), below, loaded, type(loaded)(), f"{where}{key}.")
+            continue
+        if isinstance(loaded, list) and loaded and dc.is_dataclass(loaded[0]):
+            for row, (text_row, loaded_row) in enumerate(zip(written, loaded, strict=True)):
+                wrong += compare(type(loaded_row), text_row, loaded_row, type(loaded_row)(), f"{where}{key}[{row}].")
             continue
         if loaded != written:
             wrong.append(f"{where}{key} was lost: {written} became {loaded}")

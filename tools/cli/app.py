@@ -14,6 +14,7 @@ from weldcal.tools.cli import (
     hand_eye,
     monitor,
     motion,
+    part,
     plan_motion,
     profiler,
     reproduce,
@@ -29,6 +30,7 @@ PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then wel
 COMMANDS = (
     *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, plan_motion.plan_motion, runs.weld, view.view),
     *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
+    part.part,
     *(cell.check_cell, cell.print_board, cell.finger_calibrate, tool.tool_check),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,

@@ -43,6 +43,27 @@ def seam_planning(
     return Outcome(summary, rows=rows)
 
 
+@command("benchmark part-welds")
+def part_welds(
+    call: Call,
+    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
+    runs: Annotated[int, option("--runs", "N", "Welds of each part, seeds from --seed on.", min=1)] = 1,
+    located_by: Annotated[
+        str, option("--located-by", "WORD", "Where the part's pose is from: scan or drawing.")
+    ] = "scan",
+    seam_mm: Annotated[
+        float | None, option("--seam-mm", "MM", "Weld only so much of each seam.", show_default="all of it")
+    ] = None,
+) -> Outcome:
+    """Weld twelve parts in four joints in the simulated cell, each from its STEP file, and measure the torch's error."""
+    from weldcal.tools.studies.part_welds.study import Trial, run_part_welds
+
+    folder = call.folder("benchmark", "part-welds")
+    trial = Trial.of(located_by, seam_mm)
+    summary = run_part_welds(folder, part, range(call.seed, call.seed + runs), trial, call.progress)
+    return Outcome(summary)
+
+
 @command("benchmark hand-eye")
 def hand_eye(
     call: Call,
@@ -213,6 +234,7 @@ def motion_clock(
 COMMANDS = (
     tablet,
     seam_planning,
+    part_welds,
     hand_eye,
     mountings,
     profiler,

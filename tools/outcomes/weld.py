@@ -12,7 +12,7 @@ from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.models.arrays import Array
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
-from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, work_point
+from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, seated_tip, work_point
 from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES, TELEMETRY
 from weldcal.systems.station import Truth
 from weldcal.tools.outcomes.arm_frame import true_work_point
@@ -119,11 +119,8 @@ def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
     state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth)
     if state is None or seam is None or len(state.refined) < 10:
         return None
-    assert cell.station.cad is not None
-    assert cell.station.tool is not None
-    tool = cell.station.tool
-    seat = cell.station.cad.tip_height(tool.tip_radius_m) - tool.seat_sink_m
-    line = seam.raised(seat - TORCH_ABOVE_ROOT_M, tool.seat_side_m)
+    seat = seated_tip(cell.station)
+    line = seam.raised(seat.above_m - TORCH_ABOVE_ROOT_M, seat.aside_m)
     found = path_error(state.refined.points, line)
     return FeltSeam(found.s, found.lateral, found.height)
 
@@ -181,8 +178,7 @@ def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     plan = cell.job.planned_seam(root).seam
     plan_error = None
     if plan is not None and seam is not None:
-        seat = cell.station.cad.tip_height(cell.station.tool.tip_radius_m) - cell.station.tool.seat_sink_m  # type: ignore[union-attr]
-        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seat)
+        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seated_tip(cell.station).above_m)
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:

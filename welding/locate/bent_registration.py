@@ -14,7 +14,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from scipy.optimize import least_squares
 
 from weldcal.models.mesh import inside_loops
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces, rolled, unrolled
 from weldcal.welding.locate.outline_fit import by_the_edge, inward_normals, outermost, slide
 from weldcal.welding.locate.planes import Floats, into, point_pitch, thinned

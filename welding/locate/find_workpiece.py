@@ -16,7 +16,7 @@ from pydrake.math import RigidTransform
 from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces
 from weldcal.welding.locate.bent_registration import RADIUS_SHARE, flattened, into_plate
 from weldcal.welding.locate.planes import (

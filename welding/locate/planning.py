@@ -8,7 +8,8 @@ import numpy.typing as npt
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import Part, WeldPart
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
 from weldcal.welding.locate.planes import Floats
@@ -58,9 +59,34 @@ class RootPlan:
     summary: str
 
 
+def plan_part_root(
+    points_B: npt.NDArray[np.floating],
+    part: Part,
+    X_BP_guess: RigidTransform,
+    method: PlanningMethod,
+    eye_B: npt.ArrayLike | None,
+) -> RootPlan:
+    """Plan the root of a drawn seam on a part from a file; see plan_root."""
+    if method.method == "cloud":
+        raise InputError(
+            "planning.method: cloud finds grooves in plates; a part from a file is planned with method: cad."
+        )
+    seam = part.seam.transformed(X_BP_guess)
+    return RootPlan(
+        root=seam.points_P,
+        up=seam.up_P,
+        half_angle_rad=part.half_angle_rad,
+        X_BP=X_BP_guess,
+        sigma_m=0.0,
+        rms_m=0.0,
+        confidence=1.0,
+        summary="the pose of the part is from the drawing; the scan was not used",
+    )
+
+
 def plan_root(
     points_B: npt.NDArray[np.floating],
-    workpiece: Workpiece,
+    workpiece: WeldPart,
     X_BP_guess: RigidTransform,
     method: PlanningMethod | None = None,
     eye_B: npt.ArrayLike | None = None,
@@ -73,6 +99,10 @@ def plan_root(
         WeldcalError: every refusal of registration, search and extraction, in a sentence.
     """
     method = method or PlanningMethod()
+    if isinstance(workpiece, Part):
+        return plan_part_root(points_B, workpiece, X_BP_guess, method, eye_B)
+    if not isinstance(workpiece, Workpiece):
+        raise InputError(f"'{workpiece.name}' cannot be located in a scan: use located_by: drawing.")
     if method.method == "cloud":
         groove = extract_groove(points_B, hint_A=X_BP_guess.translation(), start_A=method.start_B)
         return RootPlan(

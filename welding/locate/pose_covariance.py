@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform
 
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.planes import Floats
 
 EDGE_PITCHES = 0.03  # error common to the points of an edge, in point distances

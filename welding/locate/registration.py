@@ -19,7 +19,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import inside_loops
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.bent_registration import register_bent
 from weldcal.welding.locate.outline_fit import by_the_edge, fit_outline, outermost, slide
 from weldcal.welding.locate.planes import PLANE_BAND_M, Floats, into, point_pitch, robust_plane, thinned, upward_planes

@@ -9,7 +9,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 
 from weldcal.models.errors import WeldcalError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.outline_fit import check, displaced, outermost
 from weldcal.welding.locate.planes import Floats, rasterise, turned
 from weldcal.welding.locate.pose_covariance import moved_covariance, seam_sigma
@@ -39,7 +39,7 @@ class RegistrationConfig:
 
 @dataclass(frozen=True, eq=False)
 class WorkpieceRegistration:
-    """The pose X_BP of the plate (frame P of models.workpieces), and how well the scan agrees with it.
+    """The pose X_BP of the plate (frame P of models.workpieces.plate), and how well the scan agrees with it.
 
     rms_m             rms distance of the face's points from its plane, m
     outline_rms_m     rms distance of the face's outermost points from the outline, m (0.3 pixel pitches or so)

@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.profiler_world import (
     ProfilerFixture,
     ProfilerTruth,
@@ -23,7 +23,7 @@ def draw_fixture(
     job: ProfilerJob,
     rng: np.random.Generator,
     table_z_m: float,
-    workpiece: Workpiece | None,
+    workpiece: WeldPart | None,
     X_BP: RigidTransform | None,
 ) -> ProfilerFixture:
     """Draw the deviations of the true fixture from its nominal dimensions and poses."""

@@ -25,7 +25,7 @@ from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.bodies.tool import STEEL, TABLE, TIP_FRICTION, add_flange, add_tool, mesh_shape, show
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
@@ -87,7 +87,7 @@ def build_world(
     *,
     flange: str,
     table: RigidTransform,
-    workpiece: Workpiece | None,
+    workpiece: WeldPart | None,
     X_BP: RigidTransform | None,
     fittings: Sequence[Fittings] = (),
     profiler: ProfilerFixture | None = None,

@@ -12,7 +12,7 @@ from weldcal.models.arms.kinematics import LINKS, ArmModel, load_arm
 from weldcal.models.base_circles import base_circle
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.rendered_scanner import random_pose_error
@@ -85,7 +85,7 @@ class Mounting(Job[MountingPlanned]):
         )
 
     def furnish(
-        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+        self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> Furnishing:
         """See Job: the ring of the base mounting, and the second arm at its true pose."""
         job, second = scenario.part(MountingJob), None

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, LeafSystem
 
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
@@ -60,7 +60,7 @@ class Profiler(Job[PlanningContext]):
         )
 
     def furnish(
-        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+        self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> Furnishing:
         """See Job: the objects that the profiler scans and the torch touches."""
         p, job = scenario.profiler, scenario.part(ProfilerJob)

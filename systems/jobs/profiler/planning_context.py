@@ -16,7 +16,7 @@ from weldcal.models.arms.kinematics import LINKS, ArmModel, forward_kinematics
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.profiler_world import BEVEL_M, POST_RADIUS_M, rig_points, under_straightedge
 from weldcal.systems.jobs.profiler.config import ProfilerJob, pose_of
 
@@ -33,7 +33,7 @@ class PlanningContext:
     X_FS: RigidTransform
     p_FTip: Array
     center: Array
-    cad: Workpiece | None = None
+    cad: WeldPart | None = None
     X_BP: RigidTransform | None = None
     table_z_m: float = 0.0
 

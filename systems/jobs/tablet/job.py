@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.rendered_wrist_camera import RenderedWristCamera
 from weldcal.systems.drivers.simulated.tablet_world import tablet_fittings
@@ -85,7 +85,7 @@ class Tablet(Job[TabletPlan]):
         check_tablet(scenario)
 
     def furnish(
-        self, scenario: Scenario, rng: np.random.Generator, part: Workpiece | None, X_BP: RigidTransform | None
+        self, scenario: Scenario, rng: np.random.Generator, part: WeldPart | None, X_BP: RigidTransform | None
     ) -> Furnishing:
         """See Job: camera, pen and tablet at their true poses."""
         visit = tablet_fittings(tablet_of(scenario), scenario.wrist_camera, scenario.digitizer, rng)

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
 
 _Z = (0.0, 0.0, 1.0)
@@ -15,7 +15,7 @@ _Z = (0.0, 0.0, 1.0)
 
 def plan_root_anyhow(
     points_B: npt.NDArray[np.floating],
-    workpiece: Workpiece,
+    workpiece: WeldPart,
     X_BP_guess: RigidTransform,
     method: PlanningMethod,
     eye_B: npt.NDArray[np.float64],

@@ -14,7 +14,8 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.part import WeldPart
+from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
@@ -22,6 +23,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
+from weldcal.welding.seam.room import check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
@@ -32,7 +34,7 @@ class SeamPlanning:
 
     arm: ArmModel
     tool: WeldingTool
-    workpiece: Workpiece
+    workpiece: WeldPart
     X_BP_guess: RigidTransform
     config: ServoConfig
     q_near: NDArray[np.float64]
@@ -40,12 +42,23 @@ class SeamPlanning:
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
 
-    def waypoints(self, seam: SeamCurve) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def above_m(self) -> float | None:
+        """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
+        if self.method.method == "cloud":
+            return None
+        return self.workpiece.seated(self.tool, Press(self.tool.press_axial_m, self.tool.press_lateral_m)).above_m
+
+    def waypoints(
+        self, seam: SeamCurve, X_BP: RigidTransform | None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Joint positions of the approach; see arm_waypoints.
 
         Raises:
-            WeldcalError: the seam is not feasible, or out of reach.
+            WeldcalError: the seam is not feasible, the tool has no room beside the part at X_BP, or it is out of reach.
         """
+        if X_BP is not None:
+            tool = self.tool
+            check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
         return arm_waypoints(self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m)
 
@@ -111,8 +124,8 @@ def plan_seam(
         found = plan_root_anyhow(
             points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
         )
-        seam = seam_above(found, planning.tool, planning.seam_length_m)
-        q_start, q_above, q_retract = planning.waypoints(seam)
+        seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
+        q_start, q_above, q_retract = planning.waypoints(seam, found.X_BP)
     except WeldcalError as error:
         return PlannedSeam(sequence=scan.sequence, reason=str(error))
     return PlannedSeam(
@@ -130,13 +143,17 @@ def plan_seam(
     )
 
 
+_LEVEL = math.cos(math.radians(20.0))
+
+
 class SeamOutOfReach(WeldcalError):
     """The arm cannot hold the tool along the seam."""
 
 
-def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
+def tip_seam(workpiece: WeldPart, X_BP: RigidTransform, tool: WeldingTool, length_m: float | None) -> SeamCurve:
     """The path of the seated tip's centre, in B, cut to `length_m` of arc where given."""
-    line = workpiece.tip_line_P(tool.tip_radius_m) - tool.seat_sink_m * workpiece.up_P
+    seated = workpiece.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
+    line = workpiece.seam_P + seated.above_m * workpiece.up_P
     ups = np.broadcast_to(workpiece.up_P, line.shape)
     if length_m is not None:
         line, ups = line[workpiece.arc_length_m <= length_m], ups[workpiece.arc_length_m <= length_m]
@@ -144,13 +161,13 @@ def tip_seam(workpiece: Workpiece, X_BP: RigidTransform, tool: WeldingTool, leng
     return SeamCurve.from_points(line @ R.T + X_BP.translation(), up=ups @ R.T)
 
 
-def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None) -> SeamCurve:
-    """The path of the seated tip's centre over a planned root; its height follows from the groove's angle.
+def seam_above(plan: RootPlan, tool: WeldingTool, length_m: float | None, above_m: float | None = None) -> SeamCurve:
+    """The path of the seated tip's centre `above_m` over a planned root; None: by the groove's angle in the scan.
 
     Raises:
         InputError: for a root too short for a seam.
     """
-    height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m
+    height = tool.tip_radius_m / math.sin(plan.half_angle_rad) - tool.seat_sink_m if above_m is None else above_m
     ups = np.broadcast_to(plan.up, plan.root.shape)
     line = plan.root + height * ups
     if length_m is not None:
@@ -176,9 +193,9 @@ def arm_waypoints(
     X_BT = touch_start_pose(seam, config)
     solutions = []
     q = q_near
-    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * arm.up)
     end = seam.frame(seam.length)
-    X_BE = RigidTransform(X_BT.rotation(), np.asarray(end.position) + (clearance_m + 0.05) * arm.up)
+    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * _away(seam.frame(0.0).up, arm.up))
+    X_BE = RigidTransform(X_BT.rotation(), end.position + (clearance_m + 0.05) * _away(end.up, arm.up))
     for pose in (lifted, X_BT, X_BE):
         found = nearest_solution(arm, pose @ tool.X_FT.inverse(), q)
         if found is None:
@@ -189,6 +206,11 @@ def arm_waypoints(
         q = found
     q_above, q_start, q_retract = solutions
     return q_start, q_above, q_retract
+
+
+def _away(up: NDArray[np.float64], vertical: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Direction (3,) out of a joint: vertical on a level face, along the bisector of a leaning joint."""
+    return vertical if up @ vertical > _LEVEL else up
 
 
 class DrawnSeamPlanner(SeamPlanner):
@@ -214,7 +236,7 @@ def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
     """Plan the seam where the fixture's drawing has it; where that fails the plan holds the reason."""
     try:
         seam = tip_seam(planning.workpiece, planning.X_BP_guess, planning.tool, planning.seam_length_m)
-        q_start, q_above, q_retract = planning.waypoints(seam)
+        q_start, q_above, q_retract = planning.waypoints(seam, planning.X_BP_guess)
     except WeldcalError as error:
         return PlannedSeam(sequence=sequence, reason=str(error))
     points_B = np.asarray(seam.position(np.linspace(0.0, seam.length, 200)))

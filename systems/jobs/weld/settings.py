@@ -6,13 +6,14 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import JobPlan
 from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.welding.servo.settings import DeflectionControl, ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import DeflectionControl, GapConfig, ServoConfig, ToolGeometry, TouchConfig
 
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
@@ -36,23 +37,32 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
     tool, welding = station.tool, scenario.welding
     if tool is None or station.cad is None:
         return ServoConfig()
-    seat = station.cad.tip_height(tool.tip_radius_m) - tool.seat_sink_m
+    press = Press(tool.press_axial_m, tool.press_lateral_m)
+    seat = station.cad.seated(tool, press)
+    entry = station.cad.entry(tool, seat)
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
-        tip_drop_m=station.cad.depth_m + tool.tip_radius_m - seat,
-        torch_clearance_m=TORCH_ABOVE_ROOT_M - seat,
-        side_offset_m=-tool.seat_side_m,
+        tip_drop_m=entry.drop_m,
+        torch_clearance_m=TORCH_ABOVE_ROOT_M - seat.above_m,
+        side_offset_m=-seat.aside_m,
     )
     return ServoConfig(
         tool=geometry,
-        touch=TouchConfig(zero_frames=ZERO_FRAMES),
+        touch=TouchConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
+        gap=GapConfig(end_window_m=station.cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
-        deflection=DeflectionControl(
-            delta_d_m=welding.deflection_mm * 1e-3, axial_d_m=welding.axial_deflection_mm * 1e-3
-        ),
+        deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
     )
+
+
+def seated_tip(station: Station) -> Seated:
+    """Where the loaded tip rests in the drawn joint; a station with a tool and a workpiece."""
+    tool, cad = station.tool, station.cad
+    assert tool is not None
+    assert cad is not None
+    return cad.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
 
 
 def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:

@@ -17,7 +17,7 @@ from weldcal.calibration.profiler.edge.model import EdgeState, predicted
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import forward_kinematics, jacobian
-from weldcal.models.workpieces import make_workpiece
+from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture
 from weldcal.systems.drivers.simulated.rendered_profiler import RayFan, RenderedProfiler, drawn_pose, measured_profile

@@ -17,7 +17,7 @@ from tests.systems.cells import TOOL, scenario
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.models.mesh import TriMesh
 from weldcal.models.outline import outline
-from weldcal.models.workpieces import make_workpiece
+from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.weld.sequencer import PHASES, JobState
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport

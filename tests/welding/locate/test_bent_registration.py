@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
-from weldcal.models.bent_workpiece import bend, rolled
 from weldcal.models.scanners import get_scanner
-from weldcal.models.workpieces import Workpiece, make_workpiece
+from weldcal.models.workpieces.bent_plate import bend, rolled
+from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 from weldcal.tools.studies.seam_planning.scenes import Scene, scan_part
 from weldcal.tools.studies.seam_planning.trials import sideways
 from weldcal.welding.locate.bent_face import BentFace, find_bent_faces

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
 from weldcal.models.scanners import get_scanner
-from weldcal.models.workpieces import make_workpiece
+from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.tools.studies.seam_planning import benchmark as seam_planning
 from weldcal.tools.studies.seam_planning.scenes import Scene, box, cast, looking_at, scan_part, table
 from weldcal.tools.studies.seam_planning.trials import sideways

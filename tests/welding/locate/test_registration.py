@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points, get_scanner
-from weldcal.models.workpieces import Workpiece, make_workpiece, seeded_groove_error
+from weldcal.models.workpieces.plate import Workpiece, make_workpiece, seeded_groove_error
 from weldcal.welding.locate.registration import RegistrationConfig, WorkpieceNotFound, register_workpiece
 
 # 826 pixels over 590 mm at 650 mm: a pitch of 1.0 mm on a plate 0.91 m away; the noise there is 0.2 mm.

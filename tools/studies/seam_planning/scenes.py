@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.scanners import ScannerPreset, apply_noise, depth_to_points
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 
 TABLE_M = 1.4
 SLANT_RAD = 0.1  # of the scanner against the vertical, at most

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh
-from weldcal.models.workpieces import Workpiece
+from weldcal.models.workpieces.plate import Workpiece
 
 Floats = npt.NDArray[np.float64]
 LEAST_RADIUS_M = 0.100

@@ -21,7 +21,7 @@ from pydrake.geometry import (
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import PlanarPath, Workpiece, make_workpiece, seeded_groove_error
+from weldcal.models.workpieces.plate import PlanarPath, Workpiece, make_workpiece, seeded_groove_error
 
 SHAPES = ("straight", "s", "l")
 GROOVE_ERROR = seeded_groove_error(np.random.default_rng(4))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from weldcal.models.bent_workpiece import FELT_EDGE_M, bend, divided, rolled
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces import Workpiece, make_workpiece
+from weldcal.models.workpieces.bent_plate import FELT_EDGE_M, bend, divided, rolled
+from weldcal.models.workpieces.plate import Workpiece, make_workpiece
 
 R = 0.150
 FLAT = {shape: make_workpiece(shape, length_m=0.200) for shape in ("s", "l")}

@@ -19,6 +19,7 @@ from scipy.optimize import brentq
 
 from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, grid, merge, plane_mesh, triangulate_polygon
+from weldcal.models.workpieces.seat import Entry, JointSection, Press, Seated, Tip, seat
 
 Floats = npt.NDArray[np.float64]
 
@@ -26,6 +27,9 @@ INCLUDED_ANGLE_RAD = math.radians(45.0)
 GROOVE_DEPTH_M = 0.008
 SEAM_SPACING_M = 0.0005
 GROOVE_BAND_M = 0.012
+PRESS_AXIAL_M, PRESS_LATERAL_M = 0.003, 0.002
+BESIDE_GROOVE_M = 0.005
+END_WINDOW_M = 0.006
 
 
 @dataclass(frozen=True)
@@ -125,6 +129,34 @@ class Workpiece:
             tip_mm, groove_mm = tip_radius_m * 1e3, 2e3 * self.half_width_m
             raise InputError(f"A tip of radius {tip_mm:.3g} mm is too large for a groove {groove_mm:.3g} mm wide.")
         return tip_radius_m / math.sin(self.half_angle_rad)
+
+    @property
+    def end_window_m(self) -> float:
+        """How far from the drawn end the groove may end: the plate's edge is where it is sawn."""
+        return END_WINDOW_M
+
+    @property
+    def section(self) -> JointSection:
+        """The groove's walls in a cut square to the seam."""
+        wall = self.depth_m / math.cos(self.half_angle_rad)
+        return JointSection(self.half_angle_rad, wall, wall)
+
+    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+        """How hard the tip is pressed into the groove, m; a value that is given is kept."""
+        return Press(PRESS_AXIAL_M if axial_m is None else axial_m, PRESS_LATERAL_M if lateral_m is None else lateral_m)
+
+    def seated(self, tip: Tip, press: Press) -> Seated:
+        """Where the centre of the loaded tip rests, from the root.
+
+        Raises:
+            InputError: it rides on the groove's edges, or climbs out of the groove.
+        """
+        self.tip_height(tip.tip_radius_m)
+        return seat(self.section, tip, press)
+
+    def entry(self, tip: Tip, seated: Seated) -> Entry:
+        """How the tip is brought into the groove in which it then rests: it lands on the face beside it."""
+        return Entry(-BESIDE_GROOVE_M, self.depth_m + tip.tip_radius_m - seated.above_m)
 
     def tip_line_P(self, tip_radius_m: float) -> Floats:
         """(N,3) where the centre of a seated ball of that radius runs, m."""

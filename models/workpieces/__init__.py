@@ -1,0 +1,1 @@
+"""Parts to be welded: grooved plates, parts read from files, their edges, seams and joints."""

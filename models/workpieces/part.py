@@ -1,0 +1,224 @@
+"""A part from a file with the seam that is welded on it, and what a weld needs to know of any workpiece."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from weldcal.models.errors import InputError
+from weldcal.models.mesh import TriMesh
+from weldcal.models.workpieces.bent_plate import divided
+from weldcal.models.workpieces.drawing import goes_on
+from weldcal.models.workpieces.seams import DrawnSeam
+from weldcal.models.workpieces.seat import Entry, JointSection, Press, Seated, Tip, check_weldable, press_for, seat
+from weldcal.models.workpieces.shape import PartShape
+
+Floats = npt.NDArray[np.float64]
+
+FELT_ABOUT_SEAM_M = 0.030
+BOWED_EDGE_M = 0.006
+SELF_GUIDING_RAD = math.radians(29.0)  # half opening above which a pressed tip slides down either wall (friction 0.2)
+GUIDED_DROP_M = 0.002  # from where it may land to the root, for a plan that is as far beside it
+CHOSEN_END_M, FELT_END_M = 0.0003, 0.0015
+BESIDE_M = 0.0017  # between the joint's mouth and the tip's centre as it lands on the face
+
+
+class WeldPart(Protocol):
+    """What a weld needs to know of a workpiece in its frame P, m: a grooved plate or a part from a file.
+
+    mesh is what a scanner sees, groove_mesh what the tip feels; seam_P, tangents_P (N,3) the root line, up_P (N,3) or (1,3)
+    the bisector of its walls, depth_m from their upper end to the root.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def mesh(self) -> TriMesh: ...
+    @property
+    def groove_mesh(self) -> TriMesh: ...
+    @property
+    def seam_P(self) -> Floats: ...
+    @property
+    def tangents_P(self) -> Floats: ...
+    @property
+    def arc_length_m(self) -> Floats: ...
+    @property
+    def up_P(self) -> Floats: ...
+    @property
+    def size_m(self) -> tuple[float, float, float]: ...
+    @property
+    def half_angle_rad(self) -> float: ...
+    @property
+    def depth_m(self) -> float: ...
+    @property
+    def end_window_m(self) -> float:
+        """How far from the drawn end the seam may end."""
+
+    def seated(self, tip: Tip, press: Press) -> Seated:
+        """Where the centre of the loaded tip rests, from the root."""
+
+    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+        """How hard the tip is pressed; a value that is given is kept."""
+
+    def entry(self, tip: Tip, seated: Seated) -> Entry:
+        """How the tip is brought into the joint in which it then rests."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part in its frame P (that of its file) with one seam, m. See WeldPart."""
+
+    shape: PartShape
+    seam: DrawnSeam
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.shape.name
+
+    @property
+    def mesh(self) -> TriMesh:
+        """The whole surface."""
+        return self.shape.mesh
+
+    @cached_property
+    def groove_mesh(self) -> TriMesh:
+        """The surface about the seam."""
+        return about(self.shape.mesh, self.seam.points_P, FELT_ABOUT_SEAM_M)
+
+    @property
+    def seam_P(self) -> Floats:
+        """(N,3) the root line."""
+        return self.seam.points_P
+
+    @property
+    def tangents_P(self) -> Floats:
+        """(N,3) direction of travel."""
+        return self.seam.tangents_P
+
+    @property
+    def arc_length_m(self) -> Floats:
+        """(N,) along the root."""
+        return self.seam.arc_length_m
+
+    @property
+    def up_P(self) -> Floats:
+        """(N,3) bisector of the walls."""
+        return self.seam.up_P
+
+    @property
+    def length_m(self) -> float:
+        """Arc length of the seam."""
+        return self.seam.length_m
+
+    @cached_property
+    def size_m(self) -> tuple[float, float, float]:
+        """Extent along x, y and z."""
+        x, y, z = np.ptp(self.shape.mesh.vertices, axis=0)
+        return float(x), float(y), float(z)
+
+    @cached_property
+    def section(self) -> JointSection:
+        """The joint's walls in a cut square to the seam; the opening is the median along it."""
+        left, right = self.seam.wall_height_m
+        opening = math.pi if self.seam.joint == "butt" else float(np.median(self.seam.opening_rad))
+        return JointSection(0.5 * opening, float(left), float(right), self.seam.gap_m)
+
+    @property
+    def half_angle_rad(self) -> float:
+        """Between a wall and the bisector."""
+        return self.section.half_angle_rad
+
+    @property
+    def depth_m(self) -> float:
+        """From the end of the lower wall to the root, along the bisector; of a gap 0, for its root is level with the faces."""
+        return min(self.section.left_m, self.section.right_m) * math.cos(self.half_angle_rad)
+
+    @cached_property
+    def end_window_m(self) -> float:
+        """See WeldPart: hardly any where the joint goes on beyond the drawn end, for then the end is chosen, not felt."""
+        return CHOSEN_END_M if goes_on(self.mesh, self.seam) else FELT_END_M
+
+    def seated(self, tip: Tip, press: Press) -> Seated:
+        """See WeldPart."""
+        return seat(self.section, tip, press)
+
+    def press(self, tip: Tip, axial_m: float | None, lateral_m: float | None) -> Press:
+        """See WeldPart; raises JointNotWeldable."""
+        check_weldable(self.section, tip.tip_radius_m)
+        return press_for(self.section, tip, axial_m, lateral_m)
+
+    def entry(self, tip: Tip, seated: Seated) -> Entry:
+        """See WeldPart: a wide joint guides the tip in from above; beside a narrow one it lands on the face and searches."""
+        section = self.section
+        if section.gap_m == 0.0 and section.half_angle_rad >= SELF_GUIDING_RAD:
+            return Entry(0.0, GUIDED_DROP_M)
+        mouth = 0.5 * section.gap_m if section.gap_m else section.right_m * math.sin(section.half_angle_rad)
+        return Entry(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
+
+
+def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
+    """The triangles of a mesh whose boxes come within reach of a line (N,3)."""
+    corners = mesh.vertices[mesh.triangles]
+    low, high = corners.min(axis=1) - reach_m, corners.max(axis=1) + reach_m
+    near = np.zeros(len(corners), dtype=bool)
+    for some in np.array_split(points, max(1, len(points) // 20)):
+        near |= ((low <= some.max(axis=0)) & (high >= some.min(axis=0))).all(axis=1)
+    used, index = np.unique(mesh.triangles[near], return_inverse=True)
+    return TriMesh(mesh.vertices[used], index.reshape(-1, 3))
+
+
+def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
+    """The part as made, bowed by an amplitude at its middle in a direction (3,): its seam is not where the drawing has it.
+
+    A point moves by amplitude cos(pi x) along the direction, x from -1/2 to 1/2 along the seam's chord; the ends stay.
+
+    Raises:
+        InputError: an amplitude beyond a twentieth of the seam.
+    """
+    seam = part.seam.points_P
+    chord = seam[-1] - seam[0] if not part.seam.closed else np.ptp(seam, axis=0) * np.array([1.0, 0.0, 0.0])
+    length = float(np.linalg.norm(chord))
+    if amplitude_m > 0.05 * length:
+        raise InputError(
+            f"A part whose seam is {1e3 * length:.0f} mm long is not made {1e3 * amplitude_m:.1f} mm out of true."
+        )
+    e = chord / length
+    middle = part.mesh.vertices @ e
+    middle_at, span = 0.5 * float(middle.min() + middle.max()), float(np.ptp(middle))
+
+    def moved(points: Floats) -> Floats:
+        x = (points @ e - middle_at) / span
+        return np.asarray(points + amplitude_m * np.cos(math.pi * x)[:, None] * direction)
+
+    mesh = _divided_along(part.mesh, e, BOWED_EDGE_M)
+    points = moved(seam)
+    t = np.gradient(points, axis=0)
+    t /= np.linalg.norm(t, axis=1, keepdims=True)
+
+    def square(v: Floats) -> Floats:
+        v = v - np.sum(v * t, axis=1, keepdims=True) * t
+        return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
+
+    s = part.seam
+    walls: Callable[[Floats], Floats] = square
+    drawn = replace(
+        s, points_P=points, up_P=walls(s.up_P), wall_left_P=walls(s.wall_left_P), wall_right_P=walls(s.wall_right_P)
+    )
+    return Part(replace(part.shape, mesh=TriMesh(moved(mesh.vertices), mesh.triangles)), drawn)
+
+
+def _divided_along(mesh: TriMesh, e: Floats, edge_m: float) -> TriMesh:
+    """The same surface with no edge that runs further than `edge_m` along a unit vector."""
+    helper = np.array([0.0, 0.0, 1.0]) if abs(e[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    y = np.cross(helper, e)
+    y /= np.linalg.norm(y)
+    R = np.stack([e, y, np.cross(e, y)])
+    fine = divided(TriMesh(mesh.vertices @ R.T, mesh.triangles), edge_m)
+    return TriMesh(fine.vertices @ R, fine.triangles)

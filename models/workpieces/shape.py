@@ -1,0 +1,70 @@
+"""The shape of a part as its file has it: a closed mesh in metres and the numbered edges at which faces meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from weldcal.models.errors import InputError
+from weldcal.models.mesh import TriMesh
+
+Floats = npt.NDArray[np.float64]
+
+UNITS_M = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
+KINDS = ("concave", "convex", "smooth", "boundary")
+
+
+@dataclass(frozen=True, eq=False)
+class PartEdge:
+    """An edge of a part in its frame P.
+
+    id        the number by which a scenario names it, from 1
+    kind      concave: the free space between the faces is less than pi; convex; smooth: the faces are tangent; boundary:
+              only one face ends here
+    points_P  (N,3) m, N >= 2, along the edge; a closed edge repeats its first point
+    angle_rad between the two faces: through the free space of a concave edge, through the material of a convex one;
+              pi of a smooth edge, nan of a boundary
+    radius_m  of a circular edge; None of any other
+    """
+
+    id: int
+    kind: str
+    points_P: Floats
+    angle_rad: float
+    radius_m: float | None = None
+
+    @property
+    def length_m(self) -> float:
+        """Arc length, m."""
+        return float(np.linalg.norm(np.diff(self.points_P, axis=0), axis=1).sum())
+
+    @property
+    def closed(self) -> bool:
+        """Whether the edge ends where it starts."""
+        return len(self.points_P) > 2 and bool(np.linalg.norm(self.points_P[0] - self.points_P[-1]) < 1e-6)
+
+
+@dataclass(frozen=True, eq=False)
+class PartShape:
+    """A part in its frame P, m: its mesh, its edges by ascending id, the file's unit in m, and the number of its bodies."""
+
+    name: str
+    mesh: TriMesh
+    edges: tuple[PartEdge, ...]
+    unit_m: float
+    bodies: int = 1
+
+    def edge(self, id: int) -> PartEdge:
+        """The edge with this number.
+
+        Raises:
+            InputError: there is none.
+        """
+        found = next((e for e in self.edges if e.id == id), None)
+        if found is None:
+            raise InputError(
+                f"'{self.name}' has no edge {id}: its edges are 1 to {len(self.edges)}; weldcal part {self.name} lists them."
+            )
+        return found
