@@ -39,6 +39,12 @@ def test_each_controller_knows_its_arm(arm: str) -> None:
     assert struct.unpack(">4i", server._configuration[-16:])[2] == TYPES.get(arm, CONTROLLER_MODELS[arm][1])
 
 
+def test_each_emulated_arm_has_its_serial_number() -> None:
+    told = [DashboardServer(controller(arm)).answer("get serial number") for arm in known_arms()]
+    assert len(set(told)) == len(known_arms())
+    assert all(len(number) == 11 and number.startswith("2023") for number in told)
+
+
 def test_a_payload_beyond_the_arm_ends_the_program() -> None:
     made = controller("ur3e")
     for mass, left in ((2.5, 2.5), (3.5, 2.5)):

@@ -7,6 +7,7 @@ from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
+FIRST_IS_ONE = ("ur10e", *(name for name in CONTROLLER_MODELS if name != "ur10e"))
 GREETING = "Connected: Universal Robots Dashboard Server"
 TOO_EARLY = (
     "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking"
@@ -15,8 +16,8 @@ IDLE_PROGRAM = "def {name}():\n  while True:\n    sync()\n  end\nend\n"
 
 
 def serial_number(arm: str) -> str:
-    """A serial number for an emulated arm: year, type and count."""
-    return f"2023{CONTROLLER_MODELS[arm][1]:02d}00001"
+    """A serial number for an emulated arm, another for each model."""
+    return f"202355{1 + FIRST_IS_ONE.index(arm):05d}"
 
 
 class DashboardServer(Server):
