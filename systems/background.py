@@ -52,8 +52,9 @@ class Answer(Message, Generic[Found]):
 class Background(Protocol):
     """Computes functions of immutable, picklable arguments for the systems of a cell."""
 
-    waiting_since: float | None
-    """Wall clock (s, monotonic) of the newest question while it has no answer, else None."""
+    @property
+    def waiting_since(self) -> float | None:
+        """Wall clock (s, monotonic) of the newest question while it has no answer, else None."""
 
     def prepare(self, function: Callable[..., Any], *arguments: Any) -> None:
         """Run a function once before the arm moves, for what its first call costs: imports and compiled loops."""

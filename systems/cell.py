@@ -1,5 +1,6 @@
 """Builds the cell Diagram of a scenario: the station, the spine shared by all jobs, and the scenario's job."""
 
+import dataclasses as dc
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -13,6 +14,9 @@ from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.jobs.job import AddedJob, Job
 from weldcal.systems.motion.clear_moves import check_way_home
 from weldcal.systems.motion.spine import add_spine
+from weldcal.systems.recording.answers import NotedBackground
+from weldcal.systems.recording.player import Playback
+from weldcal.systems.recording.tap import OpenSink, add_recorder
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.wiring import Wiring
@@ -34,7 +38,12 @@ class Cell(Generic[JobOf]):
 
 
 def build_cell(
-    scenario: Scenario, seed: int = 0, meshcat: Meshcat | None = None, robot: PreparedRobot | None = None
+    scenario: Scenario,
+    seed: int = 0,
+    meshcat: Meshcat | None = None,
+    robot: PreparedRobot | None = None,
+    played: Playback | None = None,
+    open_sink: OpenSink | None = None,
 ) -> Cell[Any]:
     """Build the cell of a scenario. The caller must close its station.
 
@@ -44,24 +53,27 @@ def build_cell(
         scenario: describes the cell; its parts determine the job.
         seed: seed of all random numbers.
         meshcat: viewer of the cell, with the operator's controls; None: no viewer.
-        robot: see make_station.
+        robot, played: see make_station.
+        open_sink: opens the sink that takes what enters and leaves the cell; None: nothing is recorded.
 
     Raises:
         InputError, UnreachableScanner: the scenario cannot be run; nothing has been written or moved.
     """
     job = job_of(scenario)
-    station = make_station(scenario, seed, robot, job.furnish)
+    station = make_station(scenario, seed, robot, job.furnish, played)
+    noted = NotedBackground(station.background)
+    if open_sink is not None:
+        station = dc.replace(station, background=noted)
     try:
         check_way_home(scenario, station)
-        return _build(
-            job, job.plan(scenario, station, seed), Wiring(DiagramBuilder(), station, scenario, seed, meshcat)
-        )
+        wiring = Wiring(DiagramBuilder(), station, scenario, seed, meshcat)
+        return _build(job, job.plan(scenario, station, seed), wiring, noted, open_sink)
     except BaseException:
         station.close()
         raise
 
 
-def _build(job: Job[Any], plan: Any, wiring: Wiring) -> Cell[Any]:
+def _build(job: Job[Any], plan: Any, wiring: Wiring, noted: NotedBackground, open_sink: OpenSink | None) -> Cell[Any]:
     builder, station, scenario = wiring.builder, wiring.station, wiring.scenario
     builder.AddSystem(station.diagram)
     arms = [(FIRST, station.arm)] + ([] if station.second is None else [(SECOND, station.second)])
@@ -69,6 +81,8 @@ def _build(job: Job[Any], plan: Any, wiring: Wiring) -> Cell[Any]:
     spine = add_spine(wiring, arms, job.move_speed, job.move_acceleration, error)
     added = job.add(wiring, spine, plan)
     spine.connect(added.ports)
+    if open_sink is not None:
+        noted.note = add_recorder(wiring, added.ports.results, open_sink)
     if wiring.meshcat is not None:
         period_s = 1.0 / scenario.visualization.recording_fps
         params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=period_s)

@@ -28,6 +28,8 @@ from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
+from weldcal.systems.recording.answers import RepeatedBackground
+from weldcal.systems.recording.player import Playback, add_player
 from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario, WorkpieceConfig
 from weldcal.systems.scenario.surroundings import surroundings_of
@@ -159,11 +161,16 @@ class Furnish(Protocol):
 
 
 def make_station(
-    scenario: Scenario, seed: int, robot: PreparedRobot | None = None, furnish: Furnish | None = None
+    scenario: Scenario,
+    seed: int,
+    robot: PreparedRobot | None = None,
+    furnish: Furnish | None = None,
+    played: Playback | None = None,
 ) -> Station:
     """Build the station of a scenario; all random deviations of the simulated world follow from `seed`.
 
     `robot` is an already prepared robot; None: the driver in the scenario prepares it. `furnish` is the job's method.
+    `played`: ports of a recording take the place of all devices.
     A station without simulated devices has no simulated world: the arm is displayed at its measured joints.
 
     Ports: in `arm.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
@@ -181,7 +188,7 @@ def make_station(
         robot = prepare_robot(scenario.robot, nominal_arm(scenario), np.deg2rad(scenario.home_deg))
     opened: list[Closable] = []
     try:
-        return _make_station(scenario, seed, robot, furnish, opened)
+        return _make_station(scenario, seed, robot, furnish, opened, played)
     except BaseException:
         robot.close()
         for device in opened:
@@ -190,13 +197,18 @@ def make_station(
 
 
 def _make_station(
-    scenario: Scenario, seed: int, robot: PreparedRobot, furnish: Furnish | None, opened: list[Closable]
+    scenario: Scenario,
+    seed: int,
+    robot: PreparedRobot,
+    furnish: Furnish | None,
+    opened: list[Closable],
+    played: Playback | None,
 ) -> Station:
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
     surroundings = surroundings_of(scenario)
     tool = _tool(scenario, cad)
-    devices: dict[str, DriverConfig] = {name: getattr(scenario, name) for name in DEVICES}
+    devices: dict[str, DriverConfig] = {} if played is not None else {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot, closables=opened)
     furnishing = Furnishing()
@@ -225,6 +237,8 @@ def _make_station(
         )
         build.parts = (world, *furnishing.parts)
     X_LC = None
+    if played is not None:
+        add_player(played, build)
     for name, config in devices.items():
         if name == "robot_2" and furnishing.second is not None:
             _apply_second_robot(config, furnishing.second, build)
@@ -250,7 +264,9 @@ def _make_station(
     diagram.set_name("station")
     second = None if furnishing.second is None else furnishing.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
-    background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
+    background: Background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
+    if played is not None:
+        background = RepeatedBackground(looks=played.looks)
     return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened), surroundings)
 
 

@@ -1,6 +1,6 @@
 """A DiagramBuilder of a cell with the objects that its parts share, and methods to add and connect systems."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
@@ -17,13 +17,18 @@ AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers."""
+    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers.
+
+    `read` and `driven` are the ports of the station that the cell reads, and the sources of those that it drives, by name.
+    """
 
     builder: DiagramBuilder
     station: Station
     scenario: Scenario
     seed: int = 0
     meshcat: Meshcat | None = None
+    read: dict[str, OutputPort] = field(default_factory=dict)
+    driven: dict[str, OutputPort] = field(default_factory=dict)
 
     def add(self, name: str, system: AnySystem) -> AnySystem:
         """Add a system under its name."""
@@ -38,11 +43,14 @@ class Wiring:
 
     def out(self, name: str) -> OutputPort:
         """An output port of the station."""
-        return self.station.diagram.GetOutputPort(name)
+        port = self.station.diagram.GetOutputPort(name)
+        self.read[name] = port
+        return port
 
     def feed(self, name: str, source: OutputPort) -> None:
         """Connect a source to an input port of the station."""
         self.builder.Connect(source, self.station.diagram.GetInputPort(name))
+        self.driven[name] = source
 
     def constant(self, name: str, value: object) -> OutputPort:
         """An output port with a constant message."""

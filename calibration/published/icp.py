@@ -173,8 +173,9 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     result = registration.registration_icp(source, target, verification.max_distance_m, np.eye(4), estimation)
     if result.fitness < _MIN_FITNESS or not np.isfinite(result.transformation).all():
         return FAILED
-    E_R = RigidTransform(np.asarray(result.transformation))
+    E_R = _without_last_digits(np.asarray(result.transformation))
     pairs = np.asarray(result.correspondence_set)
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
     matched = (E_R @ X_RC @ verification.points_C[pairs[:, 0]].T).T
     standard = verification.standard
     normals = verification.model_normals_R[pairs[:, 1]] if standard is None else surface_normals(matched, standard)
@@ -186,8 +187,14 @@ def icp_error(X_BC: RigidTransform, verification: Verification) -> VerificationE
     value = np.concatenate([rotation_vector(seen.rotation()), seen.translation()])
     value[[name in unobservable for name in COMPONENTS]] = 0.0
     correction = X_RC.inverse() @ RigidTransform(RotationMatrix(exp_rotation(value[:3])), value[3:]).inverse() @ X_RC
-    fitness, rmse = float(result.fitness), float(result.inlier_rmse)
-    return VerificationError(value, correction, fitness, rmse, unobservable, sigmas(matrix, noise))
+    rmse = float(np.sqrt(np.mean(np.sum((matched - verification.model_R[pairs[:, 1]]) ** 2, axis=1))))
+    return VerificationError(value, correction, float(result.fitness), rmse, unobservable, sigmas(matrix, noise))
+
+
+def _without_last_digits(X: Array) -> RigidTransform:
+    """A pose (4, 4) to 1e-10 m and rad: Open3D's threads add up in any order, so that the last digits are others in each run."""
+    R, p = np.round(X[:3, :3], 10), np.round(X[:3, 3], 10)
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), p)
 
 
 @dataclass(frozen=True)

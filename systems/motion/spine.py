@@ -18,6 +18,7 @@ from weldcal.welding.servo.guards import SlewLimits
 
 MOVE_SPEED, MOVE_ACCELERATION = 1.0, 2.5  # rad/s and rad/s^2 of the fastest joint, at speed_factor 1
 MOVE_TIMEOUT_S = 20.0  # at speed_factor 1
+HOLD = "operator.hold"  # in a recording
 JERK_LIMIT = 150.0  # rad/s^3: 100 ms to the acceleration limit of the large joints
 SPEED_SHARE, ACCELERATION_SHARE = 0.6, 0.5  # of the arm's own limits
 
@@ -27,7 +28,8 @@ class JobPorts:
     """The output ports of a job that the spine, the log and the run loop read.
 
     `commands`: a JobCommand for each arm. `velocity` (6) rad/s drives the first arm while its command's mode is `weld`.
-    `torch_wanted` (1) and `margin` (2) go to the ProcessSwitch. `logged`: vector ports by their name in the log.
+    `torch_wanted` (1) and `margin` (2) go to the ProcessSwitch. `logged`: vector ports by their name in the log. `results`:
+    ports whose values a recording keeps, by name.
     """
 
     commands: tuple[OutputPort, ...]
@@ -36,6 +38,7 @@ class JobPorts:
     torch_wanted: OutputPort | None = None
     margin: OutputPort | None = None
     logged: dict[str, OutputPort] = field(default_factory=dict)
+    results: dict[str, OutputPort] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +139,16 @@ def add_spine(
         w.connect(limiter, velocity_wanted=arbiter.GetOutputPort("velocity_wanted"))
         w.feed(f"{prefix}.velocity_command", limiter.get_output_port())
         made.append(SpineArm(prefix, measured, status, recorder.GetOutputPort("history"), mover, arbiter, own_error))
-    panel = None if w.meshcat is None else w.add("operator_panel", OperatorPanel(w.meshcat))
-    hold = w.zeros("nobody_holds", 1) if panel is None else panel.GetOutputPort("hold")
+    hold = _hold(w)
     return Spine(w, tuple(made), hold, w.add("process_switch", ProcessSwitch()))
+
+
+def _hold(w: Wiring) -> OutputPort:
+    """The operator's stop request: of the viewer, or of a recording that is played back."""
+    if w.station.diagram.HasOutputPort(HOLD):
+        return w.out(HOLD)
+    if w.meshcat is None:
+        return w.zeros("nobody_holds", 1)
+    hold = w.add("operator_panel", OperatorPanel(w.meshcat)).GetOutputPort("hold")
+    w.read[HOLD] = hold
+    return hold

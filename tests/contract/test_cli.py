@@ -61,7 +61,14 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
         assert "--seed" in options
         return
     # these only look: they write nothing and leave nothing to chance
-    only_look = ("weldcal view", "weldcal check-robot", "weldcal check-cell", "weldcal robots", "weldcal schema")
+    only_look = (
+        "weldcal view",
+        "weldcal replay",
+        "weldcal check-robot",
+        "weldcal check-cell",
+        "weldcal robots",
+        "weldcal schema",
+    )
     assert name in only_look or {"--out", "--seed"} <= options
 
 

@@ -8,7 +8,7 @@ import pkgutil
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -97,6 +97,8 @@ from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
+from weldcal.systems.recording.player import PortPlayer
+from weldcal.systems.recording.port_recorder import PortRecorder, PortSink
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
@@ -171,6 +173,8 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     CellVisualizer: lambda: CellVisualizer(
         Meshcat(MeshcatParams(host="localhost", port=0)), TOOL, X, 0.03, VisualizationConfig()
     ),
+    PortRecorder: lambda: PortRecorder((6, 2), {}, {}, cast("PortSink", None)),
+    PortPlayer: lambda: PortPlayer({}, {}),
     OperatorPanel: lambda: OperatorPanel(Meshcat(MeshcatParams(host="localhost", port=0))),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
     TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(load_scenario("tablet"), the_arm())),
@@ -400,6 +404,8 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "planned_seam": PlannedSeam,
         "servo_report": ServoReport,
     },
+    PortRecorder: {"entered": 6, "left": 2},
+    PortPlayer: {},
     OperatorPanel: {"hold": 1, "pace": 1},
     CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},
 }

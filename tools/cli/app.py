@@ -17,6 +17,7 @@ from weldcal.tools.cli import (
     part,
     plan_motion,
     profiler,
+    replay,
     reproduce,
     robots,
     runs,
@@ -29,7 +30,16 @@ from weldcal.tools.cli import (
 
 PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then weld along a seam that is felt by touch."
 COMMANDS = (
-    *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, plan_motion.plan_motion, runs.weld, view.view),
+    *(
+        runs.demo,
+        calibrate.calibrate,
+        verify.verify,
+        monitor.monitor,
+        plan_motion.plan_motion,
+        runs.weld,
+        view.view,
+        replay.replay,
+    ),
     *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
     *(scenarios.new, scenarios.schema, part.part),
     *(cell.check_cell, cell.print_board, cell.finger_calibrate, tool.tool_check),

@@ -9,7 +9,11 @@ from weldcal.tools.cli.options import MOTION, Call, CorrectionOption, FlangeOpti
 from weldcal.tools.cli.runs import run_options
 
 
-@command("calibrate", options=MOTION, short_help="Calibrate a scanner from a folder of scans, or live in a scenario.")
+@command(
+    "calibrate",
+    options=(*MOTION, "record"),
+    short_help="Calibrate a scanner from a folder of scans, or live in a scenario.",
+)
 def calibrate(
     call: Call,
     dataset: Annotated[

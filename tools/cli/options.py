@@ -45,10 +45,12 @@ _ROBOT = "simulated, emulated (a controller on loopback), or the address of a co
 _ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
 _PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
 _SLOWER = "Slow the arm's moves down: 0.05 to 1. The welding speed does not change."
+_RECORD = "Also write recording.mcap, which weldcal replay plays back."
 _OUT = "Output folder; default: a new one in weldcal-out."
 COMMON: dict[str, tuple[Any, object]] = {
     "browser": (Annotated[bool, switch("--browser/--no-browser", _BROWSER)], True),
     "realtime": (Annotated[bool, switch("--realtime", "Do not run faster than real time.")], False),
+    "record": (Annotated[bool, switch("--record", _RECORD)], False),
     "robot": (Annotated[str | None, option("--robot", "ROBOT", _ROBOT, show_default="as in the scenario")], None),
     "dry_run": (Annotated[bool, switch("--dry-run", "Only read the robot, then run on a simulated arm.")], False),
     "pace": (Annotated[float | None, option("--pace", "P", _PACE)], None),
@@ -102,7 +104,7 @@ class Call:
     @property
     def live(self) -> dict[str, Any]:
         """The options of a live run; with --json no browser is opened."""
-        found = {name: self.given[name] for name in LIVE if name in self.given}
+        found = {name: self.given[name] for name in (*LIVE, "record") if name in self.given}
         return found | ({"browser": found["browser"] and not self.json} if "browser" in found else {})
 
     def folder(self, command: str, name: str) -> Path:

@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from weldcal.tools.outcomes.options import RunOptions
 
 DEMO_SCENARIO = "s_groove"
+RECORDED = (*LIVE, "record")
 PROFILER_SCENARIO = "profiler_seam"
 
 
-@command("demo", options=LIVE, short_help="Run the complete job in simulation and write a report.")
+@command("demo", options=RECORDED, short_help="Run the complete job in simulation and write a report.")
 def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = DEMO_SCENARIO) -> Mapping[str, object]:
     """Run the complete job: calibrate, verify, scan the workpiece, plan, weld, retract. A report is written at the end."""
     from weldcal.tools.commands.procedures import run_procedure
@@ -34,7 +35,7 @@ def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = D
     return run_procedure(options, call.progress).summary()
 
 
-@command("weld", options=LIVE, short_help="Weld a seam in a scenario, without calibrating.")
+@command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")
 def weld(call: Call, scenario: ScenarioOption = "straight_groove") -> Mapping[str, object]:
     """Weld a seam in a scenario, with the scanner's pose taken from the scenario."""
     from weldcal.tools.commands.demo import run_weld

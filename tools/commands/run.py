@@ -18,6 +18,7 @@ from weldcal.systems.person import person_at
 from weldcal.systems.runner import Progress, Run, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.record import RunRecorder
 from weldcal.tools.commands.robots import chosen_robot
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
@@ -61,7 +62,9 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
     with chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot:
         if options.recording or options.browser:
             meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
-        cell = build_cell(scenario, options.seed, meshcat, robot.prepared)
+        recorder = RunRecorder(scenario, options, robot.title) if options.record else None
+        open_sink = None if recorder is None else recorder.open_sink
+        cell = build_cell(scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink)
         with closing(cell.station):
             if meshcat is not None:
                 camera, target = cell.job.view()
@@ -71,6 +74,8 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
                     time.sleep(2.0 if options.realtime else 0.5)  # the page needs a moment to load
             with person_at() as person:
                 run = run_cell(cell, progress, meshcat, options.realtime, person)
+            if recorder is not None:
+                recorder.close(run)
     return JobRun(run, meshcat, robot.title)
 
 

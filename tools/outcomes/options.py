@@ -7,7 +7,8 @@ from pathlib import Path
 @dataclass(frozen=True)
 class RunOptions:
     """The user's options: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast as
-    possible; the robot (see chosen_robot; None: the scenario's), and the speed of the arm's moves (None: the scenario's)."""
+    possible; the robot (see chosen_robot; None: the scenario's), and the speed of the arm's moves (None: the scenario's).
+    `recording`: the viewer's recording.html; `record`: recording.mcap, which `weldcal replay` plays back."""
 
     scenario: str
     out: Path
@@ -19,3 +20,4 @@ class RunOptions:
     pace: float | None = None
     speed_factor: float | None = None
     recording: bool = True
+    record: bool = False

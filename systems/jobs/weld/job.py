@@ -179,7 +179,13 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         logged = dict(welding.logged)
         if logged:
             logged["torch_on"] = spine.switch.GetOutputPort("process_on")
-        ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged)
+        results = {
+            "job": command,
+            "flange_estimate": estimator.GetOutputPort("flange_estimate"),
+            "calibration_status": status,
+            "planned_seam": welding.seam,
+        }
+        ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results)
         return WeldJob(
             scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports, times.maximum_time_s
         )

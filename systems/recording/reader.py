@@ -1,0 +1,179 @@
+"""Reads a recording, also one that was cut off: what entered the cell, what left it, and what it was built from."""
+
+from __future__ import annotations
+
+import json
+from base64 import b64decode
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Attachment, Channel, Message, Metadata
+from mcap.stream_reader import StreamReader
+from pydrake.math import RigidTransform
+
+from weldcal.models.errors import InputError
+from weldcal.models.files import opened
+from weldcal.systems import messages
+from weldcal.systems.recording.cdr import read_cloud, read_image
+from weldcal.systems.recording.player import Track
+from weldcal.systems.recording.port_recorder import ENTERED, STAGES
+from weldcal.systems.recording.values import array, decode
+from weldcal.systems.recording.writer import FORMAT
+
+LARGEST_RECORDING = 64 * 1024**3
+_PLAYED = {
+    kind.__name__: kind
+    for kind in (messages.Scan, messages.StreamedScan, messages.ScanStream, messages.Image, messages.UrStatus)
+}
+
+
+@dataclass(frozen=True)
+class Left:
+    """What left the cell: one value (as JSON) of one port or result, the key at which it did, and its number in the file."""
+
+    number: int
+    key: int
+    value: Any
+
+
+@dataclass(eq=False)
+class Recording:
+    """A recording in memory.
+
+    about: versions, seed and what else the file says of the run; files: by name. entered: what the station's ports showed.
+    left: messages by the name of the port or result, in order. rows: number in the file, key and values of all vector ports of
+    a side. answers: looks by the number of the question. end: what is said of the
+    end of the run; None where the file was cut off. last_key: of the newest message.
+    """
+
+    about: dict[str, str] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
+    entered: dict[str, Track] = field(default_factory=dict)
+    left: dict[str, list[Left]] = field(default_factory=dict)
+    rows: dict[str, list[tuple[int, int, np.ndarray]]] = field(default_factory=dict)
+    answers: dict[int, int] = field(default_factory=dict)
+    end: dict[str, Any] | None = None
+    last_key: int = 0
+    n_messages: int = 0
+
+    @property
+    def end_tick(self) -> int:
+        """The newest tick that is complete in the file."""
+        return self.last_key // STAGES if self.end is not None else max(0, self.last_key // STAGES - 1)
+
+
+def read_recording(path: Path) -> Recording:
+    """Read a recording up to its last whole message.
+
+    Raises:
+        InputError: the file is no recording of weldcal, or of another format.
+    """
+    found, rising = Recording(), dict[str, tuple[list[int], list[Any]]]()
+    with opened(path, LARGEST_RECORDING) as file:
+        topics: dict[int, str] = {}
+        body: np.ndarray | None = None
+        try:
+            for record in StreamReader(file, record_size_limit=None).records:
+                if isinstance(record, Channel):
+                    topics[record.id] = record.topic
+                elif isinstance(record, Metadata) and record.name == "weldcal":
+                    found.about = dict(record.metadata)
+                elif isinstance(record, Attachment):
+                    found.files[record.name] = record.data
+                elif isinstance(record, Message):
+                    found.n_messages += 1
+                    body = _take(found, rising, topics.get(record.channel_id, ""), record.data, body)
+        except (McapError, EOFError, OSError, ValueError, IndexError):
+            pass  # cut off, or no MCAP at all
+        except Exception as error:  # the reader's own errors of a truncated record
+            if type(error).__module__ not in ("struct", "mcap.exceptions", "builtins"):
+                raise
+    if not found.about:
+        raise InputError(f"'{path}' is no recording of weldcal: give a recording.mcap that --record has written.")
+    if found.about.get("format") != str(FORMAT):
+        raise InputError(
+            f"'{path}' has the format {found.about.get('format')}, and this weldcal reads {FORMAT}: use the version that wrote it "
+            f"({found.about.get('version', 'unknown')})."
+        )
+    sizes = json.loads(found.about["sizes"])
+    _split(found.rows.get(ENTERED, []), sizes[ENTERED], rising)
+    found.entered = {name: Track(keys, values) for name, (keys, values) in rising.items()}
+    return found
+
+
+def _split(
+    rows: list[tuple[int, int, np.ndarray]], sizes: dict[str, int], rising: dict[str, tuple[list[int], list[Any]]]
+) -> None:
+    """Add the vector ports of rows."""
+    first = 0
+    keys = [key for _, key, _ in rows]
+    for name, size in sizes.items():
+        if rows:
+            rising[name] = keys, [row[first : first + size] for _, _, row in rows]
+        first += size
+
+
+def _take(
+    found: Recording,
+    rising: dict[str, tuple[list[int], list[Any]]],
+    topic: str,
+    data: bytes,
+    body: np.ndarray | None,
+) -> np.ndarray | None:
+    """Add a message; returns the cloud or image that the next message belongs to."""
+    if topic == "/scanner/points":
+        return read_cloud(data)
+    if topic == "/finger_camera/image":
+        return read_image(data)
+    if topic == "/tf":
+        return body
+    text = json.loads(data)
+    if topic == "/answer":
+        found.answers[text["number"]] = text["looks"]
+        return None
+    if topic == "/end":
+        found.end = text
+        return None
+    key = int(text["key"])
+    found.last_key = max(found.last_key, key)
+    if topic == "/vectors":
+        for k, side, data in text["rows"]:
+            found.rows.setdefault(side, []).append((found.n_messages, k, np.frombuffer(b64decode(data))))
+        return None
+    side, _, port = topic.strip("/").partition("/")
+    if side == "out":
+        found.left.setdefault(port, []).append(Left(found.n_messages, key, text["value"]))
+    else:
+        _add(rising, port, key, _played(text["type"], text["value"], body))
+    return None
+
+
+def _add(rising: dict[str, tuple[list[int], list[Any]]], port: str, key: int, value: Any) -> None:
+    keys, values = rising.setdefault(port, ([], []))
+    keys.append(key)
+    values.append(value)
+
+
+def _played(kind: str, value: dict[str, Any], body: np.ndarray | None) -> Any:
+    """The message of a port from its JSON and the cloud or image before it."""
+    if kind == "ndarray":  # a pose
+        return RigidTransform(array(value))
+    if kind not in _PLAYED:
+        raise InputError(
+            f"The recording holds a {kind}, which this version cannot play back: use the version that wrote it."
+        )
+    if kind in ("Scan", "StreamedScan"):
+        return _with(_PLAYED[kind], value, "points_C", body)
+    if kind == "Image":
+        return _with(_PLAYED[kind], value, "pixels", body)
+    return decode(value, _PLAYED[kind])
+
+
+def _with(kind: Any, value: dict[str, Any], name: str, body: np.ndarray | None) -> Any:
+    if body is None:
+        raise InputError("The recording holds a scan or an image without its data: record the run again.")
+    few = decode(value, kind)
+    return type(few)(**{**vars(few), name: body})

@@ -1,0 +1,154 @@
+"""Converts port values to JSON values and back, without loss of a bit."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses as dc
+import enum
+import math
+import types
+import typing
+from hashlib import sha256
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.models.errors import InputError
+
+LISTED = 16  # numbers of an array that is written as a list; a longer one is written in base64
+_NOT_FINITE = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
+_DEEPEST = 12
+
+
+def encode(value: Any, largest: int | None = None, depth: int = 0) -> Any:
+    """A value as JSON has it: numbers that are not finite as text, arrays with shape and type, objects by their fields.
+
+    An array of more than `largest` numbers is replaced by its SHA-256, which tells whether it is the same.
+    """
+    if value is None or isinstance(value, bool | str):
+        return value
+    if isinstance(value, np.ndarray):
+        return _array(value, largest)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return _number(float(value))
+    if isinstance(value, np.bool_):
+        return bool(value)
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, RigidTransform):
+        return _array(value.GetAsMatrix34())
+    if isinstance(value, RotationMatrix):
+        return _array(value.matrix())
+    if isinstance(value, PurePath):
+        return value.name
+    if depth > _DEEPEST:
+        raise TypeError(f"a {type(value).__name__} is nested too deeply to be recorded")
+    if isinstance(value, list | tuple):
+        return [encode(item, largest, depth + 1) for item in value]
+    if isinstance(value, dict):
+        return {str(key): encode(item, largest, depth + 1) for key, item in value.items()}
+    if dc.is_dataclass(value):
+        return {f.name: encode(getattr(value, f.name), largest, depth + 1) for f in dc.fields(value)}
+    slots = [name for kind in type(value).__mro__ for name in getattr(kind, "__slots__", ())]
+    names = [*getattr(value, "__dict__", {}), *(n for n in slots if hasattr(value, n))]
+    found = {name: getattr(value, name) for name in names}
+    return {name: encode(item, largest, depth + 1) for name, item in found.items() if not callable(item)}
+
+
+def _number(value: float) -> float | str:
+    if math.isfinite(value):
+        return value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0.0 else "-Infinity"
+
+
+def _array(value: np.ndarray, largest: int | None = None) -> Any:
+    if value.size <= LISTED and value.dtype == np.float64:
+        found = [_number(x) for x in value.ravel().tolist()]
+        return found if value.ndim == 1 else {"shape": list(value.shape), "values": found}
+    if largest is not None and value.size > largest:
+        digest = sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+        return {"shape": list(value.shape), "dtype": value.dtype.str, "sha256": digest}
+    data = base64.b64encode(np.ascontiguousarray(value).tobytes()).decode("ascii")
+    return {"shape": list(value.shape), "dtype": value.dtype.str, "base64": data}
+
+
+def decode(value: Any, kind: Any) -> Any:
+    """The value of a type hint from what `encode` wrote.
+
+    Raises:
+        InputError: the value is not of this type.
+    """
+    try:
+        return _decode(value, kind)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        name = getattr(kind, "__name__", str(kind))
+        raise InputError(
+            f"The recording holds a {name} that cannot be read ({error}): record the run again."
+        ) from error
+
+
+def _decode(value: Any, kind: Any) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        if value is None:
+            return None
+        return _decode(value, next(a for a in arguments if a is not type(None)))
+    if origin is np.ndarray or kind is np.ndarray:
+        return array(value)
+    if origin is tuple:
+        each = arguments[0]
+        return tuple(_decode(v, each if arguments[-1] is Ellipsis else arguments[k]) for k, v in enumerate(value))
+    if origin is list:
+        return [_decode(v, arguments[0]) for v in value]
+    if kind is float:
+        return _NOT_FINITE[value] if isinstance(value, str) else float(value)
+    if kind is RigidTransform:
+        return RigidTransform(array(value))
+    if dc.is_dataclass(kind) and isinstance(kind, type):
+        if not isinstance(value, dict):
+            raise TypeError("expected its fields by name")
+        hints = typing.get_type_hints(kind)
+        return kind(**{f.name: _decode(value[f.name], hints[f.name]) for f in dc.fields(kind) if f.name in value})
+    if kind in (int, str, bool):
+        if not isinstance(value, kind):
+            raise TypeError(f"expected {kind.__name__}")
+        return value
+    raise TypeError(f"no rule for {kind}")
+
+
+def array(value: Any) -> np.ndarray:
+    """The array that `encode` wrote; read-only."""
+    if isinstance(value, list):
+        found = np.array([_NOT_FINITE[x] if isinstance(x, str) else x for x in value], dtype=np.float64)
+    elif "values" in value:
+        found = array(value["values"]).reshape(value["shape"])
+    else:
+        found = np.frombuffer(base64.b64decode(value["base64"]), dtype=np.dtype(value["dtype"])).reshape(value["shape"])
+    found.flags.writeable = False
+    return found
+
+
+def first_difference(was: Any, now: Any, path: str = "") -> tuple[str, Any, Any] | None:
+    """Where two encoded values differ first: the path of the field and both values; None where they are the same."""
+    if isinstance(was, dict) and isinstance(now, dict):
+        for key in [*was, *(k for k in now if k not in was)]:
+            found = first_difference(was.get(key), now.get(key), f"{path}.{key}" if path else key)
+            if found is not None:
+                return found
+        return None
+    if isinstance(was, list) and isinstance(now, list) and len(was) == len(now):
+        for k, (a, b) in enumerate(zip(was, now, strict=True)):
+            found = first_difference(a, b, f"{path}[{k}]")
+            if found is not None:
+                return found
+        return None
+    if was == now and type(was) is type(now):
+        return None
+    field = path.rpartition(".")[2]
+    if field in ("base64", "sha256"):
+        return path.removesuffix(field).rstrip("."), "an array", "an array of other numbers"
+    return path, was, now
