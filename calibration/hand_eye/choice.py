@@ -1,4 +1,4 @@
-"""Solves one hand-eye problem: starts, outlier rejection, candidate weightings, and the choice by held-out errors."""
+"""Solves one hand-eye problem: starts, outlier rejection, and the mean of several weightings of rotations against translations."""
 
 from dataclasses import dataclass, replace
 from itertools import chain, islice
@@ -34,16 +34,19 @@ class Candidate:
 
 CANDIDATES = (
     Candidate("least squares", Loss.SQUARES),
-    Candidate("Student's t", Loss.STUDENT),
-    Candidate("least squares, rotations first", Loss.SQUARES, 4.0),
-    Candidate("Student's t, rotations first", Loss.STUDENT, 4.0),
+    *(Candidate(f"translations / {r:g}", Loss.SQUARES, r) for r in (2.0, 4.0, 8.0, 16.0)),
+    Candidate("rotations alone", Loss.SQUARES, 1e3),
+    Candidate("Student's t, translations / 4", Loss.STUDENT, 4.0),
 )
+"""Weightings of poses whose rotations can be had without their translations: all are averaged, none is chosen (docs/hand_eye.md)."""
+INSEPARABLE = (Candidate("least squares", Loss.SQUARES), Candidate("Student's t", Loss.STUDENT))
+"""Weightings where they cannot: points, normals, three unknowns."""
 _LEVEL = 0.01  # of all paired t tests together (Bonferroni) at which candidates count as different
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen answer, how it was found, and what the candidates reached: name -> (deg, length) rms of the held-out errors.
+    """The answer, how it was found, and what the candidates reached: name -> (deg, length) rms of the held-out errors.
 
     ``covariance`` of the free poses, 6 each in the order X, Y, Z, in the tangent of se3.moved.
     """
@@ -64,12 +67,13 @@ def solve(
     starts: tuple[State, ...] = (),
     max_outliers: float = 0.40,
     candidates: tuple[Candidate, ...] = CANDIDATES,
+    pose_only: bool = False,
 ) -> Choice:
     """Solve one problem; ``known`` holds the poses that are not free. Deterministic for ``seed``.
 
-    The candidate is chosen by held-out errors: the one whose worse column (degrees or length, each relative
-    to the best candidate of that column) is best, so that neither is bought with the other. Raises InconsistentPoses
-    where no rigid poses explain enough observations.
+    Where the rotations can be had without the translations the answer is the mean of all ``candidates`` on SE(3), each with the
+    same weight. Where they cannot, it is the mean of those of INSEPARABLE whose held-out errors a paired test cannot tell
+    apart. ``pose_only``: without covariance and scores, where only the poses are wanted. Raises InconsistentPoses where no rigid poses explain enough observations.
     """
     state, name = _start(problem, known, seed, starts)
     w, d = residuals(problem, state)
@@ -103,7 +107,7 @@ def solve(
     fits: dict[str, Fit] = {}
     # only full poses hold the rotation of X without their translations; three unknowns need what both know
     separable = bool(problem.full.all()) and not all(problem.free)
-    tried = [c for c in candidates if separable or c.ratio == 1.0] or list(candidates)
+    tried = INSEPARABLE if candidates is CANDIDATES and not separable else candidates
     for c in tried:
         near = next((f for f in reversed(fits.values()) if f.loss is c.loss), next(iter(fits.values()), base))
         noise = replace(near.noise, ratio=c.ratio)
@@ -117,21 +121,27 @@ def solve(
             keep=keep,
             hold_centre=bool(fits),
             begin=near.lin if np.array_equal(near.keep, keep) else None,
+            leave_one_out=not (pose_only and separable),
         )
     squares = _held_out(fits)
-    agreed = _alike(fits, squares)
+    agreed = list(fits) if separable else _alike(fits, squares)
     best = fits[agreed[0]]
-    state, covariance = best.state, best.scaled.covariance()
+    state, covariance = (
+        best.state,
+        best.scaled.V[: problem.size, : problem.size] if pose_only else best.scaled.covariance(),
+    )
     if len(agreed) > 1:
         chosen = [fits[k] for k in agreed]
         parts = [mean_of([f.state[k] for f in chosen]) if problem.free[k] else known[k] for k in range(3)]
         state = parts[0], parts[0] if problem.tied else parts[1], parts[2]
+        if pose_only:
+            return Choice(state, covariance, best, _said(agreed), name, {})
         covariance = (
             sum((f.scaled.cross_covariance(o.scaled) for f in chosen for o in chosen), np.zeros_like(covariance))
             / len(chosen) ** 2
         )
     scores = {k: _rms(s) for k, s in squares.items()}
-    return Choice(state, 0.5 * (covariance + covariance.T), best, " + ".join(agreed), name, scores)
+    return Choice(state, 0.5 * (covariance + covariance.T), best, _said(agreed), name, scores)
 
 
 def _gate(problem: Problem, w: Array, d: Array) -> Flags:
@@ -225,6 +235,10 @@ def _held_out(fits: dict[str, Fit]) -> dict[str, Array]:
         d = d + np.where(f.scaled.full[:, None], (exp_rotation(w) - np.eye(3)) @ (centre - f.centre), 0.0)
         out[k] = np.column_stack([(w**2).sum(axis=1), (d**2).sum(axis=1)])
     return out
+
+
+def _said(names: list[str]) -> str:
+    return " + ".join(names) if len(names) < 3 else f"mean of {len(names)} weightings"
 
 
 def _rms(squares: Array) -> tuple[float, float]:

@@ -292,6 +292,7 @@ def _held_out(problem: Problem, known: State, config: HandEyeConfig, starts: tup
                 starts=starts,
                 max_outliers=config.max_outliers,
                 candidates=config.candidates,
+                pose_only=True,
             )
         except WeldcalError:
             continue

@@ -79,6 +79,18 @@ def hand_eye(
     return Outcome(result.summary(), text=write_table(result, folder))
 
 
+@command("benchmark hand-eye-cells")
+def hand_eye_cells(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40,
+) -> Outcome:
+    """Compare held-out errors with OpenCV's best on simulated cells with a wrong camera matrix, a wrong robot, or both."""
+    from weldcal.tools.studies.hand_eye.cells_against_opencv import run_cells
+
+    summary, table = run_cells(runs, call.seed, call.progress)
+    return Outcome(summary, text=table)
+
+
 @command("benchmark mountings")
 def mountings(
     call: Call,
@@ -236,6 +248,7 @@ COMMANDS = (
     seam_planning,
     part_welds,
     hand_eye,
+    hand_eye_cells,
     mountings,
     profiler,
     cell,

@@ -28,7 +28,14 @@ BARS = {
     "multi_camera_workcell_camera2": (0.1480, 1.721),
     "ros_industrial_charuco_static_camera": (1.4332, 12.365),
     "ros_industrial_circle_grid_camera_on_wrist": (2.9820, 20.914),
+    "RWHE_Calib_kuka_1": (0.0580, 1.894),
+    "visp_franka_eye_in_hand": (0.6432, 5.623),
 }
+MARGIN = 1.02
+FEW, FEW_MARGIN = (
+    16,
+    1.05,
+)  # the best of seven methods, picked afterwards, is lucky by so much with five folds of few poses
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +44,13 @@ def report() -> HandEyeBenchmark:
     return run_hand_eye_benchmark(DATA, quick=True)
 
 
-def test_every_set_is_as_good_as_the_best_opencv_method_of_each_column(report: HandEyeBenchmark) -> None:
+def test_no_opencv_method_is_ahead_on_any_set(report: HandEyeBenchmark) -> None:
     rows = {r.name: r for r in report.rows}
-    for name, bar in BARS.items():
-        assert rows[name].meets(*bar), f"{name}: {rows[name].deg} deg, {rows[name].mm} mm against {bar}"
+    for name, (deg, mm) in BARS.items():
+        row = rows[name]
+        margin = MARGIN if row.n > FEW else FEW_MARGIN
+        assert row.deg <= margin * deg, f"{name}: {row.deg} deg against {deg}"
+        assert row.mm <= margin * mm, f"{name}: {row.mm} mm against {mm}"
 
 
 def test_opencv_reaches_the_published_bar_on_the_same_folds() -> None:
