@@ -122,7 +122,9 @@ def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
     """
     folder = Path(folder)
     if folder.is_file() and find_bag(folder) is None:
-        raise DatasetError(f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml.")
+        raise DatasetError(
+            f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml. Pairs of robot and camera poses go to 'weldcal hand-eye ax-yb'."
+        )
     if not folder.exists():
         raise DatasetError(
             f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."

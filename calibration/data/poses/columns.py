@@ -5,6 +5,7 @@ import re
 import numpy as np
 
 from weldcal.calibration.data.header import PoseForm
+from weldcal.calibration.data.poses.form import poses_from_array
 from weldcal.calibration.data.poses.rotations import notation, rotations, width
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import pose
@@ -63,8 +64,6 @@ def column_poses(names: list[str], table: Array, form: PoseForm, where: str) -> 
     }
     if len(grid) in (12, 16) and "qw" not in plain:
         chosen = table[:, [grid[key] for key in sorted(grid)]]
-        from weldcal.calibration.data.poses.form import poses_from_array
-
         return *poses_from_array(chosen, form, where), units.get("x", "")
     if not {"x", "y", "z"} <= set(plain):
         raise DatasetError(

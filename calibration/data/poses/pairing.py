@@ -60,10 +60,9 @@ def pair(ids: Sequence[str], n: int, clouds: Sequence[Path], source: str) -> tup
         of = [number_of(p.stem) for p in clouds]
         if None not in numbers and None not in of and len(set(numbers)) == n and len(set(of)) == len(of):
             by_number = dict(zip(of, clouds, strict=True))
-            if set(numbers) & set(of):
+            same = set(numbers) == set(of)
+            if same or (len(clouds) != n and set(numbers) & set(of)):
                 _no_orphans([p.name for k, p in by_number.items() if k not in numbers], source)
-                if set(numbers) - set(of) and len(clouds) == n:
-                    raise _apart(ids, clouds, source)
                 return list(ids), [by_number.get(k) for k in numbers], "paired by the numbers in their names"
         raise _apart(ids, clouds, source)
     if len(clouds) != n:

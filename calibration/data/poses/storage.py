@@ -40,6 +40,15 @@ def read_tree(path: Path) -> Any:
         raise DatasetError(str(e)) from e
 
 
+def is_storage(path: Path) -> bool:
+    """Whether a file is OpenCV FileStorage (YAML with its directive, XML, or JSON with its matrices)."""
+    try:
+        text = read_text(path, LARGEST_DOCUMENT)
+    except InputError:
+        return False
+    return text.startswith("%YAML:") or "opencv-matrix" in text[:20_000] or "<opencv_storage>" in text[:1000]
+
+
 def read_storage(path: Path, form: PoseForm) -> PoseList:
     """The poses of such a file: one matrix, several nodes (in the natural order of their names), or a list of poses.
 
