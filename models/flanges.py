@@ -9,6 +9,7 @@ the bore depths and the hole angles of the six-hole sizes are not confirmed: mea
 """
 
 import math
+import re
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,12 @@ from weldcal.models.errors import InputError
 from weldcal.models.mesh import TriMesh, circle, merge, plane_mesh, revolve, triangulate_polygon, wall
 
 Floats = npt.NDArray[np.float64]
+
+_DASH = r"[\s\-_/\u2010-\u2015]*"
+_CATALOGUE = re.compile(
+    rf"(?:(?:(?:din|en|iso|tool|flange){_DASH})*9409{_DASH}1{_DASH}(?::{_DASH}\d{{4}})?{_DASH})?(?:a{_DASH})?"
+    rf"(31[.,]5|\d{{2,3}})[\s\-_/\u2010-\u2015]+(\d{{1,2}}){_DASH}(?:x{_DASH})?m(\d{{1,2}})"
+)
 
 PAPER_RADIUS_M = 0.031
 """Radius that the flange calibration paper searches for, though ISO 9409-1-50 is 63 mm across: the edge carries a 1 mm
@@ -144,11 +151,18 @@ STANDARDS: dict[str, FlangeStandard] = {
 
 
 def get_flange(name: str, *, pin_angle_rad: float | None = None) -> FlangeStandard:
-    """The flange of that designation; `pin_angle_rad` moves the dowel (90 deg on most arms, 180 deg on Franka).
+    """The flange of that designation, also as catalogues write it ("ISO 9409-1 - 50 - 4 - M6", "50-4-M6").
+
+    `pin_angle_rad` moves the dowel (90 deg on most arms, 180 deg on Franka).
 
     Raises InputError naming the known ones.
     """
-    flange = STANDARDS.get(name.strip().lower().replace(" ", "-").replace(",", "."))
+    plain = name.strip().lower()
+    iso = _CATALOGUE.fullmatch(plain)
+    plain = (
+        f"iso9409-1-{iso[1].replace(',', '.')}-{iso[2]}-m{iso[3]}" if iso else plain.replace(" ", "-").replace(",", ".")
+    )
+    flange = STANDARDS.get(plain)
     if flange is None:
         if not name:
             raise InputError(

@@ -9,6 +9,7 @@ from pydrake.math import RotationMatrix
 
 from weldcal.calibration.data.clouds import CloudError, read_cloud
 from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.poses.names import mounting_name
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
@@ -18,6 +19,7 @@ from weldcal.models.files import read_text, sha256
 from weldcal.models.limits import LARGEST_DOCUMENT, LARGEST_NUMBER
 
 UNITS = {"m": 1.0, "mm": 1e-3}
+AUTO = "auto"
 CONFIGURATIONS = ("eye_on_base", "eye_in_hand")
 IN_HAND = "eye_in_hand"
 MODES = ("static", "motion")
@@ -46,19 +48,24 @@ def read_header(path: Path) -> DatasetHeader:
     if header.schema != 1:
         raise DatasetError(f"'{path.name}' says schema {header.schema}; this software reads schema 1.")
     for name, unit in (("clouds", header.units.clouds), ("poses", header.units.poses)):
-        if unit not in UNITS:
+        if unit not in (*UNITS, AUTO):
             raise DatasetError(f"'{path.name}' gives the unit '{unit}' for {name}; write m or mm.")
     if header.mode not in MODES:
         raise DatasetError(f"'{path.name}' gives the mode '{header.mode}'; write {' or '.join(MODES)}.")
+    header.configuration = mounting_name(header.configuration)
     if header.configuration not in CONFIGURATIONS:
+        command = "axb-ycz" if header.configuration == "co_manipulation" else "ax-yb"
+        known = header.configuration.startswith(("eye_on_arm", "co_manipulation"))
+        there = f"; 'weldcal hand-eye {command} PAIRS' calibrates that mounting from pairs of poses" if known else ""
         raise DatasetError(
             f"'{path.name}' asks for the configuration '{header.configuration}'; calibrate handles "
-            f"{', '.join(CONFIGURATIONS)}."
+            f"{', '.join(CONFIGURATIONS)}{there}."
         )
     if header.configuration == IN_HAND and header.mode != "motion":
         raise DatasetError(
-            f"'{path.name}' asks for the configuration '{IN_HAND}', which calibrate handles in motion (mode: motion); at rest use "
-            "weldcal hand-eye."
+            f"'{path.name}' asks for the configuration '{IN_HAND}' (the scanner on the arm), which calibrate handles in motion (mode: "
+            f"motion); at rest use weldcal hand-eye: 'weldcal hand-eye ax-yb PAIRS --mounting {IN_HAND}' takes pairs of robot and camera "
+            "poses, and 'weldcal hand-eye live eye_in_hand' scans the foot of the robot."
         )
     _check_poses(header, path)
     return header
@@ -67,13 +74,21 @@ def read_header(path: Path) -> DatasetHeader:
 def metric_cloud(path: Path, unit: str) -> Array:
     """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
     points = read_cloud(path)
-    points *= UNITS[unit]
+    return to_metres(points, unit, path.name)
+
+
+def to_metres(points: Array, unit: str, name: str) -> Array:
+    """The points, in place, in metres; the unit is m, mm or auto (by their distance). Raises CloudError."""
     seen = points[np.isfinite(points[..., 2])]
     distance = float(np.median(np.linalg.norm(seen[:: 1 + len(seen) // _SAMPLE], axis=1)))
+    if unit == AUTO:
+        unit = "mm" if distance > REACH_M[1] else "m"
+    points *= UNITS[unit]
+    distance *= UNITS[unit]
     if not REACH_M[0] <= distance <= REACH_M[1]:
         other = "mm" if unit == "m" else "m"
         raise CloudError(
-            f"The points of {path.name} lie {distance:.3g} m from the camera, as {unit}: they look like {other}; correct "
+            f"The points of {name} lie {distance:.3g} m from the camera, as {unit}: they look like {other}; correct "
             "units in dataset.yaml."
         )
     return points

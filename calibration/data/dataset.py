@@ -1,8 +1,9 @@
 """Reads, checks and writes a calibration dataset folder: poses, clouds and pairs."""
 
 import csv
+import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -11,6 +12,8 @@ from pydrake.common.yaml import yaml_dump
 from pydrake.math import RigidTransform, RotationMatrix
 
 from weldcal.calibration.data.checks import (
+    AUTO,
+    REACH_M,
     UNITS,
     check_reach,
     digest,
@@ -18,10 +21,16 @@ from weldcal.calibration.data.checks import (
     read_header,
     row_numbers,
     table_rows,
+    to_metres,
     unit_quaternion,
 )
 from weldcal.calibration.data.clouds import NO_NOTES, CloudError, find_cloud, save_cloud
-from weldcal.calibration.data.header import DatasetHeader
+from weldcal.calibration.data.header import DatasetHeader, PoseForm, Units
+from weldcal.calibration.data.poses.bag import ENDINGS as RECORDINGS
+from weldcal.calibration.data.poses.bag import find_bag, read_bag
+from weldcal.calibration.data.poses.form import PoseList
+from weldcal.calibration.data.poses.pairing import find_clouds, pair
+from weldcal.calibration.data.poses.source import files_of_poses, find_poses, is_plain, metric_poses, read_poses
 from weldcal.calibration.errors import DatasetError
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -41,7 +50,8 @@ class Pair:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A dataset, checked. ``poses`` maps id to X_BF; ``clouds`` maps id to file; ``refused`` lists (id, reason)."""
+    """A dataset, checked. ``poses`` maps id to X_BF; ``clouds`` maps id to file; ``refused`` lists (id, reason).
+    ``recorded`` holds the clouds, in metres, that stand in no file of their own; ``notes`` say what was recognised."""
 
     folder: Path
     header: DatasetHeader
@@ -50,6 +60,8 @@ class Dataset:
     pairs: tuple[Pair, ...]
     refused: tuple[tuple[str, str], ...]
     hashes: dict[str, str]
+    recorded: Mapping[str, Array] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def between(self, ids: str) -> Self:
         """The dataset without the scans before or after those named "FROM:TO" (ids; either may be left out), in its order.
@@ -91,11 +103,16 @@ class Dataset:
 
     def cloud(self, id: str) -> Array:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""
+        if id in self.recorded:
+            return to_metres(self.recorded[id].astype(float), self.header.units.clouds, id)
         return metric_cloud(self.clouds[id], self.header.units.clouds)
 
 
-def load_dataset(folder: Path) -> Dataset:
-    """Read and check a dataset folder (dataset.yaml, and poses.csv with clouds/, or pairs.csv).
+def load_dataset(folder: Path, *, robot: str = "") -> Dataset:
+    """Read and check a dataset: dataset.yaml with poses.csv and clouds/, or pairs.csv; or the poses in any form of docs/datasets.md.
+
+    Without dataset.yaml the scanner is taken as fixed beside the robot, and the units follow from the size of the numbers.
+    ``robot`` gives the kinematics of a recording that holds joint angles.
 
     Raises DatasetError, one sentence, for what makes the whole folder unusable: a missing or wrong file, an unknown
     unit or configuration, a cell that is not a number, a quaternion that is not a unit one, an id given twice, poses
@@ -104,49 +121,137 @@ def load_dataset(folder: Path) -> Dataset:
     that repeats another one to the last digit is refused by name.
     """
     folder = Path(folder)
-    if folder.is_file():
-        raise DatasetError(f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml.")
-    if not folder.is_dir():
+    if folder.is_file() and find_bag(folder) is None:
+        raise DatasetError(
+            f"'{folder.name}' is a file; give the folder that holds it and dataset.yaml. Pairs of robot and camera poses go to 'weldcal hand-eye ax-yb'."
+        )
+    if not folder.exists():
         raise DatasetError(
             f"The dataset folder '{folder}' does not exist; give the path of a folder that holds dataset.yaml."
         )
-    header = read_header(folder / "dataset.yaml")
+    description = folder / "dataset.yaml"
+    bare = folder.is_file() or not description.exists()
+    source = None if folder.is_file() else find_poses(folder)
+    bag = find_bag(folder) if source is None else None
+    if bare and (source is not None or bag is not None) and not (folder / "pairs.csv").exists():
+        header = DatasetHeader(schema=1, configuration="eye_on_base", units=Units(AUTO, AUTO), poses=PoseForm())
+    else:
+        header = read_header(description)
     if header.mode == "motion":
         raise DatasetError(
             f"'{folder.name}' is a recording in motion (mode: motion); 'weldcal calibrate' and 'weldcal monitor' read it. "
             "This command needs scans at rest, with poses.csv."
         )
-    hashes = {"dataset.yaml": digest(folder / "dataset.yaml")}
-    scale = UNITS[header.units.poses]
-    if (folder / "poses.csv").is_file():
-        hashes["poses.csv"] = digest(folder / "poses.csv")
-        poses = _poses(folder / "poses.csv", scale)
-        clouds, refused = _match(folder / "clouds", poses)
-        content, unreadable = _contents(clouds)
-        clouds = {id: cloud for id, cloud in clouds.items() if id in content}
-        refused += unreadable
-        again = _repeated({id: (content[id], *poses[id].GetAsMatrix34().ravel()) for id in clouds})
-        clouds = {id: cloud for id, cloud in clouds.items() if id not in dict(again)}
-        if not clouds:
-            raise DatasetError(
-                f"No pose in '{folder.name}/poses.csv' has a cloud in clouds/; name the files after the ids, for "
-                f"example {next(iter(poses), 'pose01')}.pcd."
-            )
-        hashes.update({f"clouds/{path.name}": content[id] for id, path in clouds.items()})
-        return Dataset(folder, header, poses, clouds, (), refused + again, hashes)
-    if (folder / "pairs.csv").is_file():
+    hashes = {} if bare else {"dataset.yaml": digest(description)}
+    if header.poses is not None and header.poses.file:
+        source = _stated(folder, header.poses.file)
+        bag = None if source is not None else find_bag(folder / header.poses.file)
+    table = folder / "poses.csv"
+    if source == table and header.poses is None and is_plain(table):
+        return _plain(folder, header, hashes)
+    if source is None and (folder / "pairs.csv").is_file():
         hashes["pairs.csv"] = digest(folder / "pairs.csv")
-        pairs = _pairs(folder / "pairs.csv", scale, UNITS[header.units.clouds])
+        scales = (UNITS.get(header.units.poses, 1.0), UNITS.get(header.units.clouds, 1.0))
+        pairs = _pairs(folder / "pairs.csv", *scales)
         again = _repeated({p.id: (*p.X_BR.GetAsMatrix34().ravel(), *p.p_CR) for p in pairs})
         pairs = tuple(p for p in pairs if p.id not in dict(again))
         return Dataset(folder, header, {}, {}, pairs, again, hashes)
+    if source is not None:
+        return _recognised(folder, header, source, hashes)
+    if bag is not None:
+        return _recording(folder, header, bag, hashes, robot)
     if (folder / "stream.csv").is_file():
         raise DatasetError(
             f"'{folder.name}' holds stream.csv and no poses.csv; for a recording in motion add 'mode: motion' to dataset.yaml."
         )
     raise DatasetError(
-        f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz."
+        f"'{folder.name}' holds neither poses.csv nor pairs.csv; add poses.csv with the columns id,x,y,z,qw,qx,qy,qz, or poses in another "
+        "form of docs/datasets.md."
     )
+
+
+def _stated(folder: Path, name: str) -> Path | tuple[Path, ...] | None:
+    """The source of poses that dataset.yaml names; None where it is a ROS recording."""
+    path = folder / name
+    if not path.exists():
+        raise DatasetError(
+            f"dataset.yaml names the poses '{name[:60]}', and '{folder.name}' has no such file or folder."
+        )
+    if path.is_dir():
+        return files_of_poses(path) or None
+    return None if path.suffix.lower() in RECORDINGS else path
+
+
+def _plain(folder: Path, header: DatasetHeader, hashes: dict[str, str]) -> Dataset:
+    """A dataset in this package's own form: poses.csv with quaternions, and clouds/."""
+    hashes["poses.csv"] = digest(folder / "poses.csv")
+    poses = _poses(folder / "poses.csv", header.units.poses)
+    clouds, refused = _match(folder / "clouds", poses)
+    return _finished(folder, header, poses, clouds, refused, hashes, ())
+
+
+def _recognised(
+    folder: Path, header: DatasetHeader, source: Path | tuple[Path, ...], hashes: dict[str, str]
+) -> Dataset:
+    """A dataset whose poses are in another form."""
+    form = header.poses or PoseForm()
+    found = read_poses(source, form)
+    X, unit = metric_poses(found, header.units.poses, form)
+    ids, files, how = pair(found.ids, len(X), find_clouds(folder, source), found.source)
+    check_reach(X[:, :3, 3], Path(found.source), unit)
+    poses = {id: _rigid(pose) for id, pose in zip(ids, X, strict=True)}
+    for path in source if isinstance(source, tuple) else (source,):
+        hashes[path.relative_to(folder).as_posix()] = digest(path)
+    clouds = {id: path for id, path in zip(ids, files, strict=True) if path is not None}
+    refused = tuple((id, "There is no cloud for this pose.") for id in ids if id not in clouds)
+    note = f"{found.source}: {len(X)} poses, {found.read_as}, in {unit}; clouds {how}."
+    return _finished(folder, header, poses, clouds, refused, hashes, (note,))
+
+
+def _recording(folder: Path, header: DatasetHeader, bag: Path, hashes: dict[str, str], robot: str) -> Dataset:
+    """A dataset from a ROS recording; its clouds stay in memory."""
+    form = header.poses or PoseForm()
+    found = read_bag(bag, form, robot or header.robot)
+    listed = PoseList(bag.name, found.X, found.ids, found.times, "m", "a ROS recording")
+    X, unit = metric_poses(listed, "m" if header.units.poses == AUTO else header.units.poses, form)
+    check_reach(X[:, :3, 3], bag, unit)
+    recorded = dict(zip(found.ids, found.clouds, strict=True))
+    for path in sorted(p for p in (bag.iterdir() if bag.is_dir() else (bag,)) if p.is_file()):
+        hashes[path.name] = digest(path)
+    for id, points in recorded.items():
+        hashes[f"clouds/{id}"] = hashlib.sha256(np.ascontiguousarray(points).tobytes()).hexdigest()
+    note = f"{bag.name}: {len(X)} scans at rest, {found.read_as}."
+    poses = {id: _rigid(pose) for id, pose in zip(found.ids, X, strict=True)}
+    clouds = {id: bag / id for id in found.ids}
+    return Dataset(folder, header, poses, clouds, (), found.refused, hashes, recorded, (note,))
+
+
+def _finished(
+    folder: Path,
+    header: DatasetHeader,
+    poses: dict[str, RigidTransform],
+    clouds: dict[str, Path],
+    refused: tuple[tuple[str, str], ...],
+    hashes: dict[str, str],
+    notes: tuple[str, ...],
+) -> Dataset:
+    """The dataset without unreadable clouds and scans that repeat another one."""
+    content, unreadable = _contents(clouds)
+    clouds = {id: cloud for id, cloud in clouds.items() if id in content}
+    refused += unreadable
+    again = _repeated({id: (content[id], *poses[id].GetAsMatrix34().ravel()) for id in clouds})
+    clouds = {id: cloud for id, cloud in clouds.items() if id not in dict(again)}
+    if not clouds:
+        raise DatasetError(
+            f"No pose in '{folder.name}/poses.csv' has a cloud in clouds/; name the files after the ids, for "
+            f"example {next(iter(poses), 'pose01')}.pcd."
+        )
+    hashes.update({f"clouds/{path.name}": content[id] for id, path in clouds.items()})
+    return Dataset(folder, header, poses, clouds, (), refused + again, hashes, notes=notes)
+
+
+def _rigid(X: Array) -> RigidTransform:
+    return RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3])
 
 
 def save_dataset(
@@ -183,14 +288,15 @@ def _wxyz(X: RigidTransform) -> list[float]:
     return [float(v) for v in (q.w(), q.x(), q.y(), q.z())]
 
 
-def _poses(path: Path, scale: float) -> dict[str, RigidTransform]:
+def _poses(path: Path, unit: str) -> dict[str, RigidTransform]:
     columns = ("x", "y", "z", "qw", "qx", "qy", "qz")
-    poses = {}
-    for row in table_rows(path, ("id", *columns)):
-        v = row_numbers(row, columns, path)
-        poses[row["id"]] = RigidTransform(unit_quaternion(v[3:], row["id"]), scale * np.array(v[:3]))
-    check_reach(np.array([X.translation() for X in poses.values()]), path, "m" if scale == 1.0 else "mm")
-    return poses
+    rows = {row["id"]: row_numbers(row, columns, path) for row in table_rows(path, ("id", *columns))}
+    p = np.array([v[:3] for v in rows.values()])
+    if unit == AUTO:
+        unit = "mm" if float(np.median(np.linalg.norm(p, axis=1))) > REACH_M[1] else "m"
+    scale = UNITS[unit]
+    check_reach(scale * p, path, unit)
+    return {id: RigidTransform(unit_quaternion(v[3:], id), scale * np.array(v[:3])) for id, v in rows.items()}
 
 
 def _pairs(path: Path, scale_base: float, scale_camera: float) -> tuple[Pair, ...]:

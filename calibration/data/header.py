@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class Units:
-    """Length units of the files: ``m`` or ``mm``. Flange poses and clouds must then lie 10 mm to 10 m away (median)."""
+    """Length units of the files: ``m``, ``mm`` or ``auto`` (by their size). Flange poses and clouds must then lie 10 mm to 10 m away (median)."""
 
     clouds: str = "m"
     poses: str = "m"
@@ -32,6 +32,24 @@ class ScannerGuess:
 
 
 @dataclass
+class PoseForm:
+    """How the poses are written, where it is not x,y,z,qw,qx,qy,qz: ``file`` (a file or folder beside dataset.yaml), ``rotation`` (a
+    notation by name), ``angles`` (rad or deg), ``frame`` (flange_in_base, or base_in_flange for the inverse), ``tcp`` (the
+    controller's TCP x,y,z,rx,ry,rz in m and rad where the poses are the TCP's), and of a ROS recording the names of the frames and
+    topics."""
+
+    file: str = ""
+    rotation: str = ""
+    angles: str = ""
+    frame: str = "flange_in_base"
+    tcp: list[float] = field(default_factory=list)
+    base_frame: str = ""
+    flange_frame: str = ""
+    topic: str = ""
+    cloud_topic: str = ""
+
+
+@dataclass
 class DatasetHeader:
     """Contents of dataset.yaml. ``mode``: static (a scan at each pose) or motion (scans while the arm moves)."""
 
@@ -45,3 +63,4 @@ class DatasetHeader:
     feature_in_flange: Feature = field(default_factory=Feature)
     scanner_guess: ScannerGuess | None = None
     mode: str = "static"
+    poses: PoseForm | None = None

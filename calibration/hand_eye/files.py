@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from weldcal.calibration.data.poses.names import mounting_name
+from weldcal.calibration.data.poses.storage import is_storage
+from weldcal.calibration.data.poses.two_lists import pairs_of_document, pairs_of_folder, pairs_of_tree
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
@@ -79,8 +82,9 @@ def read_pairs(path: Path, *, mounting: str | None = None, length: str | None = 
     cm; m where not said). Raises DatasetError with one sentence, InputError for poses that are no poses.
     """
     path = Path(path)
-    if path.is_dir():
+    if path.is_dir() and (path / "pairs.npz").exists():
         path = path / "pairs.npz"
+    mounting = None if mounting is None else mounting_name(mounting)
     if length is not None and length not in LENGTHS:
         raise DatasetError(f"There is no unit '{length}'; use {', '.join(LENGTHS)}.")
     try:
@@ -98,11 +102,18 @@ def _named(path: Path, sentence: str) -> str:
 
 
 def _read(path: Path, mounting: str | None, length: str | None) -> PosePairs:
+    if path.is_dir():
+        return _finished(path, pairs_of_folder(path), mounting, length)
     file_size(path)
     ending = path.suffix.lower()
     if ending == ".npz":
         raw = _npz(path)
-    elif ending in (".npy", ".mat", ".pkl", ".bag", ".db3"):
+    elif ending in (".bag", ".db3", ".mcap"):
+        raise DatasetError(
+            f"'{path.name}' is a ROS recording: write the robot's and the camera's poses as robot.csv and camera.csv into a folder "
+            "(rostopic echo -p, or ros2 topic echo --csv) and give that folder."
+        )
+    elif ending in (".npy", ".mat", ".pkl"):
         raise DatasetError(f"'{path.name}' cannot be read: give npz, CSV, JSON, or samples of easy_handeye2 or MoveIt.")
     elif ending in (".csv", ".txt"):
         raw = _csv(path)
@@ -113,8 +124,7 @@ def _read(path: Path, mounting: str | None, length: str | None) -> PosePairs:
 
 def _finished(path: Path, raw: dict[str, Any], mounting: str | None, length: str | None) -> PosePairs:
     said = _said(path, raw, "mode")
-    if said in ("eye_to_hand", "eye_on_hand"):  # other tools' words
-        said = {"eye_to_hand": "eye_on_base", "eye_on_hand": "eye_in_hand"}[said]
+    said = mounting_name(said) if said else said  # other tools' words
     if said and mounting and said != mounting:
         raise DatasetError(
             f"'{path.name}' states the mounting {said}, and the command states {mounting}; correct one of them."
@@ -211,6 +221,9 @@ def _npz(path: Path) -> dict[str, Any]:
             f"'{path.name}' holds two streams of poses, not pairs: bring them to one clock and write pairs, A and B (n, 4, 4)."
         )
     if out["robot"] is None or out["camera"] is None:
+        two = pairs_of_tree({k: v.astype(float) for k, v in raw.items() if v.dtype.kind in "fiu"}, path.name)
+        if two is not None:
+            return out | two
         raise DatasetError(
             f"'{path.name}' has no arrays A and B (n, 4, 4): A = pose of the flange in the base, B = of the target in the camera."
         )
@@ -290,6 +303,14 @@ def _from_quaternions(path: Path, q: Array) -> Array:
 
 
 def _document(path: Path) -> dict[str, Any]:
+    if path.suffix.lower() == ".xml" or is_storage(path):
+        two = pairs_of_document(path)
+        if two is None:
+            raise DatasetError(
+                f"'{path.name}' holds no two lists of poses: name its nodes R_gripper2base, t_gripper2base, R_target2cam and t_target2cam, or "
+                "A and B."
+            )
+        return two
     document = read_document(path)
     out: dict[str, Any] = {}
     samples: Any = document
@@ -304,6 +325,9 @@ def _document(path: Path) -> dict[str, Any]:
             return out | {"robot": document["A"], "camera": document["B"]} | more
         samples = document.get("samples", document.get("poses"))
     if not isinstance(samples, list) or not samples:
+        two = pairs_of_document(path)
+        if two is not None:
+            return out | two
         raise DatasetError(f"'{path.name}' holds no list of samples.")
     first = samples[0]
     if isinstance(first, list) and len(first) == 2:  # MoveIt's own test data: pairs without names

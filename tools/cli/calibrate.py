@@ -18,7 +18,9 @@ def calibrate(
     call: Call,
     dataset: Annotated[
         Path | None,
-        typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/; in motion stream.csv, frames.csv."),
+        typer.Argument(
+            help="A folder with poses and clouds (docs/datasets.md), a ROS recording; in motion stream.csv."
+        ),
     ] = None,
     scenario: Annotated[str | None, option("--scenario", "NAME", "Calibrate live in this scenario instead.")] = None,
     robot: Annotated[
@@ -48,7 +50,7 @@ def calibrate(
     ] = None,
 ) -> Outcome:
     """Calibrate a scanner from a folder of flange scans and robot poses, or live in a scenario."""
-    from weldcal.tools.outcomes.poses import pose_rows
+    from weldcal.tools.outcomes.poses import job_rows, pose_rows, work_rows
 
     if dataset is not None and scenario is None:
         from weldcal.calibration.data.motion_dataset import is_motion
@@ -84,7 +86,8 @@ def calibrate(
         interval = report.held_out_interval_mm
         if interval is not None:
             rows["mean error of as many new scans"] = f"{interval[0]:.3f} to {interval[1]:.3f} mm (95 %)"
-        return Outcome(report.summary(), rows=rows | pose_rows(report.result.X_BC))
+        summary = report.summary()
+        return Outcome(summary, rows=rows | pose_rows(report.result.X_BC) | work_rows(summary["work_point"]))
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
     if poses is not None:
@@ -92,5 +95,4 @@ def calibrate(
     from weldcal.tools.commands.procedures import calibrate_live
 
     found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)
-    X_BC = found.get("X_BC")
-    return Outcome(found, rows=pose_rows(X_BC) if X_BC is not None else {})
+    return Outcome(found, rows=job_rows(found))

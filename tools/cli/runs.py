@@ -27,12 +27,14 @@ PROFILER_SCENARIO = "profiler_seam"
 
 
 @command("demo", options=RECORDED, short_help="Run the complete job in simulation and write a report.")
-def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = DEMO_SCENARIO) -> Mapping[str, object]:
+def demo(call: Call, name: ScenarioArgument = None, scenario: ScenarioOption = DEMO_SCENARIO) -> Outcome:
     """Run the complete job: calibrate, verify, scan the workpiece, plan, weld, retract. A report is written at the end."""
     from weldcal.tools.commands.procedures import run_procedure
+    from weldcal.tools.outcomes.poses import job_rows
 
     options = run_options(call, "demo", _named_once(name, scenario, DEMO_SCENARIO))
-    return run_procedure(options, call.progress).summary()
+    summary = run_procedure(options, call.progress).summary()
+    return Outcome(summary, rows=job_rows(summary))
 
 
 @command("weld", options=RECORDED, short_help="Weld a seam in a scenario, without calibrating.")

@@ -29,12 +29,18 @@ def new(
     dataset: Annotated[
         bool, switch("--dataset", "Write an example of a calibration dataset, scanned in simulation, instead.")
     ] = False,
+    form: Annotated[
+        str,
+        option("--format", "NAME", "With --dataset: ur, matrices, opencv, zivid, ros or mcap; default: weldcal's own."),
+    ] = "",
 ) -> Outcome:
     """Write a commented scenario that runs, cell.yaml, with a schema for editors; or an example of a calibration dataset."""
+    if form and not dataset:
+        raise typer.BadParameter("--format is for --dataset")
     if dataset:
         from weldcal.tools.commands.new import write_example
 
-        written = write_example(folder, call.seed, call.progress)
+        written = write_example(folder, call.seed, call.progress, form)
         following = f"weldcal calibrate {written}"
     else:
         from weldcal.models.tools.loading import WELDING

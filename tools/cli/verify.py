@@ -12,7 +12,7 @@ from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outc
 def verify(
     call: Call,
     result: Annotated[Path, typer.Argument(help="A result folder, or its calibration.yaml.")],
-    dataset: Annotated[Path, typer.Argument(help="A folder with dataset.yaml, poses.csv and clouds/, or pairs.csv.")],
+    dataset: Annotated[Path, typer.Argument(help="A folder with poses and clouds, or pairs.csv (docs/datasets.md).")],
     flange: FlangeOption = None,
     scanner_correction: CorrectionOption = True,
     limit_mm: Annotated[

@@ -61,7 +61,7 @@ def calibrate_dataset(
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
-    data = load_dataset(Path(folder))
+    data = load_dataset(Path(folder), robot=robot or "")
     if poses is not None:
         data = data.between(poses)
     standard = get_flange(flange or data.header.flange)
@@ -155,6 +155,7 @@ def calibrate_dataset(
         Path(out),
         sampling_advice(estimate, corrected),
         seen.patterns,
+        data.notes,
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)

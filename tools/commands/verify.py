@@ -62,7 +62,7 @@ def verify_dataset(
         raise InputError(f"'{out}' is a file. Give a folder for the verification.")
     calibration = load_result(Path(result))
     correction = correction_from_document(calibration.scanner_correction) if correct_scanner else None
-    data = load_dataset(Path(dataset))
+    data = load_dataset(Path(dataset), robot=calibration.robot)
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(
         data,

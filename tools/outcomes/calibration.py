@@ -17,6 +17,7 @@ from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arrays import Array
+from weldcal.tools.outcomes.poses import WorkPoint, work_point_error
 
 
 def error_summary(values: Array) -> dict[str, float]:
@@ -63,7 +64,7 @@ class Algorithm1Outcome:
 @dataclass(frozen=True)
 class CalibrationReport:
     """The result of `weldcal calibrate`: the estimate, the records written, and the folder. ``observations`` include the
-    scanner correction where one was accepted."""
+    scanner correction where one was accepted; ``notes`` say in which form the dataset was read."""
 
     result: CalibrationResult
     estimate: CalibrationEstimate
@@ -79,6 +80,13 @@ class CalibrationReport:
     out: Path
     advice: tuple[str, ...] = ()
     patterns: dict[str, HolePattern] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def work_point(self) -> WorkPoint:
+        """The expected error at the middle of the flange centres that were used."""
+        used = [o.p_BR for o, keep in zip(self.observations, self.estimate.inliers, strict=True) if keep]
+        return work_point_error(self.estimate, np.mean(used, axis=0))
 
     @property
     def held_out_interval_mm(self) -> tuple[float, float] | None:
@@ -107,6 +115,8 @@ class CalibrationReport:
             "k_fold_mm": self.k_fold_mm,
             "axis_turn_deg": None if r.axis_turn_deg is None else list(r.axis_turn_deg),
             "advice": list(self.advice),
+            "notes": list(self.notes),
+            "work_point": self.work_point.document(),
             "features": feature_residuals(self.fits, self.patterns),
             "algorithm1": None
             if a is None

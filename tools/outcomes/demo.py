@@ -13,6 +13,7 @@ from weldcal.systems.runner import Run
 from weldcal.tools.outcomes.calibration import error_summary
 from weldcal.tools.outcomes.monitor import drift_document
 from weldcal.tools.outcomes.options import RunOptions
+from weldcal.tools.outcomes.poses import work_point_error
 from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
 
 
@@ -74,6 +75,7 @@ class DemoResult:
             found["X_BC_error_at_work_mm"] = 1e3 * self.calibration.at_work_m
         if self.status.estimate is not None:
             found["X_BC"] = self.status.estimate.X_BC.GetAsMatrix4().tolist()
+            found["work_point"] = work_point_error(self.status.estimate, work_point(self.run.cell.scenario)).document()
             found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
             found["held_out_mm"] = live_errors(1e3 * self.status.estimate.held_out.position_m)
             found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]

@@ -85,7 +85,9 @@ class HandEyeReport:
                 + "  ".join(f"{v:+.4f}" for v in rpy)
                 + "  deg  +- "
                 + _sigmas(np.degrees(sigma[:3]), 57.3),
+                "  quaternion wxyz " + "  ".join(f"{v:+.7f}" for v in X.rotation().ToQuaternion().wxyz()),
                 f"  UR pose      {export_ur_pose(X).strip()}",
+                *("  4 x 4, m     " + " ".join(f"{v:+.6f}" for v in row) for row in X.GetAsMatrix4()),
             ]
         lines += ["", f"held out     {_held_out(r.held_out, 'all poses, ' if not r.inliers.all() else '')}"]
         if not r.inliers.all():

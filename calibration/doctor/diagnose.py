@@ -1,0 +1,124 @@
+"""Names the causes that the scans give evidence of, the likeliest first.
+
+Every model of a disturbance is fitted to the same scans and compared with the undisturbed one by the difference of the Bayesian
+information criterion (fit.py); the difference must exceed a threshold for each cause, and the disturbance a size that matters. The
+thresholds were fixed on simulated sets (tools/studies/doctor), other ones than those that its false alarms are counted on.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.doctor.models import Explained, explanations
+from weldcal.calibration.doctor.quality import installation, noise_growth, outliers, partial_views, too_alike
+from weldcal.calibration.doctor.readings import best_reading, mixed_units
+
+THRESHOLDS = {
+    "scanner moved": 20.0,
+    "TCP set at the controller": 20.0,
+    "warm-up drift": 20.0,
+    "slack flange or loose mount": 20.0,
+    "wrong kinematics file": 20.0,
+    "outlier scans or partial views": 20.0,
+}
+"""Least difference of the criterion at which each is named; the evidence of a difference of 10 is called very strong (Raftery 1995)."""
+LEAST_EFFECT_M = {
+    "scanner moved": 3e-4,
+    "TCP set at the controller": 2e-3,
+    "warm-up drift": 1.5e-4,
+    "slack flange or loose mount": 3e-4,
+    "wrong kinematics file": 3e-4,
+    "outlier scans or partial views": 1e-3,
+}
+"""Smaller ones are what arms and scanners are off anyway."""
+FEWEST = 5
+_LOOKS_WRONG_M, _LOOKS_WRONG_RAD = 3e-3, 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """A named cause: ``confidence`` 0 to 1 (its weight among the models that were compared), ``score`` (twice the log-likelihood ratio
+    less the cost of its numbers), the ``numbers`` of the evidence, ``words`` of a misreading and the scans ``where`` it shows."""
+
+    name: str
+    confidence: float
+    score: float
+    numbers: dict[str, float]
+    where: tuple[str, ...] = ()
+    words: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """The causes, likeliest first; the number of scans, and the spread (m) of their centres about what explains them best."""
+
+    causes: tuple[Cause, ...]
+    n: int
+    spread_m: float
+
+
+def diagnose(case: Case) -> Diagnosis:
+    """The causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
+    causes: list[Cause] = []
+    if case.fits_flange and case.fits_flange != case.flange:
+        causes.append(Cause("wrong flange size", 0.99, 500.0, {}, (), case.fits_flange))
+    if case.n >= FEWEST and (mixed := mixed_units(case)) is not None:
+        case, factor, where = mixed
+        causes.append(Cause("unit mix", 0.99, 1000.0, {"factor": factor}, where))
+    partial = partial_views(case)
+    if case.n < FEWEST:
+        if partial is not None:
+            causes.append(Cause(partial.cause, 0.9, partial.score, partial.numbers, partial.where))
+        return Diagnosis(tuple(causes), case.n, float("nan"))
+    null = fit(case)
+    wrong = null.rms > _LOOKS_WRONG_M or (
+        np.isfinite(null.tilt).any() and float(np.nanmedian(null.tilt)) > _LOOKS_WRONG_RAD
+    )
+    models = _ranked(case, null)
+    winner = next((m for m in models if _named(m, null)), None)
+    if wrong:
+        reading = best_reading(case, null)
+        rival = winner.bic if winner is not None else null.bic
+        if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
+            causes.append(
+                Cause(reading.cause, 0.99, null.bic - reading.fit.bic, _residuals(null, reading.fit), (), reading.words)
+            )
+            case, null = reading.case, reading.fit
+            models = _ranked(case, null)
+            winner = next((m for m in models if _named(m, null)), None)
+    best = null if winner is None else winner.fit
+    if winner is not None:
+        numbers = winner.numbers | _residuals(null, winner.fit)
+        causes.append(Cause(winner.cause, _weight(winner, models, null), null.bic - winner.bic, numbers, winner.where))
+    named = {c.name for c in causes}
+    alone = winner is None or winner.cause != "scanner moved"
+    findings = [partial, noise_growth(case), too_alike(case), installation(case, best) if alone else None]
+    for found in findings:
+        if found is not None and found.cause not in named:
+            causes.append(
+                Cause(found.cause, float(1.0 - np.exp(-found.score / 20.0)), found.score, found.numbers, found.where)
+            )
+    causes.sort(key=lambda c: -c.score)
+    return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))))
+
+
+def _ranked(case: Case, null: Fit) -> list[Explained]:
+    found = [*explanations(case, null)]
+    single = outliers(case, null)
+    return sorted([*found, *([] if single is None else [single])], key=lambda m: m.bic)
+
+
+def _named(m: Explained, null: Fit) -> bool:
+    return null.bic - m.bic > THRESHOLDS[m.cause] and m.effect_m > LEAST_EFFECT_M[m.cause]
+
+
+def _weight(winner: Explained, models: list[Explained], null: Fit) -> float:
+    """Share of the winner in the weights of all models, exp(-bic / 2)."""
+    lead = [0.5 * (winner.bic - m.bic) for m in models] + [0.5 * (winner.bic - null.bic)]
+    return float(1.0 / np.exp(np.minimum(lead, 0.0)).sum())
+
+
+def _residuals(null: Fit, best: Fit) -> dict[str, float]:
+    return {"without_mm": 1e3 * null.rms, "with_mm": 1e3 * best.rms}

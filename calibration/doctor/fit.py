@@ -1,0 +1,161 @@
+"""Fits a model of the scans, X_BC with the scanner's usual error and what a cause adds, and gives its log-likelihood.
+
+Model: e_k = X_g(k) s(c_k) - b_k + D_k a, with a camera pose for each group g of scans, the scanner's scale and gradients s held to
+their usual size, and columns D_k (3, p) of the cause. Residuals of centres and of normals follow Student's t (6 free), so that a few
+outliers decide nothing. Gauss-Newton, reweighted (Lange, Little and Taylor 1989). Models are compared by the Bayesian
+information criterion (Schwarz 1978) with the factor of Hurvich and Tsai for few residuals.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.geometry.rigid import fit_rigid, fit_rigid_sets
+from weldcal.calibration.geometry.se3 import exp_rotation, skew
+from weldcal.models.arrays import Array
+
+NU = 6.0
+FLOOR_M, FLOOR_RAD = 2e-5, 3e-4  # below any arm and scanner
+_USUAL = np.array([2e-3, 1.5e-2, 1.5e-2, 2e-2])  # what scanners err: scale, and its gradients over x, y and z (1/m)
+_STEPS = 25
+_TRIPLES = 300
+_BEST = 0.6  # share of the scans that the start must explain
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of centres e (n, 3) m and of
+    normals (n,) rad; spreads per axis; log-likelihood; ``size`` the count of free numbers (the scanner's not: they are held)."""
+
+    R: Array
+    p: Array
+    scanner: Array
+    a: Array
+    e: Array
+    tilt: Array
+    sigma_m: float
+    sigma_rad: float
+    loglik: float
+    size: int
+    n: int
+
+    @property
+    def rms(self) -> float:
+        """Of the centres' residuals, m, over the middle half of the scans: a few outliers decide nothing."""
+        return float(np.median(np.linalg.norm(self.e, axis=1)))
+
+    @property
+    def bic(self) -> float:
+        """The criterion; less is better."""
+        count = 3.0 * self.n
+        few = count / max(count - self.size - 1.0, 1.0)
+        return -2.0 * self.loglik + self.size * np.log(count) * few
+
+
+def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
+    """Rotation (3, 3) and position (3,) that explain most of the centres (least trimmed squares over seeded triples)."""
+    n = len(b)
+    rng = np.random.default_rng(seed)
+    sets = np.array([rng.choice(n, 3, replace=False) for _ in range(_TRIPLES if n > 3 else 1)])
+    R, t = fit_rigid_sets(b[sets], c[sets])
+    if len(R) == 0:
+        return np.eye(3), np.asarray(b.mean(axis=0) - c.mean(axis=0))
+    square = ((np.einsum("kij,nj->kni", R, c) + t[:, None] - b) ** 2).sum(axis=2)
+    h = max(3, int(np.ceil(_BEST * n)))
+    k = int(np.argmin(np.partition(square, h - 1, axis=1)[:, :h].sum(axis=1)))
+    best_R, best_t = R[k], t[k]
+    for _ in range(5):
+        near = np.argsort(((c @ best_R.T + best_t - b) ** 2).sum(axis=1))[:h]
+        try:
+            X = fit_rigid(b[near], c[near])
+        except ValueError:
+            break
+        best_R, best_t = X.rotation().matrix(), np.asarray(X.translation())
+    return np.asarray(best_R), np.asarray(best_t)
+
+
+def fit(
+    case: Case,
+    *,
+    groups: NDArray[np.int64] | None = None,
+    columns: Array | None = None,
+    start: Fit | None = None,
+    normals: bool = True,
+) -> Fit:
+    """The best numbers of a model; ``columns`` (n, 3, p) of the cause, ``groups`` (n,) the camera pose of each scan."""
+    n, b, c = case.n, case.b, case.c
+    g = np.zeros(n, dtype=int) if groups is None else groups
+    G, p = int(g.max()) + 1, 0 if columns is None else columns.shape[2]
+    D = np.zeros((n, 3, 0)) if columns is None else columns
+    has = np.isfinite(case.m).all(axis=1) & normals
+    m, z = np.where(has[:, None], case.m, 0.0), case.z
+    terms = np.column_stack([np.ones(n), c - c.mean(axis=0)])
+    if start is not None and len(start.R) == G:
+        R, t = start.R.copy(), start.p.copy()
+    else:
+        poses = [start_pose(b[g == k], c[g == k]) for k in range(G)]
+        R, t = np.array([one[0] for one in poses]), np.array([one[1] for one in poses])
+    s, a = np.zeros(4), np.zeros(p)
+    sigma, sigma_n = 1e-3, 3e-3
+    size = 6 * G + 4 + p
+    e, en = np.zeros((n, 3)), np.zeros((n, 3))
+    for step in range(_STEPS):
+        q = np.einsum("kij,kj->ki", R[g], c * (1.0 + terms @ s)[:, None])
+        u = np.einsum("kij,kj->ki", R[g], m)
+        e, en = q + t[g] - b + D @ a, np.where(has[:, None], np.cross(u, z), 0.0)
+        backward = has & ((u * z).sum(axis=1) < 0.0)
+        en[backward] /= np.maximum(np.linalg.norm(en[backward], axis=1), 1e-9)[:, None]
+        r2, rn2 = (e**2).sum(axis=1), (en**2).sum(axis=1)
+        if step == 0:
+            sigma = max(float(np.median(np.sqrt(r2))) / 1.54, 1e-4)
+            sigma_n = max(float(np.median(np.sqrt(rn2[has]))) / 1.18, 1e-3) if has.any() else 1.0
+        w = (NU + 3.0) / (NU + r2 / sigma**2)
+        wn = np.where(has, (NU + 2.0) / (NU + rn2 / sigma_n**2), 0.0)
+        new = max(float(np.sqrt((w * r2).sum() / (3.0 * n))), FLOOR_M)
+        new_n = max(float(np.sqrt((wn * rn2).sum() / max(2.0 * has.sum(), 1.0))), FLOOR_RAD)
+        done = step > 3 and abs(new / sigma - 1.0) < 1e-4 and abs(new_n / sigma_n - 1.0) < 1e-3
+        sigma, sigma_n = new, new_n
+        if done:
+            break
+        J, Jn = np.zeros((n, 3, size)), np.zeros((n, 3, size))
+        S, Sn = -skew(q), _cross_change(u, z)
+        for k in range(G):
+            own = g == k
+            J[own, :, 6 * k : 6 * k + 3], J[own, :, 6 * k + 3 : 6 * k + 6] = S[own], np.eye(3)
+            Jn[own, :, 6 * k : 6 * k + 3] = Sn[own]
+        at = 6 * G
+        J[:, :, at : at + 4] = np.einsum("kij,kj->ki", R[g], c)[:, :, None] * terms[:, None]
+        J[:, :, at + 4 :] = D
+        rows = np.concatenate([
+            (J * (np.sqrt(w) / sigma)[:, None, None]).reshape(-1, size),
+            (Jn * (np.sqrt(wn) / sigma_n)[:, None, None]).reshape(-1, size)[np.repeat(has, 3)],
+            np.eye(size)[at : at + 4] / _USUAL[:, None],
+        ])  # fmt: skip
+        left = np.concatenate([
+            (e * (np.sqrt(w) / sigma)[:, None]).ravel(), (en * (np.sqrt(wn) / sigma_n)[:, None]).ravel()[np.repeat(has, 3)], s / _USUAL,
+        ])  # fmt: skip
+        unit = np.maximum(np.linalg.norm(rows, axis=0), 1e-12)
+        x = -np.linalg.lstsq(rows / unit, left, rcond=1e-7)[0] / unit
+        for k in range(G):
+            R[k] = exp_rotation(x[6 * k : 6 * k + 3]) @ R[k]
+            t[k] = t[k] + x[6 * k + 3 : 6 * k + 6]
+        s, a = s + x[at : at + 4], a + x[at + 4 :]
+    tilt = np.where(has, np.arctan2(np.linalg.norm(np.cross(u, z), axis=1), (u * z).sum(axis=1)), np.nan)
+    loglik = student(np.sqrt((e**2).sum(axis=1)), sigma, 3) - 0.5 * float(((s / _USUAL) ** 2).sum())
+    if has.any():
+        loglik += student(tilt[has], sigma_n, 2)
+    return Fit(R, t, s, a, e, tilt, sigma, sigma_n, loglik, 6 * G + p, n)
+
+
+def _cross_change(u: Array, z: Array) -> Array:
+    """Change (n, 3, 3) of u x z by a rotation of u."""
+    return np.asarray(skew(z) @ skew(u))
+
+
+def student(r: Array, sigma: float, d: int) -> float:
+    """Log-likelihood of distances r (n,) in d dimensions under Student's t with NU free."""
+    constant = gammaln((NU + d) / 2) - gammaln(NU / 2) - 0.5 * d * np.log(NU * np.pi) - d * np.log(sigma)
+    return float(len(r) * constant - 0.5 * (NU + d) * np.log1p((r / sigma) ** 2 / NU).sum())

@@ -1,0 +1,274 @@
+"""Models of what disturbs a set of scans: a moved scanner, a TCP, a drift, a loose mount, wrong kinematics."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.math import RigidTransform, RotationMatrix
+
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.geometry.se3 import exp_rotation, log_rotation, skew
+from weldcal.models.arms.chain import Chain, chain_inverse, chain_poses, load_chain
+from weldcal.models.arms.inverse import inverse_kinematics
+from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+
+LEAST_PART = 3  # scans before and after a move
+_LEAST_SHARE = 0.2  # of the scans in the smaller of two states
+_STATES = 12  # reassignments of the scans to two states
+_TURNED = 0.03  # rad from which on a face is turned by the TCP and not by noise
+_TURNS = 1e-4  # rad, of a numerical derivative
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """A cause's model fitted: its criterion (less is better), the fit, how far it moves the centres (rms, m) and its numbers."""
+
+    cause: str
+    bic: float
+    fit: Fit
+    effect_m: float
+    numbers: dict[str, float]
+    where: tuple[str, ...] = ()
+
+
+def explanations(case: Case, null: Fit) -> Iterator[Explained]:
+    """Every model of a disturbance that these scans can bear."""
+    for one in (moved(case), tcp(case, null), drift(case, null), loose(case, null), kinematics(case, null)):
+        if one is not None:
+            yield one
+
+
+def moved(case: Case) -> Explained | None:
+    """One camera pose before a scan and another one from it on."""
+    n = case.n
+    if n < 2 * LEAST_PART + 1:
+        return None
+    order = np.argsort(case.clock, kind="stable")
+    place = np.empty(n, dtype=int)
+    place[order] = np.arange(n)
+    best: tuple[float, int, Fit] | None = None
+    for k in range(LEAST_PART, n - LEAST_PART + 1):
+        one = fit(case, groups=(place >= k).astype(int))
+        if best is None or one.bic < best[0]:
+            best = one.bic, k, one
+    assert best is not None
+    bic, k, one = best
+    after = case.b @ (one.R[1] @ one.R[0].T).T + one.p[1] - one.R[1] @ one.R[0].T @ one.p[0]
+    shift = np.linalg.norm(after - case.b, axis=1)
+    turn = float(np.linalg.norm(log_rotation((one.R[1] @ one.R[0].T)[None])[0]))
+    ids = (case.ids[order[k - 1]], case.ids[order[k]])
+    numbers = {
+        "shift_mm": 1e3 * float(np.sqrt((shift**2).mean())),
+        "turn_deg": float(np.degrees(turn)),
+        "index": float(k),
+    }
+    return Explained("scanner moved", bic + 2.0 * np.log(n), one, float(np.sqrt((shift**2).mean())), numbers, ids)
+
+
+def tcp(case: Case, null: Fit) -> Explained | None:
+    """A constant offset in the flange's frame."""
+    D = -case.X_BF[:, :3, :3]
+    if case.n < 5:
+        return None
+    starts = [null, *_tcp_starts(case, null)]
+    one = min((fit(case, columns=D, start=s) for s in starts), key=lambda f: f.bic)
+    straight = _faces_straight(
+        case, min((fit(case, columns=D, start=s, normals=False) for s in starts), key=lambda f: f.rms)
+    )
+    bic = one.bic
+    if straight is not None:  # a TCP that is turned as well: two numbers more
+        turned = fit(straight, columns=D, start=one)
+        if turned.bic + 2.0 * np.log(3.0 * case.n) < bic:
+            one, bic = turned, turned.bic + 2.0 * np.log(3.0 * case.n)
+    offset = -one.a  # the flange stands at this place in the frame that the poses name
+    numbers = {f"tcp_{axis}_mm": 1e3 * float(v) for axis, v in zip("xyz", offset, strict=True)}
+    return Explained("TCP set at the controller", bic, one, float(np.linalg.norm(one.a)), numbers)
+
+
+def _faces_straight(case: Case, found: Fit) -> Case | None:
+    """The case with the poses turned so that the faces seen look along z; None where they do, or no normals were seen."""
+    has = np.isfinite(case.m).all(axis=1)
+    if has.sum() < 4:
+        return None
+    v = np.einsum("kji,kj->ki", case.X_BF[has][:, :3, :3], case.m[has] @ found.R[0].T)
+    v = np.median(v, axis=0)
+    length = float(np.linalg.norm(v))
+    if length < 0.5 or v[2] > np.cos(_TURNED) * length:
+        return None
+    z = case.X_FR[:3, 2]
+    axis = np.cross(z, v / length)
+    angle = np.arctan2(np.linalg.norm(axis), float(z @ v) / length)
+    R = exp_rotation(axis / max(float(np.linalg.norm(axis)), 1e-9) * angle)
+    X_FR = case.X_FR.copy()
+    X_FR[:3, :3] = R @ X_FR[:3, :3]
+    return replace(case, X_FR=X_FR)
+
+
+def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
+    """Camera poses with the rotation's nine numbers free, so that an offset of any size is linear."""
+    n = case.n
+    if n < 6:
+        return
+    A = np.zeros((n, 3, 15))
+    for k in range(3):
+        A[:, k, 3 * k : 3 * k + 3] = case.c
+    A[:, :, 9:12], A[:, :, 12:] = np.eye(3), -case.X_BF[:, :3, :3]
+    x = np.linalg.lstsq(A.reshape(-1, 15), case.b.ravel(), rcond=1e-9)[0]
+    U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    yield Fit(R[None], x[9:12][None], null.scanner, x[12:], null.e, null.tilt, 0.0, 0.0, 0.0, 0, n)
+
+
+def drift(case: Case, null: Fit) -> Explained | None:
+    """The camera creeps with time, evenly or as a thing that warms up."""
+    t = case.clock
+    best: tuple[Fit, Array, str] | None = None
+    arm = case.b - case.b.mean(axis=0)
+    for tau in (None, 0.15, 0.4):
+        f = t if tau is None else 1.0 - np.exp(-t / tau)
+        f = f - f.mean()
+        shift = np.eye(3)[None] * f[:, None, None]
+        turned = np.concatenate([shift, -skew(arm) * f[:, None, None]], axis=2)
+        for D in (shift, turned):
+            one = fit(case, columns=D, start=null)
+            if best is None or one.bic < best[0].bic:
+                best = one, D, "even" if tau is None else f"{tau:g}"
+    assert best is not None
+    one, D, kind = best
+    made = D @ one.a
+    total = made[np.argmax(t)] - made[np.argmin(t)]
+    numbers = {"drift_mm": 1e3 * float(np.linalg.norm(total)), "levels_off": 0.0 if kind == "even" else 1.0}
+    return Explained(
+        "warm-up drift", one.bic + 2.0 * np.log(3.0), one, float(np.sqrt((made**2).sum(axis=1).mean())), numbers
+    )
+
+
+def loose(case: Case, null: Fit) -> Explained | None:
+    """Two states that the scans fall into in no order: an offset in the flange's frame, or of the camera, in some of them."""
+    n = case.n
+    if n < 8:
+        return None
+    best: tuple[float, Fit, Array, str] | None = None
+    for frame, T in (("flange", -case.X_BF[:, :3, :3]), ("camera", np.broadcast_to(np.eye(3), (n, 3, 3)))):
+        local = np.einsum("kji,kj->ki", T, null.e)
+        spread = local - np.median(local, axis=0)
+        axis = np.linalg.svd(spread, full_matrices=False)[2][0]
+        for first in (
+            (spread @ axis) > 0.0,
+            np.linalg.norm(spread, axis=1) > np.median(np.linalg.norm(spread, axis=1)),
+        ):
+            found = _two_states(case, null, T, first)
+            if found is not None and (best is None or found[0] < best[0]):
+                best = (*found, frame)
+    if best is None:
+        return None
+    bic, one, state, frame = best
+    few = state if state.sum() <= n / 2 else ~state
+    ids = tuple(np.array(case.ids)[few])
+    numbers = {"jump_mm": 1e3 * float(np.linalg.norm(one.a)), "in_flange": float(frame == "flange")}
+    return Explained("slack flange or loose mount", bic, one, float(np.linalg.norm(one.a)), numbers, ids)
+
+
+def _two_states(case: Case, null: Fit, T: Array, state: Array) -> tuple[float, Fit, Array] | None:
+    """Scans and states in turn until nothing changes (classification EM); None where one state has too few scans."""
+    n = case.n
+    least = max(3, int(np.ceil(_LEAST_SHARE * n)))
+    one = null
+    for _ in range(_STATES):
+        if not least <= state.sum() <= n - least:
+            return None
+        one = fit(case, columns=T * state[:, None, None], start=one)
+        bare = one.e - np.einsum("kij,j->ki", T, one.a) * state[:, None]
+        other = bare + np.einsum("kij,j->ki", T, one.a)
+        new = np.linalg.norm(other, axis=1) < np.linalg.norm(bare, axis=1)
+        if (new == state).all():
+            break
+        state = new
+    if not least <= state.sum() <= n - least:
+        return None
+    order = state[np.argsort(case.clock, kind="stable")]
+    if np.count_nonzero(np.diff(order.astype(int))) <= 1:
+        return None  # a move, not a play
+    share = state.mean()
+    labels = -2.0 * n * (share * np.log(share) + (1.0 - share) * np.log(1.0 - share))
+    return one.bic + float(labels) + 2.0 * np.log(4.0), one, state
+
+
+def kinematics(case: Case, null: Fit) -> Explained | None:
+    """Other joint zeros and link lengths than those by which the poses were computed."""
+    if not case.robot or case.n < 9:
+        return None
+    try:
+        arm = load_chain(case.robot)
+    except InputError:
+        return None
+    best: Explained | None = None
+    for q in joint_angles(case, arm):
+        D, names = _arm_columns(case, arm, q)
+        one = fit(case, columns=D, start=null)
+        if best is None or one.bic < best.bic:
+            made = np.linalg.norm(D @ one.a - (D @ one.a).mean(axis=0), axis=1)
+            worst = int(np.argmax(np.abs(one.a) * np.linalg.norm(D, axis=(0, 1))))
+            numbers = {"largest_mm": 1e3 * float(made.max()), "worst": float(worst)}
+            best = Explained(
+                "wrong kinematics file", one.bic, one, float(np.sqrt((made**2).mean())), numbers, (names[worst],)
+            )
+    return best
+
+
+def joint_angles(case: Case, arm: Chain) -> Iterator[Array]:
+    """Joint angles (n, joints) for all poses, on each branch of the arm that reaches them all."""
+    poses = [RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), X[:3, 3]) for X in case.X_BF]
+    if arm.name in known_arms():
+        model = load_arm(arm.name)
+        answers = [inverse_kinematics(model, X) for X in poses]
+        if any(len(a) == 0 for a in answers):
+            return
+        for seed in answers[0]:
+            yield np.array([a[np.argmin(np.abs(np.angle(np.exp(1j * (a - seed)))).sum(axis=1))] for a in answers])
+        return
+    near: Array | None = None
+    found = []
+    for X in poses:
+        q = chain_inverse(arm, X, near)
+        if q is None:
+            return
+        near = q
+        found.append(q)
+    yield np.array(found)
+
+
+def _arm_columns(case: Case, arm: Chain, q: Array) -> tuple[Array, tuple[str, ...]]:
+    """Change (n, 3, p) of the feature's centre by joint zeros and link lengths, but those that only move base or flange."""
+    at = case.X_FR[:3, 3]
+
+    def centres(chain: Chain, angles: Array) -> Array:
+        X = chain_poses(chain, angles)
+        return np.asarray(X[:, :3, :3] @ at + X[:, :3, 3])
+
+    zero = centres(arm, q)
+    made, names = [], []
+    for j in range(1, arm.n - 1):
+        step = np.zeros(arm.n)
+        step[j] = _TURNS
+        made.append((centres(arm, q + step) - zero) / _TURNS)
+        names.append(f"zero of joint {j + 1}")
+    for j in range(1, arm.n):
+        along = arm.stack[j, :3, 3]
+        length = float(np.linalg.norm(along))
+        if length < 1e-3:
+            continue
+        along = along / length
+        if j == arm.n - 1 and abs(float(along @ arm.stack[j, :3, 2])) > 0.99:
+            continue  # along the last axis: a TCP
+        stack = arm.stack.copy()
+        stack[j, :3, 3] += 1e-3 * along
+        other = Chain(
+            arm.name, arm.joint_names, stack, arm.X_LF, arm.position_lower, arm.position_upper, arm.velocity_limit
+        )
+        made.append((centres(other, q) - zero) / 1e-3)
+        names.append(f"length of link {j}")
+    return -np.stack(made, axis=2), tuple(names)

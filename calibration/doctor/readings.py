@@ -1,0 +1,120 @@
+"""Tries the ways in which a list of poses is misread: the quaternion's order, the inverse, a mixed unit, scans against poses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.geometry.se3 import inverse, pose
+from weldcal.models.arrays import Array
+
+UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
+_WITHIN = 0.08  # of a unit's factor
+_LEAST_GAIN = 3.0  # a reading must bring the residuals down by this factor: nothing less is a misreading
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """Another way to read the poses: the cause's name, what it is in words, the case so read and its fit."""
+
+    cause: str
+    words: str
+    case: Case
+    fit: Fit
+
+
+def _turned(case: Case, R: Array) -> Case:
+    return case.with_poses(pose(R, case.X_BF[:, :3, 3]))
+
+
+def _other_order(case: Case) -> Case:
+    """The poses as if (x, y, z, w) had been taken for (w, x, y, z)."""
+    wxyz = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_quat(scalar_first=True)
+    return _turned(case, np.asarray(Rotation.from_quat(wxyz, scalar_first=False).as_matrix()))
+
+
+def _other_order_back(case: Case) -> Case:
+    """The poses as if (w, x, y, z) had been taken for (x, y, z, w)."""
+    xyzw = Rotation.from_matrix(case.X_BF[:, :3, :3]).as_quat(scalar_first=False)
+    return _turned(case, np.asarray(Rotation.from_quat(xyzw, scalar_first=True).as_matrix()))
+
+
+def _vector_as_euler(case: Case) -> Case:
+    turn = Rotation.from_matrix(case.X_BF[:, :3, :3])
+    return _turned(case, np.asarray(Rotation.from_euler("xyz", turn.as_rotvec()).as_matrix()))
+
+
+def _euler_as_vector(case: Case) -> Case:
+    turn = Rotation.from_matrix(case.X_BF[:, :3, :3])
+    return _turned(case, np.asarray(Rotation.from_rotvec(turn.as_euler("xyz")).as_matrix()))
+
+
+READINGS: dict[str, tuple[str, Callable[[Case], Case]]] = {
+    "the quaternions' order is (x, y, z, w), and they were read as (w, x, y, z)": ("wrong quaternion order", _other_order),
+    "the quaternions' order is (w, x, y, z), and they were read as (x, y, z, w)": ("wrong quaternion order", _other_order_back),
+    "the poses are the base in the flange, the inverse of what is expected": ("poses inverted", lambda c: c.with_poses(inverse(c.X_BF))),
+    "the rotations are transposed": ("poses inverted", lambda c: _turned(c, np.swapaxes(c.X_BF[:, :3, :3], 1, 2))),
+    "the rotations are roll, pitch and yaw, and they were read as rotation vectors": ("wrong rotation convention", _vector_as_euler),
+    "the rotations are rotation vectors, and they were read as roll, pitch and yaw": ("wrong rotation convention", _euler_as_vector),
+}  # fmt: skip
+
+
+def best_reading(case: Case, null: Fit) -> Reading | None:
+    """The misreading whose correction lowers the criterion most, if it also lowers the residuals by a clear factor; else None."""
+    found: list[Reading] = []
+    for words, (cause, change) in READINGS.items():
+        other = change(case)
+        found.append(Reading(cause, words, other, fit(other)))
+    for shift in (1, -1):
+        if case.n > 6:
+            inside = case.pick(np.arange(1, case.n) if shift == 1 else np.arange(case.n - 1))
+            X = case.X_BF[:-1] if shift == 1 else case.X_BF[1:]
+            moved = inside.with_poses(X)
+            words = f"each scan belongs to the pose {'before' if shift == 1 else 'after'} its own"
+            one = fit(moved)
+            # one scan fewer: compared on the same scans
+            if fit(inside).bic - one.bic > 0.0:
+                found.append(Reading("scans and poses shifted by one", words, moved, one))
+    found.sort(key=lambda r: r.fit.bic / r.case.n)
+    best = found[0] if found else None
+    if best is None or best.fit.bic / best.case.n >= null.bic / case.n:
+        return None
+    tilts = [float(np.nanmedian(f.tilt)) if np.isfinite(f.tilt).any() else 0.0 for f in (null, best.fit)]
+    better = null.rms > _LEAST_GAIN * max(best.fit.rms, 2e-4) or tilts[0] > _LEAST_GAIN * max(tilts[1], 0.02)
+    return best if better else None
+
+
+def mixed_units(case: Case) -> tuple[Case, float, tuple[str, ...]] | None:
+    """The case in one unit, the factor and the scans that were in another one; None where all are in one.
+
+    Positions of single poses, or distances of single scans, that are a unit's factor away from the median of the others; else one
+    factor between the spreads of both sides.
+    """
+    for name, points in (("poses", case.X_BF[:, :3, 3]), ("scans", case.c)):
+        size = np.linalg.norm(points, axis=1)
+        ratio = size / max(float(np.median(size)), 1e-12)
+        for unit in UNITS[:4]:
+            off = np.abs(ratio / unit - 1.0) < (0.8 if unit > 100.0 or unit < 0.01 else 0.5)
+            if off.any() and off.sum() <= 0.5 * case.n:
+                factor = np.where(off, 1.0 / unit, 1.0)
+                return _scaled(case, name, factor), unit, tuple(np.array(case.ids)[off])
+    if case.n >= 4:
+        spreads = [float(np.median(np.linalg.norm(v - np.median(v, axis=0), axis=1))) for v in (case.b, case.c)]
+        ratio_all = spreads[0] / max(spreads[1], 1e-12)
+        for unit in UNITS:
+            if abs(ratio_all / unit - 1.0) < max(_WITHIN, 0.3):
+                other = _scaled(case, "poses", np.full(case.n, 1.0 / unit))
+                if fit(other).rms < 0.05 * spreads[1]:
+                    return other, unit, case.ids
+    return None
+
+
+def _scaled(case: Case, what: str, factor: Array) -> Case:
+    if what == "scans":
+        return replace(case, c=case.c * factor[:, None])
+    X = case.X_BF.copy()
+    X[:, :3, 3] *= factor[:, None]
+    return case.with_poses(X)
