@@ -3,11 +3,11 @@
 import math
 from dataclasses import dataclass
 
-from weldcal.models.arms.chain import Chain, load_chain
+from weldcal.models.arms.chain import Chain, is_urdf, load_chain
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard, get_flange
 
-ISO_50 = "iso9409-1-50-4-m6"
+ISO_50, ISO_80 = "iso9409-1-50-4-m6", "iso9409-1-80-6-m8"
 CLOSED_FORM, NUMERIC = "closed form", "numeric"
 """How joint angles are found: every solution (arms.inverse), or one by iteration (arms.chain)."""
 
@@ -53,11 +53,17 @@ class Robot:
 
 _UR_E = "user manual, e-Series, technical specifications; kinematics: Universal Robots, DH parameters"
 _UR_CB3 = "user manual, CB3, technical specifications; kinematics: Universal Robots, DH parameters (series 3)"
+_UR_TWIN = (
+    "technical specifications; kinematics: Universal Robots, ROS 2 description, as the predecessor of the same build"
+)
+_UR_LARGE = "technical specifications (UR20, UR30: the smaller of two published payloads); kinematics: Universal Robots, DH parameters"
 _RIGHT_ANGLE = math.pi / 2
 
 
 _SCANS = "pattern of holes and dowel in the recorded scans and their CAD"
 _DESCRIPTION = "ur_description (URDF of ROS-Industrial)"
+_SERIES = "table of models in the API catalogue of Universal Robots (api-evangelist/universal-robots)"
+_FLANGES = "graspmonkey.de, ISO 9409-1 (table of robots): UR20 and UR30 have ISO 9409-1-80-6-M8"
 CONFIRMED: dict[str, tuple[tuple[str, str], ...]] = {
     "ur5": (
         ("flange", _SCANS),
@@ -65,11 +71,21 @@ CONFIRMED: dict[str, tuple[tuple[str, str], ...]] = {
         ("joint limits", _DESCRIPTION),
     ),
     "ur5e": (("payload", "hardware manual UR5e 2022, chapter 9: 5 kg"), ("joint limits", _DESCRIPTION)),
+    "ur7e": (("payload", _SERIES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
     "ur10e": (
         ("flange", _SCANS),
         ("payload", "online manual UR10e, software 10.6, Maximum Payload: 10 or 12.5 kg, by the label on the arm"),
         ("reach", "the same page: work space of 1300 mm"),
     ),
+    "ur12e": (("payload", _SERIES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
+    "ur16e": (("payload", _SERIES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
+    "ur20": (
+        ("flange", _FLANGES),
+        ("payload", "rocketfarm.no, UR20 cobot for palletizing: 20 kg (later labels say 25 kg)"),
+        ("reach", "the same page: 1750 mm"),
+        ("joint limits", _DESCRIPTION),
+    ),
+    "ur30": (("flange", _FLANGES), ("reach", _SERIES), ("joint limits", _DESCRIPTION)),
     "franka_panda": (
         ("flange", _SCANS),
         ("payload", "Elsner 2023, after the maker: 3 kg"),
@@ -88,9 +104,11 @@ CONFIRMED: dict[str, tuple[tuple[str, str], ...]] = {
 """By robot: what of CATALOGUE could be looked up, and where."""
 
 
-def _ur(name: str, title: str, payload: float, reach: float, repeatability: float, source: str) -> Robot:
+def _ur(
+    name: str, title: str, payload: float, reach: float, repeatability: float, source: str, flange: str = ISO_50
+) -> Robot:
     known = CONFIRMED.get(name, ())
-    return Robot(name, title, 6, ISO_50, _RIGHT_ANGLE, payload, reach, repeatability, CLOSED_FORM, source, known)
+    return Robot(name, title, 6, flange, _RIGHT_ANGLE, payload, reach, repeatability, CLOSED_FORM, source, known)
 
 
 ROBOTS: dict[str, Robot] = {
@@ -99,9 +117,13 @@ ROBOTS: dict[str, Robot] = {
         _ur("ur3e", "Universal Robots UR3e", 3.0, 0.500, 3e-5, _UR_E),
         _ur("ur5", "Universal Robots UR5", 5.0, 0.850, 1e-4, _UR_CB3),
         _ur("ur5e", "Universal Robots UR5e", 5.0, 0.850, 3e-5, _UR_E),
+        _ur("ur7e", "Universal Robots UR7e", 7.5, 0.850, 3e-5, _UR_TWIN),
         _ur("ur10", "Universal Robots UR10", 10.0, 1.300, 1e-4, _UR_CB3),
         _ur("ur10e", "Universal Robots UR10e", 12.5, 1.300, 5e-5, _UR_E),
+        _ur("ur12e", "Universal Robots UR12e", 12.5, 1.300, 5e-5, _UR_TWIN),
         _ur("ur16e", "Universal Robots UR16e", 16.0, 0.900, 5e-5, _UR_E),
+        _ur("ur20", "Universal Robots UR20", 20.0, 1.750, 1e-4, _UR_LARGE, ISO_80),
+        _ur("ur30", "Universal Robots UR30", 30.0, 1.300, 1e-4, _UR_LARGE, ISO_80),
         Robot(
             "franka_panda", "Franka Emika Panda", 7, ISO_50, math.pi, 3.0, 0.855, 1e-4, NUMERIC,
             "Franka Emika data sheet; limits: FCI documentation; kinematics: franka_description; dowel: the recorded scans' CAD",
@@ -121,6 +143,22 @@ ROBOTS: dict[str, Robot] = {
 }  # fmt: skip
 """Every robot known by name; the ISO 9409-1 designation of each in one place."""
 
+CONTROLLER_MODELS: dict[str, tuple[str, int]] = {
+    "ur3e": ("UR3", 3),
+    "ur5": ("UR5", 1),
+    "ur5e": ("UR5", 1),
+    "ur7e": ("UR5", 1),
+    "ur10": ("UR10", 2),
+    "ur10e": ("UR10", 2),
+    "ur12e": ("UR10", 2),
+    "ur16e": ("UR16", 4),
+    "ur20": ("UR20", 7),
+    "ur30": ("UR30", 8),
+}
+"""What a Universal Robots controller calls its arm: `get robot model` of the dashboard, and robot_type of the primary interface
+(numbers: RobotType of UniversalRobots/Universal_Robots_Client_Library). UR7e and UR12e are assumed to answer as the UR5e and UR10e,
+or with their own names."""
+
 ALIASES = {"franka": "franka_panda", "panda": "franka_panda", "fr3": "franka_fr3", "aubo": "aubo_i5"}
 """Shorter names that datasets use."""
 
@@ -132,3 +170,8 @@ def get_robot(name: str) -> Robot:
     if robot is None:
         raise InputError(f"Robot '{name}' is not known: use one of {', '.join(ROBOTS)}.")
     return robot
+
+
+def get_chain(name: str) -> Chain:
+    """Kinematics and limits of the robot of that name, or of a URDF file. Raises InputError naming the known ones."""
+    return load_chain(name) if is_urdf(name) else get_robot(name).chain

@@ -14,12 +14,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from weldcal.models.depth_noise import Depth, DepthNoise, measured_points, noisy_depth
 from weldcal.models.errors import InputError
+from weldcal.models.scanner_files import read_scanner_file
 
 Floats = npt.NDArray[np.float64]
 
@@ -157,11 +159,20 @@ SCANNERS: dict[str, ScannerPreset] = {
 """Every scanner known by name, in its full resolution."""
 
 
+def is_scanner_file(name: str) -> bool:
+    """Whether a preset's name is that of a file."""
+    return name.lower().endswith((".yaml", ".yml"))
+
+
 def get_scanner(name: str, width: int | None = None, height: int | None = None) -> ScannerPreset:
-    """The named scanner, resized when a width (and height) is given; raises InputError naming the known ones."""
-    preset = SCANNERS.get(name.strip().lower().replace("-", "_"))
+    """The named scanner, or that of a file (.yaml), resized when a width (and height) is given; raises InputError naming the
+    known ones, or what is wrong in the file."""
+    if is_scanner_file(name):
+        preset: ScannerPreset | None = ScannerPreset(**vars(read_scanner_file(Path(name))))
+    else:
+        preset = SCANNERS.get(name.strip().lower().replace("-", "_"))
     if preset is None:
-        raise InputError(f"Scanner '{name}' is not known: use one of {', '.join(SCANNERS)}.")
+        raise InputError(f"Scanner '{name}' is not known: use one of {', '.join(SCANNERS)}, or a scanner file (.yaml).")
     if width is None:
         if height is not None:
             raise InputError("A scanner is resized by its width: give the width too, or omit the height.")

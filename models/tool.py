@@ -11,11 +11,40 @@ from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arms.urdf import Capsule
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.flanges import FlangeStandard, get_flange
 
+RING = get_flange("tool-ring-63")
 LAST_LINK = len(LINKS)  # the flange's link, counted as in kinematics.link_frames (0 is the base)
 
 # z_F points out of the flange (down while welding); the ring, the tip frame and the torch all have their z up, against z_F.
 R_FLIPPED = RollPitchYaw(np.pi, 0.0, 0.0).ToRotationMatrix()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A pose that compares and travels: x, y, z in m and roll, pitch, yaw in rad about fixed axes."""
+
+    xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @property
+    def pose(self) -> RigidTransform:
+        """The pose."""
+        return RigidTransform(RollPitchYaw(*self.rpy_rad), self.xyz_m)
+
+
+@dataclass(frozen=True)
+class ToolShape:
+    """A drawn body of a tool, on the flange: ``size`` m of a box (x, y, z), cylinder (radius, length along z), capsule (likewise),
+    sphere (radius) or mesh (none: vertices and triangles are those of the file)."""
+
+    name: str
+    kind: str
+    size: tuple[float, ...]
+    place: Placed
+    colour: str = "dark"
+    mesh: str = ""  # path of the file
+    unit_m: float = 1.0  # of the file
 
 
 class Seat(NamedTuple):
@@ -25,9 +54,16 @@ class Seat(NamedTuple):
     below_m: float
 
 
+def flipped_where_it_is(X: RigidTransform) -> RigidTransform:
+    """The pose with R_FLIPPED as its rotation where it differs from that by rounding only."""
+    same = np.abs(X.rotation().matrix() - R_FLIPPED.matrix()).max() < 1e-12
+    return RigidTransform(R_FLIPPED, X.translation()) if same else X
+
+
 @dataclass(frozen=True)
 class WeldingTool:
-    """Numbers of the tool, all in the flange frame F (m, rad, N, kg).
+    """Numbers of a tool, all in the flange frame F (m, rad, N, kg). The defaults are the welding tool of the paper's figure; a tool
+    file gives the fields at the end, which replace what follows from the others (models/tools).
 
     The soft tip is a sphere on three springs (omni-directional, as the metamaterial finger of the paper); the tag rides on
     it and the finger camera looks at the tag along +z_F. The torch trails the tip by `chord_m` along -x_T.
@@ -54,6 +90,17 @@ class WeldingTool:
     chord_m: float = 0.060  # |d| of Eq. 14
     torch_height_m: float = -0.0015  # z of the wire point in T
     mass_kg: float = 1.4
+    centre_of_mass_m: tuple[float, float, float] = (0.03, 0.0, 0.05)
+    ring: FlangeStandard | None = RING  # what the scanner measures; None: the arm's bare flange
+    finger_radius_m: float = 0.0022  # of the drawn rod between tag and ball
+    membrane_radius_m: float = 0.026  # of the soft disc that carries the tag
+    tag_plate_m: float = 0.016  # side of the white plate under the tag's print
+    ring_pose: Placed | None = None
+    tip_pose: Placed | None = None  # of T
+    camera_pose: Placed | None = None
+    tag_pose: Placed | None = None  # of M, tip at rest
+    shapes: tuple[ToolShape, ...] | None = None
+    keep_clear: tuple[Capsule, ...] | None = None
 
     def wall_force(self, depth_m: float) -> float:
         """Force in N of a flat rigid wall that is pressed `depth_m` into the ball.
@@ -106,6 +153,8 @@ class WeldingTool:
     @property
     def X_FT(self) -> RigidTransform:
         """Pose of the soft tip at rest: z_T up, x_T from the torch to the tip."""
+        if self.tip_pose is not None:
+            return flipped_where_it_is(self.tip_pose.pose)
         return RigidTransform(R_FLIPPED, [0.0, 0.0, self.tip_reach_m])
 
     @property
@@ -115,11 +164,21 @@ class WeldingTool:
 
     @property
     def X_FR(self) -> RigidTransform:
-        """Pose of the flange-like ring: its face looks back along -z_F, at a scanner above the cell."""
+        """Pose of the flange-like ring: its face looks back along -z_F, at a scanner above the cell.
+
+        Raises:
+            InputError: the tool has no ring.
+        """
+        if self.ring is None:
+            raise InputError("This tool has no ring: write calibration.feature: flange in the scenario.")
+        if self.ring_pose is not None:
+            return self.ring_pose.pose
         return RigidTransform(R_FLIPPED, [self.ring_offset_m, 0.0, -self.ring_height_m])
 
     def capsules(self) -> list[Capsule]:
         """What must keep clear of the table and out of the line of sight, on the arm's last link (frame F)."""
+        if self.keep_clear is not None:
+            return list(self.keep_clear)
         p_FW = self.X_FT @ self.p_TW
         bar_z = 0.030  # low enough that the capsule's top does not rise above the ring that stands on the bar
         spans = [
@@ -133,12 +192,50 @@ class WeldingTool:
     @property
     def X_FK(self) -> RigidTransform:
         """Pose of the finger camera (optical frame: z along +z_F, x along +x_F)."""
+        if self.camera_pose is not None:
+            return self.camera_pose.pose
         return RigidTransform(RotationMatrix.Identity(), [0.0, 0.0, self.tag_reach_m - self.camera_distance_m])
 
     @property
     def X_FM_rest(self) -> RigidTransform:
         """Pose of the tag while the tip is at rest: it faces the camera (OpenCV marker frame, z out of the print)."""
+        if self.tag_pose is not None:
+            return self.tag_pose.pose
         return RigidTransform(R_FLIPPED, [0.0, 0.0, self.tag_reach_m])
+
+    @property
+    def X_TM(self) -> RigidTransform:
+        """Pose of the tag on the tip."""
+        X_TM = self.X_FT.InvertAndCompose(self.X_FM_rest)
+        straight = RigidTransform(
+            [0.0, 0.0, self.tip_reach_m - self.tag_reach_m]
+        )  # without the rounding of the product
+        return straight if X_TM.IsNearlyEqualTo(straight, 1e-12) else X_TM
+
+    def drawn(self) -> tuple[ToolShape, ...]:
+        """The bodies on the flange, besides ring, finger and tag: those of the tool's file, or those of the welding tool."""
+        return self.shapes if self.shapes is not None else self._own_shapes()
+
+    def _own_shapes(self) -> tuple[ToolShape, ...]:
+        t, r, camera_z = self.plate_thickness_m, self.ring_offset_m, float(self.X_FK.translation()[2])
+        p_FW = self.X_FT @ self.p_TW
+        x, length = float(p_FW[0]), float(p_FW[2]) - 0.012 - t
+        rows: list[tuple[str, tuple[float, ...], tuple[float, float, float], str]] = [
+            ("mount", (0.0375, t), (0.0, 0.0, t / 2), "dark"),
+            ("bar", (r, 0.064, t), (r / 2, 0.0, t / 2), "dark"),
+            ("ring_base", (0.0375, t), (r, 0.0, t / 2), "dark"),
+            ("camera", (0.026, 0.026, camera_z - 0.006 - t), (0.0, 0.0, t + (camera_z - 0.006 - t) / 2), "dark"),
+        ]
+        for side in (-1.0, 1.0):  # the frame that carries the soft metamaterial, outside the camera's view
+            middle = (0.0, side * 0.034, (t + self.tag_reach_m) / 2)
+            rows.append((f"post{side:+.0f}", (0.012, 0.004, self.tag_reach_m - t), middle, "dark"))
+        rows += [
+            ("torch_arm", (-x + 0.02, 0.03, t), (x / 2 - 0.01, 0.0, t / 2 + t), "dark"),
+            ("torch_body", (0.009, length), (x, 0.0, t + length / 2), "copper"),
+            ("torch_wire", (0.0006, 0.012), (x, 0.0, float(p_FW[2]) - 0.006), "steel"),
+        ]
+        kinds = {2: "cylinder", 3: "box"}
+        return tuple(ToolShape(name, kinds[len(size)], size, Placed(at), colour) for name, size, at, colour in rows)
 
     @property
     def X_KM_rest(self) -> RigidTransform:

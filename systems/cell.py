@@ -7,12 +7,12 @@ from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams
 from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
-from weldcal.systems.drivers.simulated.second_arm import SECOND
+from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.jobs.job import AddedJob, Job
 from weldcal.systems.motion.clear_moves import check_way_home
-from weldcal.systems.motion.spine import FIRST, add_spine
+from weldcal.systems.motion.spine import add_spine
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
 from weldcal.systems.wiring import Wiring

@@ -14,10 +14,10 @@ from pydrake.systems.framework import Context, EventStatus
 from pydrake.systems.sensors import RgbdSensor
 
 from weldcal.systems.cell import Cell, JobOf
+from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
 from weldcal.systems.messages import JobCommand, Scan
 from weldcal.systems.motion.operator_panel import PACE_SLIDER
-from weldcal.systems.motion.spine import FIRST
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
 from weldcal.systems.person import KEYS, Person
 from weldcal.systems.wall_clock import WallClock

@@ -2,7 +2,6 @@
 
 import dataclasses as dc
 import inspect
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import BasicVector, Context, Diagram, DiagramBuilder, LeafSystem
 from pydrake.systems.primitives import ConstantValueSource
 
-from weldcal.models.arms.kinematics import ArmModel, load_arm
+from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.bent_plate import bend
@@ -23,12 +23,14 @@ from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraCo
 from weldcal.systems.drivers.simulated.furnishing import Furnishing
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerTruth
 from weldcal.systems.drivers.simulated.rendered_scanner import TrueScanner, random_pose_error
-from weldcal.systems.drivers.simulated.second_arm import SECOND, PlacedArm
+from weldcal.systems.drivers.simulated.second_arm import FIRST, SECOND, PlacedArm
 from weldcal.systems.drivers.simulated.world import SimulatedWorld, build_world
 from weldcal.systems.drivers.station_build import Closable, PreparedRobot, StationBuild
 from weldcal.systems.jobs.tablet.messages import TabletTruth
 from weldcal.systems.messages import Message
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario, WorkpieceConfig
+from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.scenario.workpiece import made, part_of
 from weldcal.systems.viewer.drawn_arm import add_drawn_arm
 
@@ -61,6 +63,7 @@ class Station:
     second: ArmModel | None = None
     background: Background = dc.field(default_factory=Inline)
     devices: tuple[Closable, ...] = ()
+    surroundings: Surroundings = dc.field(default_factory=Surroundings)
 
     @property
     def arm(self) -> ArmModel:
@@ -106,6 +109,9 @@ def prepare_robot(config: Any, nominal: ArmModel, q_home: np.ndarray) -> Prepare
         return PreparedRobot(nominal, q_home)
     found: PreparedRobot = prepare(config, nominal)
     return found
+
+
+TABLE_MIDDLE_M = 0.45  # along the world's x
 
 
 class CheatPoses(LeafSystem):
@@ -160,8 +166,8 @@ def make_station(
     `robot` is an already prepared robot; None: the driver in the scenario prepares it. `furnish` is the job's method.
     A station without simulated devices has no simulated world: the arm is displayed at its measured joints.
 
-    Ports: in `ur10e.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
-    `ur10e.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
+    Ports: in `arm.velocity_command` (6) rad/s, `scanner.trigger` (1), `finger_camera.streaming` (1); out
+    `arm.position_measured`, `.velocity_measured`, `.X_BF`, `.sample_time`, `.status`, `scanner.scan`,
     `finger_camera.image`, `.capture_time`, `query_object`; simulated only: `cheat.X_BC`, `cheat.truth`, `cheat.contact`,
     `cheat.torch`. With a tablet: in `wrist_camera.trigger` (1), out `wrist_camera.picture`, `digitizer.touch`. With a
     profiler: in `profiler.trigger`, out `profiler.profile`, `torch.touch`.
@@ -172,8 +178,7 @@ def make_station(
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     if robot is None:
-        nominal = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
-        robot = prepare_robot(scenario.robot, nominal, np.deg2rad(scenario.home_deg))
+        robot = prepare_robot(scenario.robot, nominal_arm(scenario), np.deg2rad(scenario.home_deg))
     opened: list[Closable] = []
     try:
         return _make_station(scenario, seed, robot, furnish, opened)
@@ -189,7 +194,8 @@ def _make_station(
 ) -> Station:
     rng = np.random.default_rng(seed)
     cad, real, X_BP = _workpieces(scenario, rng)
-    tool = _tool(scenario, cad) if scenario.tool == "welding" else None
+    surroundings = surroundings_of(scenario)
+    tool = _tool(scenario, cad)
     devices: dict[str, DriverConfig] = {name: getattr(scenario, name) for name in DEVICES}
     builder = DiagramBuilder()
     build = StationBuild(builder, robot.arm, tool, robot.q_start, rng, robot, closables=opened)
@@ -206,8 +212,8 @@ def _make_station(
             true_arm,
             tool,
             robot.q_start,
-            flange=scenario.flange,
-            table_z_m=scenario.calibration.table_z_m,
+            flange=scenario.flange_name(),
+            table=table_in_base(scenario),
             workpiece=real,
             X_BP=X_BP,
             fittings=furnishing.fittings,
@@ -215,6 +221,7 @@ def _make_station(
             foot=furnishing.foot,
             profiler=furnishing.profiler,
             time_step_s=furnishing.time_step_s,
+            surroundings=surroundings,
         )
         build.parts = (world, *furnishing.parts)
     X_LC = None
@@ -238,13 +245,13 @@ def _make_station(
         build.find(TrueScanner),
         None if world is None else true_arm,
     )
-    _export(build, world, truth, scenario)
+    _export(build, world, truth, scenario, surroundings)
     diagram = builder.Build()
     diagram.set_name("station")
     second = None if furnishing.second is None else furnishing.second.arm
     # only a Diagram that keeps a robot's pace cannot wait for a computation
     background = Inline() if robot.pace is None else OwnProcess(waits=robot.waits)
-    return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened))
+    return Station(diagram, robot, tool, cad, truth, world, second, background, tuple(opened), surroundings)
 
 
 def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationBuild) -> None:
@@ -264,14 +271,22 @@ def _apply_second_robot(config: DriverConfig, placed: PlacedArm, build: StationB
     apply_driver_config(config, own)
     for system in build.builder.GetSystems():
         if id(system) not in before:
-            system.set_name(system.get_name().replace("ur10e", SECOND))
-    build.inputs |= {name.replace("ur10e", SECOND): port for name, port in own.inputs.items()}
-    build.outputs |= {name.replace("ur10e", SECOND): port for name, port in own.outputs.items()}
+            system.set_name(_of_second(system.get_name()))
+    build.inputs |= {_of_second(name): port for name, port in own.inputs.items()}
+    build.outputs |= {_of_second(name): port for name, port in own.outputs.items()}
 
 
-def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool:
+def _of_second(name: str) -> str:
+    """The name of a port or system of the second arm, from that which its driver gave it."""
+    return f"{SECOND}{name.removeprefix(FIRST)}" if name.startswith(FIRST) else name
+
+
+def _tool(scenario: Scenario, cad: WeldPart | None) -> WeldingTool | None:
     """The welding tool with the scenario's press deflections and the groove angle of the workpiece."""
-    tool, welding, camera = WeldingTool(), scenario.welding, scenario.finger_camera
+    loaded, welding, camera = scenario.loaded_tool(), scenario.welding, scenario.finger_camera
+    if loaded is None:
+        return None
+    tool = loaded.tool
     given = [None if mm is None else 1e-3 * mm for mm in (welding.axial_deflection_mm, welding.deflection_mm)]
     press = Press(tool.press_axial_m, tool.press_lateral_m) if cad is None else cad.press(tool, given[0], given[1])
     measured = camera.tag_size_m() if isinstance(camera, FingerCameraConfig) else None
@@ -316,6 +331,11 @@ def _plates(spec: WorkpieceConfig, rng: np.random.Generator) -> tuple[WeldPart, 
     return cad, real
 
 
+def table_in_base(scenario: Scenario) -> RigidTransform:
+    """Pose in the base of the table's frame: its top's middle, z up."""
+    return scenario.base.pose().inverse() @ RigidTransform([TABLE_MIDDLE_M, 0.0, scenario.calibration.table_z_m])
+
+
 def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: float) -> RigidTransform:
     """Draw the pose error of a plate on its fixture: a translation and a rotation in its plane."""
     error = random_pose_error(rng, translation_m, rotation_rad)
@@ -326,7 +346,9 @@ def _lying_error(rng: np.random.Generator, translation_m: float, rotation_rad: f
     return RigidTransform(RollPitchYaw(0.0, 0.0, sign * rotation_rad), p)
 
 
-def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, scenario: Scenario) -> None:
+def _export(
+    build: StationBuild, world: SimulatedWorld | None, truth: Truth, scenario: Scenario, surroundings: Surroundings
+) -> None:
     builder = build.builder
     for name, port in build.inputs.items():
         builder.ExportInput(port, name)
@@ -337,9 +359,10 @@ def _export(build: StationBuild, world: SimulatedWorld | None, truth: Truth, sce
             builder,
             build.arm,
             build.tool,
-            scenario.flange,
-            scenario.calibration.table_z_m,
-            build.outputs["ur10e.position_measured"],
+            scenario.flange_name(),
+            table_in_base(scenario),
+            build.outputs["arm.position_measured"],
+            surroundings,
         )
         builder.ExportOutput(drawn.get_query_output_port(), "query_object")
         return

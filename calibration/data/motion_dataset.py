@@ -24,12 +24,12 @@ from weldcal.calibration.data.header import DatasetHeader, Units
 from weldcal.calibration.data.tables import read_rows
 from weldcal.calibration.errors import DatasetError
 from weldcal.calibration.geometry.se3 import pose
-from weldcal.models.arms.chain import chain_poses, load_chain
+from weldcal.models.arms.chain import chain_poses, is_urdf
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.files import sha256
 from weldcal.models.limits import LARGEST_NUMBER
-from weldcal.models.robots import ROBOTS, get_robot
+from weldcal.models.robots import ROBOTS, get_chain, get_robot
 
 POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _RATE_S = (1e-4, 0.5)  # between two rows of a robot's stream
@@ -244,6 +244,8 @@ def _read_stream(path: Path, header: DatasetHeader, robot: str) -> tuple[RobotSt
         poses, q = _poses(path, table[:, 1:], header.units.poses), None
     else:
         q = table[:, 1:]
+        if is_urdf(robot) and not Path(robot).is_file():
+            robot = str(path.parent / robot)  # as dataset.yaml names it
         poses = _forward(path, q, robot)
     return RobotStream(table[:, 0], poses, q, robot), said
 
@@ -295,19 +297,20 @@ def _poses(path: Path, values: Array, unit: str) -> Array:
 def _forward(path: Path, q: Array, robot: str) -> Array:
     """Poses (n, 4, 4) of joint angles (n, J). Raises DatasetError where the robot is not known or the angles are none of it."""
     try:
-        found = get_robot(robot)
-    except InputError:
+        found = get_chain(robot)
+    except InputError as error:
+        if is_urdf(robot):
+            raise DatasetError(str(error)) from None
         raise DatasetError(
             f"'{path.name}' holds joint angles, and the robot '{robot}' is not known; use poses (x,y,z,qw,qx,qy,qz), or one of "
             f"{', '.join(ROBOTS)}."
         ) from None
-    if q.shape[1] != found.joints:
-        raise DatasetError(
-            f"'{path.name}' holds {q.shape[1]} joint angles; the {found.title} has {found.joints} joints."
-        )
+    if q.shape[1] != found.n:
+        title = Path(robot).name if is_urdf(robot) else get_robot(robot).title
+        raise DatasetError(f"'{path.name}' holds {q.shape[1]} joint angles; the {title} has {found.n} joints.")
     if float(np.abs(q).max()) > 2.0 * _FULL_TURN:
         raise DatasetError(f"'{path.name}' holds an angle of {np.abs(q).max():.4g}; give joint angles in radians.")
-    return chain_poses(load_chain(found.name), q)
+    return chain_poses(found, q)
 
 
 def _read_frames(path: Path, stream: RobotStream) -> tuple[list[FrameTime], list[tuple[str, str]]]:

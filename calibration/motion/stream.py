@@ -14,7 +14,7 @@ from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arms.chain import Chain, chain_poses
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
-from weldcal.models.robots import get_robot
+from weldcal.models.robots import get_chain
 
 Flags = NDArray[np.bool_]
 
@@ -53,7 +53,7 @@ class ContinuousMotion:
         self._chain: Chain | None = None
         self.inverted = inverted
         if stream.joints is not None:
-            self._chain = get_robot(stream.robot).chain
+            self._chain = get_chain(stream.robot)
             groups = [stream.joints]
         else:
             groups = [stream.poses[:, :3, 3], _continuous_quaternions(stream.poses[:, :3, :3])]

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
@@ -10,6 +10,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.errors import UnreachableScanner
 from weldcal.calibration.geometry.se3 import exp_rotation, skew
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes, self_distance
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, jacobian, link_frames, sigma_min
 from weldcal.models.arms.urdf import Capsule
@@ -26,7 +27,7 @@ class PlannerConfig:
     of the table in B; ``margin_m`` above it. ``image_margin``: share of the image kept free at each side, and of the
     working range at each end, for an uncertain X_BC. ``sight_margin_m``: how far the scanner may stand from its guess
     without the arm coming into its sight. ``feature_radius_m``: outer radius of the flange or ring.
-    ``max_travel_rad``: farthest any joint may go from the start. The sigmas weigh positions and normals in the
+    ``max_travel_rad``: farthest any joint may go from the start. ``surroundings``: what else the arm must not touch. The sigmas weigh positions and normals in the
     information.
     """
 
@@ -47,6 +48,7 @@ class PlannerConfig:
     candidates: int = 80
     max_trials: int = 3000
     work_point_B: tuple[float, float, float] | None = None
+    surroundings: Surroundings = field(default_factory=Surroundings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +140,9 @@ def _candidates(
         X_BF = X_BR @ X_RF
         if (
             float(np.linalg.norm(X_BF.translation())) > reach
-            or float(X_BR.translation()[2]) < config.table_z_m + config.margin_m
+            or float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m
         ):
-            low = float(X_BR.translation()[2]) < config.table_z_m + config.margin_m
+            low = float(arm.up @ X_BR.translation()) < config.table_z_m + config.margin_m
             why["the table is in the way" if low else "the scanner's working range is out of the arm's reach"] += 1
             continue
         q = nearest_solution(arm, X_BF, q_start)
@@ -198,16 +200,21 @@ def _refuse(
     if sigma_min(jacobian(arm, q)) < config.min_sigma:
         return "the arm would stand in a singularity"
     frames = link_frames(arm, q)
-    if lowest_point(bodies, frames) < config.table_z_m + config.margin_m:
+    if lowest_point(bodies, frames, arm.up) < config.table_z_m + config.margin_m:
         return "the table is in the way"
     if self_distance(bodies, frames) < config.self_clearance_m:
         return "the arm would touch itself"
+    if touched := config.surroundings.touched(bodies, frames):
+        return f"{touched} is in the way"
     eye = np.asarray(X_BC.translation())
     ring_B = (X_BR @ ring_R.T).T
     hidden, near_eye = occludes(bodies, frames, eye, ring_B, config.sight_margin_m)
     if near_eye < config.scanner_clearance_m:
         return "the arm would come too close to the scanner"
-    return "the arm hides the flange from the scanner" if hidden else None
+    if hidden:
+        return "the arm hides the flange from the scanner"
+    between = config.surroundings.blocks(eye, ring_B)
+    return f"{between} hides the flange from the scanner" if between else None
 
 
 def _information(X_BR: RigidTransform, X_BC: RigidTransform, work: Array, config: PlannerConfig) -> Array:

@@ -11,7 +11,8 @@ from weldcal.models.arms.urdf import Capsule, link_capsules
 from weldcal.models.arrays import Array
 
 TOOL = 7  # bodies of the tool: on the flange, one link further than wrist 3
-_STANDING = (0, 1)  # base and shoulder stand on the table by design
+STANDING = (0, 1)  # links: base and shoulder stand on the table by design
+_UP = np.array([0.0, 0.0, 1.0])
 _SAMPLES = np.linspace(0.0, 1.0, 5)
 
 
@@ -32,21 +33,22 @@ def arm_bodies(arm: ArmModel, tool: Sequence[Capsule] = ()) -> list[Body]:
     return bodies + [Body(TOOL, 6, c.p_start, c.p_end, c.radius) for c in tool]
 
 
-def _ends(body: Body, frames: list[RigidTransform]) -> tuple[Array, Array]:
+def body_ends(body: Body, frames: list[RigidTransform]) -> tuple[Array, Array]:
+    """Both ends of a body's axis (3,) in B, m, with the arm's links at `frames`."""
     X = frames[body.frame]
     return np.asarray(X @ body.p_start), np.asarray(X @ body.p_end)
 
 
-def lowest_point(bodies: list[Body], frames: list[RigidTransform]) -> float:
-    """Lowest z (m, in B) of all bodies that move."""
-    moving = [b for b in bodies if b.link not in _STANDING]
-    return min(min(float(e[2]) for e in _ends(b, frames)) - b.radius for b in moving)
+def lowest_point(bodies: list[Body], frames: list[RigidTransform], up: Array = _UP) -> float:
+    """Lowest height (m over B's origin, along ``up`` (3,), a unit vector in B) of all bodies that move."""
+    moving = [b for b in bodies if b.link not in STANDING]
+    return min(min(float(e @ up) for e in body_ends(b, frames)) - b.radius for b in moving)
 
 
 def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
     """Smallest gap (m) between bodies at least three links apart (nearer ones share a joint housing); segments are
     sampled."""
-    placed = [(b, np.linspace(*_ends(b, frames), len(_SAMPLES))) for b in bodies]
+    placed = [(b, np.linspace(*body_ends(b, frames), len(_SAMPLES))) for b in bodies]
     gap = np.inf
     for i, (a, pa) in enumerate(placed):
         for b, pb in placed[i + 1 :]:
@@ -60,13 +62,13 @@ def self_distance(bodies: list[Body], frames: list[RigidTransform]) -> float:
 def path_clearance(
     arm: ArmModel, bodies: list[Body], q_a: Array, q_b: Array, step_rad: float = 0.1
 ) -> tuple[float, float]:
-    """Lowest z (m, in B) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
+    """Lowest height (m over B's origin, along the arm's ``up``) of the moving bodies and smallest gap (m) between bodies on a path straight in joint space.
 
     ``q_a``, ``q_b`` (6,) rad; the path is sampled so that no joint turns by more than ``step_rad`` between samples.
     """
     n = int(np.ceil(float(np.abs(q_b - q_a).max()) / step_rad)) + 1
     placed = [link_frames(arm, q_a + u * (q_b - q_a)) for u in np.linspace(0.0, 1.0, max(n, 2))]
-    return min(lowest_point(bodies, f) for f in placed), min(self_distance(bodies, f) for f in placed)
+    return min(lowest_point(bodies, f, arm.up) for f in placed), min(self_distance(bodies, f) for f in placed)
 
 
 def occludes(
@@ -80,7 +82,7 @@ def occludes(
     """
     hidden, gap = False, np.inf
     for body in bodies:
-        start, end = _ends(body, frames)
+        start, end = body_ends(body, frames)
         gap = min(gap, float(_point_segment(eye[None], start, end)[0]) - body.radius)
         if bool((_point_segment(targets, start, end) < body.radius + 0.005).any()):
             continue

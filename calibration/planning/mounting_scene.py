@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from weldcal.calibration.geometry.se3 import IDENTITY
 from weldcal.calibration.hand_eye.mountings import Mounting, TargetObservation, get_mounting, problem_of
 from weldcal.calibration.hand_eye.problem import Problem, State
 from weldcal.calibration.planning.clearance import Body, arm_bodies, lowest_point, occludes
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel, link_frames
 from weldcal.models.arrays import Array
 from weldcal.models.scanners import ScannerPreset
@@ -47,6 +48,7 @@ class MountingScene:
     arm_2: ArmModel | None = None
     X_BD: RigidTransform | None = None
     q_home_2: Array | None = None
+    surroundings: Surroundings = field(default_factory=Surroundings)
 
     @property
     def mounting(self) -> Mounting:
@@ -142,6 +144,10 @@ class Bodies:
 
     def gap(self, frames: list[RigidTransform], frames_2: list[RigidTransform] | None) -> float:
         """Smallest distance (m) between bodies that can meet; the scanner's carrier and its neighbours do not count."""
+        if self.scene.surroundings.touched([*self.arm, *self.scanner], frames):
+            return -np.inf
+        if frames_2 is not None and self.scene.surroundings.touched(self.arm_2, frames_2):
+            return -np.inf
         here = _placed(self._first, frames)
         least = float((_distances(here, here) - self._own).min())
         if frames_2 is not None:

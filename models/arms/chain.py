@@ -10,6 +10,7 @@ from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import known_arms, load_arm
+from weldcal.models.arms.urdf_file import read_urdf_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -46,8 +47,17 @@ def known_chains() -> tuple[str, ...]:
     return tuple(sorted({p.parent.name for p in _HERE.glob("*/chain.yaml")} | set(known_arms())))
 
 
+def is_urdf(name: str) -> bool:
+    """Whether an arm's name is that of a URDF file."""
+    return name.lower().endswith(".urdf")
+
+
 def load_chain(name: str) -> Chain:
-    """The arm of that name as a chain. Raises InputError naming the known ones, or where its file is not one."""
+    """The arm of that name, or of a URDF file, as a chain. Raises InputError naming the known ones, or where its file is not one."""
+    if is_urdf(name):
+        if not Path(name).is_file():
+            raise InputError(f"There is no file '{name}' of an arm.")
+        return Chain(Path(name).name, *read_urdf_chain(Path(name)))
     if name in known_arms():
         arm = load_arm(name)
         limits = (arm.position_lower, arm.position_upper, arm.velocity_limit)

@@ -8,7 +8,7 @@ factory calibration has the same schema as the nominal numbers, so nothing else 
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,17 @@ class DenavitHartenberg:
     d6: float
 
 
+@dataclass(frozen=True)
+class Housings:
+    """Radii (m) of the joints' housings and of the two tubes, for the drawn body and its capsules."""
+
+    shoulder: float
+    elbow: float
+    wrist: float
+    upper_tube: float
+    forearm_tube: float
+
+
 @dataclass(frozen=True, eq=False)
 class ArmModel:
     """One arm. Arrays are read-only; joint order is `joint_names`, link order is `link_names` (link 0 is the base).
@@ -57,8 +68,9 @@ class ArmModel:
     stack is (6, 4, 4): the link transforms as homogeneous matrices, the one source of the kinematics. Limits are (6,)
     in rad, rad/s, rad/s^2, Nm (the acceleration limits are a model choice, see joint_limits.yaml). masses (6,) kg,
     centers_of_mass (6, 3) m in the link frames, inertias (6, 3, 3) kg m^2 about the centre of mass in link axes.
-    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m). calibration is
-    the hash of the factory calibration in use ("" if its file names none), or None for the nominal numbers.
+    tube_offsets are the places of upper arm and forearm along the axes of shoulder lift and elbow (m), housings the radii
+    of the drawn body. calibration is the hash of the factory calibration in use ("" if its file names none), or None for the nominal numbers.
+    up (3,) is the unit vector against gravity in B: +z of an arm that stands.
     """
 
     name: str
@@ -78,7 +90,9 @@ class ArmModel:
     inertias: Array
     tube_offsets: tuple[float, float]
     dh: DenavitHartenberg
+    housings: Housings
     calibration: str | None = None
+    up: Array = field(default_factory=lambda: _frozen([0.0, 0.0, 1.0]))
 
     @property
     def transforms(self) -> tuple[RigidTransform, ...]:
@@ -118,6 +132,7 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
     inertia = _read(physical, "inertia_parameters")
     dh = _read(physical, "dh_parameters")
     offsets = _read(physical, "offsets")
+    radii = _read(physical, "housing_radii")
 
     def limit(key: str) -> Array:
         return _frozen([_number(limits, joint, key) for joint in JOINT_NAMES])
@@ -144,8 +159,16 @@ def load_arm(name: str = "ur10e", kinematics: Path | None = None) -> ArmModel:
         inertias=_frozen([R @ tensor @ R.T for R, tensor in zip(rotations, tensors, strict=True)]),
         tube_offsets=(_number(offsets, "shoulder_offset"), _number(offsets, "elbow_offset")),
         dh=DenavitHartenberg(**{k: _number(dh, k) for k in ("d1", "a2", "a3", "d4", "d5", "d6")}),
+        housings=Housings(**{f.name: _number(radii, f.name) for f in fields(Housings)}),
         calibration=calibration,
     )
+
+
+def mounted(arm: ArmModel, X_WB: RigidTransform) -> ArmModel:
+    """The same arm with its base at X_WB in a world whose z points up: on a ceiling, a wall or a pedestal."""
+    # exactly +z for an upright base: rounding must not change a plan
+    up = X_WB.rotation().matrix()[2]
+    return replace(arm, up=_frozen(np.where(np.abs(up - np.round(up)) < 1e-12, np.round(up), up)))
 
 
 def with_link_transforms(arm: ArmModel, stack: Array, calibration: str | None, source: str) -> ArmModel:

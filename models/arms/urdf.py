@@ -15,7 +15,7 @@ from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arrays import Array
 
 FLANGE_DISC_M = 0.006  # the last millimetres before the flange plane, left to the flange's own mesh
-WRIST_3_RADIUS_M = 0.045
+WRIST_3_RADIUS_M = 0.045  # of the UR10e; see wrist_3_size
 WRIST_3_LENGTH_M = 0.046
 
 _BODY = (0.80, 0.81, 0.82)
@@ -23,8 +23,8 @@ _CAP = (0.35, 0.45, 0.55)
 _SEAL = (0.13, 0.14, 0.15)
 _COLOR_NAMES = {_BODY: "light_grey", _CAP: "blue_grey", _SEAL: "charcoal"}
 
-_BIG, _ELBOW, _WRIST = 0.076, 0.064, 0.0465  # housing radii of the three joint sizes
-_UPPER_TUBE, _FORE_TUBE = 0.061, 0.049
+# The lengths below are those of the UR10e's body, whose housings have these radii; another arm's grow with its own radii.
+_BIG, _ELBOW, _WRIST = 0.076, 0.064, 0.0465
 _SEAL_LENGTH, _SEAL_INSET = 0.004, 0.001
 _DOME = 0.45  # height of a cap over its radius
 
@@ -102,78 +102,118 @@ def arm_urdf(arm: ArmModel, model_name: str | None = None) -> str:
     return ET.tostring(robot, encoding="unicode")
 
 
+@dataclass(frozen=True)
+class _Sizes:
+    """Radii of an arm's housings, and its size by joint relative to the UR10e: lengths of housings grow with their radii."""
+
+    big: float
+    mid: float
+    small: float
+    shoulder: float
+    elbow: float
+    wrist: float
+
+    @staticmethod
+    def of(arm: ArmModel) -> "_Sizes":
+        """The sizes of an arm."""
+        h = arm.housings
+        return _Sizes(h.shoulder, h.elbow, h.wrist, h.shoulder / _BIG, h.elbow / _ELBOW, h.wrist / _WRIST)
+
+
+def wrist_3_size(arm: ArmModel) -> tuple[float, float]:
+    """Radius and length (m) of the last link's drawn body, behind the flange disc."""
+    size = _Sizes.of(arm)
+    free = arm.dh.d6 - size.small - FLANGE_DISC_M - _SEAL_LENGTH  # between the housing of wrist 2 and the flange disc
+    return WRIST_3_RADIUS_M * size.wrist, min(WRIST_3_LENGTH_M * size.wrist, free)
+
+
+def _column(arm: ArmModel, size: _Sizes) -> float:
+    """Height (m) of the fixed column: below the housing of the shoulder's lift joint, which turns above it."""
+    return min(0.094 * size.shoulder, arm.dh.d1 - size.big - _SEAL_LENGTH)
+
+
 def link_capsules(arm: ArmModel) -> list[Capsule]:
     """Capsules (spheres included) that enclose the drawn body of every link, in link frames, for clearance checks."""
     upper, fore, shoulder, elbow = arm.dh.a2, arm.dh.a3, *arm.tube_offsets
-    big, mid, small = _BIG + 0.004, _ELBOW + 0.004, _WRIST + 0.004
+    size = _Sizes.of(arm)
+    b, m, w = size.shoulder, size.elbow, size.wrist
+    big, mid, small = size.big + 0.004, size.mid + 0.004, size.small + 0.004
+    foot_end = min(-0.075 * b, _column(arm, size) + 0.003 * b - arm.dh.d1 + 0.01)
+    lift_start = min(shoulder - 0.08 * b, 0.108 * b)
+    elbow_end = max(elbow + 0.06 * m, 0.5 * (shoulder + elbow) - 0.02 * m)
     rows: list[tuple[int, ArrayLike, ArrayLike, float]] = [
-        (0, (0.0, 0.0, 0.01), (0.0, 0.0, 0.075), 0.1),
-        (1, (0.0, 0.0, -0.075), (0.0, 0.0, 0.0), big),
-        (1, (0.0, -0.08, 0.0), (0.0, 0.08, 0.0), big),
-        (2, (0.0, 0.0, shoulder - 0.08), (0.0, 0.0, shoulder + 0.08), big),
-        (2, (0.0, 0.0, shoulder), (upper, 0.0, shoulder), mid),
-        (2, (upper, 0.0, shoulder - 0.065), (upper, 0.0, shoulder + 0.07), mid),
-        (3, (0.0, 0.0, elbow - 0.065), (0.0, 0.0, elbow + 0.06), mid),
-        (3, (0.0, 0.0, elbow), (fore, 0.0, elbow), _FORE_TUBE + 0.008),
-        (3, (fore, 0.0, elbow - 0.055), (fore, 0.0, elbow + 0.05), small + 0.002),
-        (4, (0.0, 0.0, -0.08), (0.0, 0.0, 0.05), small),
-        (4, (0.0, 0.0, 0.0), (0.0, -0.06, 0.0), small),
-        (5, (0.0, 0.0, -0.055), (0.0, 0.0, 0.05), small),
-        (5, (0.0, 0.0, 0.0), (0.0, 0.06, 0.0), small),
+        (0, (0.0, 0.0, 0.01), (0.0, 0.0, 0.075 * b), 0.1 * b),
+        (1, (0.0, 0.0, foot_end), (0.0, 0.0, 0.0), big),
+        (1, (0.0, -0.08 * b, 0.0), (0.0, 0.08 * b, 0.0), big),
+        (2, (0.0, 0.0, lift_start), (0.0, 0.0, shoulder + 0.08 * b), big),
+        (2, (0.0, 0.0, shoulder), (upper, 0.0, shoulder), max(mid, arm.housings.upper_tube + 0.007 * b)),
+        (2, (upper, 0.0, shoulder - 0.065 * m), (upper, 0.0, shoulder + 0.07 * m), mid),
+        (3, (0.0, 0.0, elbow - 0.065 * m), (0.0, 0.0, elbow_end), mid),
+        (3, (0.0, 0.0, elbow), (fore, 0.0, elbow), arm.housings.forearm_tube + 0.008),
+        (3, (fore, 0.0, elbow - 0.055 * w), (fore, 0.0, elbow + 0.05 * w), small + 0.002),
+        (4, (0.0, 0.0, -0.08 * w), (0.0, 0.0, 0.05 * w), small),
+        (4, (0.0, 0.0, 0.0), (0.0, -0.06 * w, 0.0), small),
+        (5, (0.0, 0.0, -0.055 * w), (0.0, 0.0, 0.05 * w), small),
+        (5, (0.0, 0.0, 0.0), (0.0, 0.06 * w, 0.0), small),
     ]
-    middle = (0.0, 0.0, -FLANGE_DISC_M - WRIST_3_LENGTH_M / 2.0)
-    rows.append((6, middle, middle, float(np.hypot(WRIST_3_RADIUS_M, WRIST_3_LENGTH_M / 2.0))))
+    radius, length = wrist_3_size(arm)
+    middle = (0.0, 0.0, -FLANGE_DISC_M - length / 2.0)
+    rows.append((6, middle, middle, float(np.hypot(radius, length / 2.0))))
     return [Capsule(i, np.array(a, dtype=np.float64), np.array(b, dtype=np.float64), r) for i, a, b, r in rows]
 
 
 def _solids(arm: ArmModel) -> list[_Solid]:
     """The drawn body: each joint has a housing on its axis, a seal where it turns, a domed cap at its blind end."""
     upper, fore, shoulder, elbow = arm.dh.a2, arm.dh.a3, *arm.tube_offsets
+    size, tube_u, tube_f = _Sizes.of(arm), arm.housings.upper_tube, arm.housings.forearm_tube
+    big, mid, small, b, m, w = size.big, size.mid, size.small, size.shoulder, size.elbow, size.wrist
+    column = _column(arm, size)
     elbow_split = 0.5 * (shoulder + elbow)  # where forearm meets upper arm, along the elbow axis
-    wrist_1_split = 0.5 * (elbow + arm.dh.d4) - 0.016
+    wrist_1_split = 0.5 * (elbow + arm.dh.d4) - 0.016 * w
     wrist_1_start = wrist_1_split - arm.dh.d4 + _SEAL_LENGTH
     wrist_2_start = -arm.dh.d5 / 2.0 + _SEAL_LENGTH
-    wrist_3_start = -FLANGE_DISC_M - WRIST_3_LENGTH_M
+    wrist_3_radius, wrist_3_length = wrist_3_size(arm)
+    wrist_3_start = -FLANGE_DISC_M - wrist_3_length
     wrist_2_end = arm.dh.d6 + wrist_3_start
     return [
         # Base: a foot, a step, the fixed half of the first joint.
-        _rod(0, "z", (0.0, 0.0), 0.0, 0.014, 0.095, _BODY),
-        _rod(0, "z", (0.0, 0.0), 0.014, 0.030, 0.083, _BODY),
-        _rod(0, "z", (0.0, 0.0), 0.030, 0.094, _BIG, _BODY),
-        _seal(0, "z", (0.0, 0.0), 0.094, _BIG),
+        _rod(0, "z", (0.0, 0.0), 0.0, 0.014 * b, 0.095 * b, _BODY),
+        _rod(0, "z", (0.0, 0.0), 0.014 * b, 0.030 * b, 0.083 * b, _BODY),
+        _rod(0, "z", (0.0, 0.0), 0.030 * b, column, big, _BODY),
+        _seal(0, "z", (0.0, 0.0), column, big),
         # Shoulder: upright housing turning into the one along the lift axis (-y carries the arm).
-        _rod(1, "z", (0.0, 0.0), 0.097 - arm.dh.d1, 0.0, _BIG, _BODY),
-        _rod(1, "y", (0.0, 0.0), -0.085, 0.070, _BIG, _BODY),
-        _seal(1, "y", (0.0, 0.0), -0.088, _BIG),
-        *_cap(1, "y", (0.0, 0.0), 0.070, 1.0, _BIG),
+        _rod(1, "z", (0.0, 0.0), column + 0.003 * b - arm.dh.d1, 0.0, big, _BODY),
+        _rod(1, "y", (0.0, 0.0), -0.085 * b, 0.070 * b, big, _BODY),
+        _seal(1, "y", (0.0, 0.0), -0.088 * b, big),
+        *_cap(1, "y", (0.0, 0.0), 0.070 * b, 1.0, big),
         # Upper arm: its own half of the lift joint, the tube with two collars, its half of the elbow.
-        _rod(2, "z", (0.0, 0.0), 0.088, shoulder + 0.070, _BIG, _BODY),
-        *_cap(2, "z", (0.0, 0.0), shoulder + 0.070, 1.0, _BIG),
-        _rod(2, "x", (0.0, shoulder), upper, 0.0, _UPPER_TUBE, _BODY),
-        _rod(2, "x", (0.0, shoulder), -0.112, -0.02, _UPPER_TUBE + 0.005, _BODY),
-        _rod(2, "x", (0.0, shoulder), upper + 0.02, upper + 0.098, _UPPER_TUBE + 0.0025, _BODY),
-        _rod(2, "z", (upper, 0.0), elbow_split + _SEAL_LENGTH, shoulder + 0.062, _ELBOW, _BODY),
-        _seal(2, "z", (upper, 0.0), elbow_split, _ELBOW),
-        *_cap(2, "z", (upper, 0.0), shoulder + 0.062, 1.0, _ELBOW),
+        _rod(2, "z", (0.0, 0.0), 0.088 * b, shoulder + 0.070 * b, big, _BODY),
+        *_cap(2, "z", (0.0, 0.0), shoulder + 0.070 * b, 1.0, big),
+        _rod(2, "x", (0.0, shoulder), upper, 0.0, tube_u, _BODY),
+        _rod(2, "x", (0.0, shoulder), -0.112 * b, -0.02 * b, tube_u + 0.005 * b, _BODY),
+        _rod(2, "x", (0.0, shoulder), upper + 0.02 * m, upper + 0.098 * m, tube_u + 0.0025 * m, _BODY),
+        _rod(2, "z", (upper, 0.0), elbow_split + _SEAL_LENGTH, shoulder + 0.062 * m, mid, _BODY),
+        _seal(2, "z", (upper, 0.0), elbow_split, mid),
+        *_cap(2, "z", (upper, 0.0), shoulder + 0.062 * m, 1.0, mid),
         # Forearm: elbow half, tube, and its half of wrist 1.
-        _rod(3, "z", (0.0, 0.0), elbow - 0.055, elbow_split, _ELBOW, _BODY),
-        *_cap(3, "z", (0.0, 0.0), elbow - 0.055, -1.0, _ELBOW),
-        _rod(3, "x", (0.0, elbow), fore, 0.0, _FORE_TUBE, _BODY),
-        _rod(3, "x", (0.0, elbow), -0.098, -0.02, _FORE_TUBE + 0.004, _BODY),
-        _rod(3, "z", (fore, 0.0), elbow - 0.048, wrist_1_split, _WRIST + 0.0045, _BODY),
-        *_cap(3, "z", (fore, 0.0), elbow - 0.048, -1.0, _WRIST + 0.0045),
-        _seal(3, "z", (fore, 0.0), wrist_1_split, _WRIST),
+        _rod(3, "z", (0.0, 0.0), elbow - 0.055 * m, elbow_split, mid, _BODY),
+        *_cap(3, "z", (0.0, 0.0), elbow - 0.055 * m, -1.0, mid),
+        _rod(3, "x", (0.0, elbow), fore, 0.0, tube_f, _BODY),
+        _rod(3, "x", (0.0, elbow), -0.098 * m, -0.02 * m, tube_f + 0.004 * m, _BODY),
+        _rod(3, "z", (fore, 0.0), elbow - 0.048 * w, wrist_1_split, small + 0.0045 * w, _BODY),
+        *_cap(3, "z", (fore, 0.0), elbow - 0.048 * w, -1.0, small + 0.0045 * w),
+        _seal(3, "z", (fore, 0.0), wrist_1_split, small),
         # Wrists 1 and 2: an elbow pipe each.
-        _rod(4, "z", (0.0, 0.0), wrist_1_start, 0.042, _WRIST, _BODY),
-        *_cap(4, "z", (0.0, 0.0), 0.042, 1.0, _WRIST),
-        _rod(4, "y", (0.0, 0.0), -arm.dh.d5 / 2.0, 0.0, _WRIST, _BODY),
-        _seal(5, "z", (0.0, 0.0), wrist_2_start - _SEAL_LENGTH, _WRIST),
-        _rod(5, "z", (0.0, 0.0), wrist_2_start, 0.042, _WRIST, _BODY),
-        *_cap(5, "z", (0.0, 0.0), 0.042, 1.0, _WRIST),
-        _rod(5, "y", (0.0, 0.0), 0.0, wrist_2_end - _SEAL_LENGTH, _WRIST, _BODY),
-        _seal(5, "y", (0.0, 0.0), wrist_2_end - _SEAL_LENGTH, WRIST_3_RADIUS_M),
+        _rod(4, "z", (0.0, 0.0), wrist_1_start, 0.042 * w, small, _BODY),
+        *_cap(4, "z", (0.0, 0.0), 0.042 * w, 1.0, small),
+        _rod(4, "y", (0.0, 0.0), -arm.dh.d5 / 2.0, 0.0, small, _BODY),
+        _seal(5, "z", (0.0, 0.0), wrist_2_start - _SEAL_LENGTH, small),
+        _rod(5, "z", (0.0, 0.0), wrist_2_start, 0.042 * w, small, _BODY),
+        *_cap(5, "z", (0.0, 0.0), 0.042 * w, 1.0, small),
+        _rod(5, "y", (0.0, 0.0), 0.0, wrist_2_end - _SEAL_LENGTH, small, _BODY),
+        _seal(5, "y", (0.0, 0.0), wrist_2_end - _SEAL_LENGTH, wrist_3_radius),
         # Wrist 3 ends where the flange disc begins.
-        _rod(6, "z", (0.0, 0.0), wrist_3_start, -FLANGE_DISC_M, WRIST_3_RADIUS_M, _BODY),
+        _rod(6, "z", (0.0, 0.0), wrist_3_start, -FLANGE_DISC_M, wrist_3_radius, _BODY),
     ]
 
 

@@ -19,10 +19,26 @@ _MERGED = 1e-6  # of the part's size: corners that a file repeats for each trian
 
 
 def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
-    """Read a mesh, join its repeated corners, and find its sharp edges.
+    """Read a closed mesh and find its sharp edges.
 
     Raises:
-        InputError: the file is missing, empty, malformed, too large, has holes or is turned inside out.
+        InputError: the file is missing, empty, malformed, too large or has holes.
+    """
+    mesh = read_surface(path, unit_m)
+    if not mesh.watertight():
+        raise InputError(
+            f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a solid."
+        )
+    if mesh.volume < 0.0:
+        mesh = mesh.flipped()
+    return PartShape(path.name, mesh, mesh_edges(mesh), unit_m)
+
+
+def read_surface(path: Path, unit_m: float) -> TriMesh:
+    """Read a mesh, closed or open, in metres, and join its repeated corners.
+
+    Raises:
+        InputError: the file is missing, empty, malformed or too large.
     """
     if file_size(path, LARGEST_MESH) == 0:
         raise InputError(f"'{path.name}' is empty.")
@@ -38,14 +54,7 @@ def read_mesh_shape(path: Path, unit_m: float) -> PartShape:
     size = float(np.ptp(vertices, axis=0).max())
     if size <= 0.0:
         raise InputError(f"'{path.name}' has no extent: all its corners are one point.")
-    mesh = merge(TriMesh(vertices * unit_m, triangles), tolerance_m=_MERGED * size * unit_m)
-    if not mesh.watertight():
-        raise InputError(
-            f"'{path.name}' is not a closed surface (a hole, or triangles that face different ways): close it to a solid."
-        )
-    if mesh.volume < 0.0:
-        mesh = mesh.flipped()
-    return PartShape(path.name, mesh, mesh_edges(mesh), unit_m)
+    return merge(TriMesh(vertices * unit_m, triangles), tolerance_m=_MERGED * size * unit_m)
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from weldcal.models.errors import InputError
-from weldcal.models.files import file_size
+from weldcal.models.files import file_size, read_bytes
 from weldcal.models.mesh import TriMesh, merge
 from weldcal.models.workpieces.shape import UNITS_M, PartEdge, PartShape
 
@@ -22,6 +22,7 @@ CHORD_MM, FACET_RAD = 0.02, 0.05  # largest distance and angle between the mesh 
 EDGE_SPACING_MM = 0.5
 SMOOTH_RAD = math.radians(2.0)
 _MERGED_M = 1e-7
+_STRINGS, _HELD, _NAMED = re.compile(rb"'(?:[^']|'')*'"), re.compile(rb"#(\d+)\s*="), re.compile(rb"#(\d+)")
 _UNIT_NAMES = {"MILLIMETRE": "mm", "MILLIMETER": "mm", "METRE": "m", "METER": "m", "INCH": "inch"}
 
 
@@ -32,14 +33,35 @@ def read_step(path: Path, units: str | None = None) -> PartShape:
         InputError: no OpenCascade, not a STEP file, no solid in it, or another unit than `units`.
     """
     file_size(path, LARGEST_STEP)
-    with path.open("rb") as stream:
-        if b"ISO-10303-21" not in stream.read(4096):
-            raise InputError(f"'{path.name}' is not a STEP file: it does not begin with ISO-10303-21.")
+    _check_text(path)
     shape, unit = _transferred(path)
     if units is not None and unit is not None and unit != units:
         raise InputError(f"'{path.name}' is in {unit}, not in {units}: give units {unit}.")
     mesh, bodies = _mesh(shape, path)
     return PartShape(path.name, mesh, _edges(shape), UNITS_M[unit or units or "mm"], bodies)
+
+
+def _check_text(path: Path) -> None:
+    """Check what OpenCascade takes for granted: a whole file, and no reference to an entity that is not there.
+
+    Raises:
+        InputError: it is not a STEP file, is cut off or refers to what it does not hold.
+    """
+    content = read_bytes(path, LARGEST_STEP)
+    if b"ISO-10303-21" not in content[:4096]:
+        raise InputError(f"'{path.name}' is not a STEP file: it does not begin with ISO-10303-21.")
+    if b"END-ISO-10303-21" not in content[-4096:]:
+        raise InputError(f"'{path.name}' is cut off: it does not end with END-ISO-10303-21; export or copy it again.")
+    plain = _STRINGS.sub(b"''", content)
+    held = set(_HELD.findall(plain))
+    missing = set(_NAMED.findall(plain)) - held
+    if not held:
+        raise InputError(f"'{path.name}' is a STEP file without any shape: export the part again.")
+    if missing:
+        first = min(map(int, missing))
+        raise InputError(
+            f"'{path.name}' is damaged: it refers to #{first}, which it does not hold; export or copy it again."
+        )
 
 
 def _transferred(path: Path) -> tuple[Any, str | None]:
@@ -56,16 +78,19 @@ def _transferred(path: Path) -> tuple[Any, str | None]:
         messenger.RemovePrinter(printer)  # it would write its statistics to stdout
     reader = STEPControl_Reader()
     try:
-        status = reader.ReadFile(str(path))
+        if reader.ReadFile(str(path)) != IFSelect_ReturnStatus.IFSelect_RetDone:
+            raise InputError(f"'{path.name}' cannot be read as STEP: it is cut off or malformed; export it again.")
         lengths, angles, solids = (Sequence_TCollection_AsciiString() for _ in range(3))
         reader.FileUnits(lengths, angles, solids)
         names = {lengths.Value(k + 1).ToCString().upper() for k in range(lengths.Length())}
         reader.SetSystemLengthUnit(1.0)
         reader.TransferRoots()
         shape = reader.OneShape()
+    except InputError:
+        raise
     except Exception as error:  # OpenCascade raises several types
         raise InputError(f"'{path.name}' cannot be read as STEP: {_first_line(error)}.") from error
-    if status != IFSelect_ReturnStatus.IFSelect_RetDone or shape is None or shape.IsNull():
+    if shape is None or shape.IsNull():
         raise InputError(f"'{path.name}' holds no shape that can be read: export it again as STEP AP214 or AP242.")
     known = {_UNIT_NAMES[name] for name in names if name in _UNIT_NAMES}
     if len(known) > 1:

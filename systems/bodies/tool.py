@@ -8,6 +8,7 @@ from pydrake.geometry import (
     AddCompliantHydroelasticProperties,
     AddContactMaterial,
     Box,
+    Capsule,
     Cylinder,
     GeometryInstance,
     IllustrationProperties,
@@ -30,9 +31,11 @@ from pydrake.multibody.tree import (
     UnitInertia,
 )
 
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.flanges import flange_mesh, get_flange
 from weldcal.models.mesh import TriMesh
-from weldcal.models.tool import WeldingTool
+from weldcal.models.tool import ToolShape, WeldingTool
+from weldcal.models.tools.enclosing import shape_mesh
 from weldcal.systems.bodies.textured_board import textured_board
 from weldcal.welding.servo.deformation import TagModel, tag_cells
 
@@ -41,11 +44,12 @@ DARK = (0.16, 0.18, 0.21, 1.0)
 COPPER = (0.80, 0.45, 0.20, 1.0)
 SOFT = (0.18, 0.42, 0.62, 1.0)
 TABLE = (0.36, 0.38, 0.40, 1.0)
+SURROUNDINGS = (0.55, 0.50, 0.42, 1.0)
+COLOURS = {"dark": DARK, "steel": STEEL, "copper": COPPER, "soft": SOFT, "white": (1.0, 1.0, 1.0, 1.0)}
 CELL_PX = 32  # texels of a tag cell: more than those of the camera's picture of it
 # A camera pixel integrates light over its area through a lens; a renderer samples one point of it. The blur of lens and pixel,
 # in texels, is applied to the print. Without it, edges parallel to the pixel rows would be off by a tenth of a pixel.
 BLUR_TEXELS = 1.2
-TAG_PLATE_M = 0.016  # side of the white plate under the tag's print
 TAG_PLATE_DEPTH_M = 0.00005  # of its face below the print
 TIP_FRICTION = 0.2  # soft tip on steel
 # The contact model approximates a sphere by an inscribed polyhedron with this share of its volume (at a resolution of half the
@@ -58,11 +62,26 @@ def mesh_shape(mesh: TriMesh, name: str) -> Mesh:
     return Mesh(InMemoryMesh(mesh_file=MemoryFile(contents=mesh.to_obj(), extension=".obj", filename_hint=name)))
 
 
+def drake_shape(shape: ToolShape) -> Shape:
+    """A tool's shape for Drake."""
+    if shape.kind == "mesh":
+        return mesh_shape(shape_mesh(shape), "tool.obj")
+    kinds: dict[str, type[Shape]] = {"box": Box, "cylinder": Cylinder, "capsule": Capsule, "sphere": Sphere}
+    return kinds[shape.kind](*shape.size)
+
+
 def show(
     plant: MultibodyPlant, body: RigidBody, X: RigidTransform, shape: Shape, name: str, rgba: tuple[float, ...]
 ) -> None:
     """Register visual geometry on a body, for Meshcat and for rendered images."""
     plant.RegisterVisualGeometry(body, X, shape, name, np.array(rgba))
+
+
+def add_surroundings(plant: MultibodyPlant, surroundings: Surroundings) -> None:
+    """Add the cell's surroundings to the world as visual geometry."""
+    for k, obstacle in enumerate(surroundings.obstacles):
+        shape = mesh_shape(obstacle.mesh, f"surroundings_{k}.obj")
+        show(plant, plant.world_body(), RigidTransform(), shape, f"surroundings_{k}", SURROUNDINGS)
 
 
 def add_flange(plant: MultibodyPlant, arm: ModelInstanceIndex, flange: str) -> None:
@@ -97,52 +116,20 @@ def _print_tag(plant: MultibodyPlant, body: RigidBody, X: RigidTransform, tag: T
 def add_tool(
     plant: MultibodyPlant, arm: ModelInstanceIndex, tool: WeldingTool, contact_hint_m: float
 ) -> tuple[ModelInstanceIndex, tuple[PrismaticJoint, ...]]:
-    """Add plate, ring, camera and torch, welded to the flange, and the soft tip on three sprung prismatic joints."""
+    """Add the tool's bodies and its ring, welded to the flange, and the soft tip on three sprung prismatic joints."""
     instance = plant.AddModelInstance("tool")
     flange_frame = plant.GetFrameByName("flange", arm)
+    middle = np.array(tool.centre_of_mass_m)
     inertia = SpatialInertia(
-        tool.mass_kg,
-        np.array([0.03, 0.0, 0.05]),
-        UnitInertia.SolidBox(0.25, 0.08, 0.12).ShiftFromCenterOfMass(np.array([-0.03, 0.0, -0.05])),
+        tool.mass_kg, middle, UnitInertia.SolidBox(0.25, 0.08, 0.12).ShiftFromCenterOfMass(-middle)
     )
     plate = plant.AddRigidBody("tool_plate", instance, inertia)
     plant.WeldFrames(flange_frame, plate.body_frame())
-    t, r = tool.plate_thickness_m, tool.ring_offset_m
-    ring = flange_mesh(get_flange("tool-ring-63"), thickness_m=tool.ring_height_m)
-    show(plant, plate, RigidTransform([0.0, 0.0, t / 2]), Cylinder(0.0375, t), "mount", DARK)
-    show(plant, plate, RigidTransform([r / 2, 0.0, t / 2]), Box(r, 0.064, t), "bar", DARK)
-    show(plant, plate, RigidTransform([r, 0.0, t / 2]), Cylinder(0.0375, t), "ring_base", DARK)
-    show(plant, plate, tool.X_FR, mesh_shape(ring, "ring.obj"), "flange_like_ring", STEEL)
-    camera_z = tool.X_FK.translation()[2]
-    show(
-        plant,
-        plate,
-        RigidTransform([0.0, 0.0, t + (camera_z - 0.006 - t) / 2]),
-        Box(0.026, 0.026, camera_z - 0.006 - t),
-        "camera",
-        DARK,
-    )
-    for side in (-1.0, 1.0):  # the frame that carries the soft metamaterial, outside the camera's view
-        show(
-            plant,
-            plate,
-            RigidTransform([0.0, side * 0.034, (t + tool.tag_reach_m) / 2]),
-            Box(0.012, 0.004, tool.tag_reach_m - t),
-            f"post{side:+.0f}",
-            DARK,
-        )
-    p_FW = tool.X_FT @ tool.p_TW
-    length = p_FW[2] - 0.012 - t
-    show(
-        plant,
-        plate,
-        RigidTransform([p_FW[0] / 2 - 0.01, 0.0, t / 2 + t]),
-        Box(-p_FW[0] + 0.02, 0.03, t),
-        "torch_arm",
-        DARK,
-    )
-    show(plant, plate, RigidTransform([p_FW[0], 0.0, t + length / 2]), Cylinder(0.009, length), "torch_body", COPPER)
-    show(plant, plate, RigidTransform([p_FW[0], 0.0, p_FW[2] - 0.006]), Cylinder(0.0006, 0.012), "torch_wire", STEEL)
+    if tool.ring is not None:
+        ring = flange_mesh(tool.ring, thickness_m=tool.ring_height_m)
+        show(plant, plate, tool.X_FR, mesh_shape(ring, "ring.obj"), "flange_like_ring", STEEL)
+    for body_shape in tool.drawn():
+        show(plant, plate, body_shape.place.pose, drake_shape(body_shape), body_shape.name, COLOURS[body_shape.colour])
 
     # Three prismatic joints in series carry the tip; the springs are implicit PD controllers, stable at 2 ms with a mass of grams.
     parent = plant.AddFrame(_fixed_offset(plant, "tip_rest", plate, tool.X_FT))
@@ -159,12 +146,21 @@ def add_tool(
         joints.append(joint)
         parent = body.body_frame()
 
-    radius, reach = tool.tip_radius_m, tool.tip_reach_m - tool.tag_reach_m
+    X_TM = tool.X_TM
+    p_TM = X_TM.translation()
+    radius, reach = tool.tip_radius_m, float(p_TM[2])
     show(plant, body, RigidTransform(), Sphere(radius), "tip", SOFT)
-    show(plant, body, RigidTransform([0.0, 0.0, reach / 2 - 0.003]), Cylinder(0.0022, reach - 0.006), "finger", SOFT)
-    show(plant, body, RigidTransform([0.0, 0.0, reach - 0.0015]), Cylinder(0.026, 0.002), "membrane", SOFT)
-    X_TM = RigidTransform([0.0, 0.0, reach])
-    plate = Box(TAG_PLATE_M, TAG_PLATE_M, 0.0005)
+    show(
+        plant,
+        body,
+        RigidTransform([0.0, 0.0, reach / 2 - 0.003]),
+        Cylinder(tool.finger_radius_m, reach - 0.006),
+        "finger",
+        SOFT,
+    )
+    X_TMembrane = RigidTransform(X_TM.rotation(), [p_TM[0], p_TM[1], reach - 0.0015])
+    show(plant, body, X_TMembrane, Cylinder(tool.membrane_radius_m, 0.002), "membrane", SOFT)
+    plate = Box(tool.tag_plate_m, tool.tag_plate_m, 0.0005)
     X_TPlate = X_TM @ RigidTransform([0.0, 0.0, -0.00025 - TAG_PLATE_DEPTH_M])
     show(plant, body, X_TPlate, plate, "tag_white", (1.0, 1.0, 1.0, 1.0))
     _print_tag(plant, body, X_TM, tool_tag(tool))

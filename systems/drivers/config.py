@@ -29,6 +29,10 @@ class DriverConfig:
         """The arm that a simulated world holds in place of the controller's model; the model itself by default."""
         return arm
 
+    def torch_delay_s(self) -> float:
+        """How long a robot's driver waits from the command of the torch to the torch, s, such as for the shielding gas."""
+        return 0.0
+
 
 @dc.dataclass
 class NoDevice(DriverConfig):

@@ -1,4 +1,4 @@
-"""Checks that moves on straight lines in joint space keep the arm clear of the table and of itself."""
+"""Checks that moves on straight lines in joint space keep the arm clear of the table, the surroundings and itself."""
 
 from collections.abc import Sequence
 
@@ -22,9 +22,11 @@ def station_bodies(station: Station) -> list[Body]:
 
 
 def clear_move(scenario: Scenario, station: Station, bodies: list[Body], q_a: Joints, q_b: Joints) -> bool:
-    """Whether a straight move in joint space stays above the table and free of self-collision; (6,) rad."""
+    """Whether a straight move in joint space stays above the table, clear of the surroundings and of the arm itself; (6,) rad."""
+    if station.surroundings.touched_on_path(station.arm, bodies, q_a, q_b):
+        return False
     lowest, gap = path_clearance(station.arm, bodies, q_a, q_b)
-    return lowest > scenario.calibration.table_z_m and gap > 0.0
+    return lowest > scenario.table_height_m() and gap > 0.0
 
 
 def check_way_home(scenario: Scenario, station: Station) -> None:
@@ -41,7 +43,7 @@ def check_way_home(scenario: Scenario, station: Station) -> None:
     stands = ", ".join(f"{angle:.0f}" for angle in np.rad2deg(station.q_start))
     wanted = ", ".join(f"{angle:.0f}" for angle in scenario.home_deg)
     raise InputError(
-        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table or the arm itself: "
+        f"The arm is at [{stands}] deg, from where a straight joint move to home would touch the table, the surroundings or the arm itself: "
         f"move it by hand near home_deg [{wanted}] first."
     )
 
@@ -52,7 +54,7 @@ def clear_poses(
     """The poses that the FlangeMover can reach from the previous one and with a free move home, in their order.
 
     Raises:
-        UnreachableScanner: too many moves would touch the table or the arm itself.
+        UnreachableScanner: too many moves would touch the table, the surroundings or the arm itself.
     """
     c, home = scenario.calibration, np.deg2rad(scenario.home_deg)
     kept: list[PlannedPose] = []
@@ -65,7 +67,7 @@ def clear_poses(
     needed = 1 + c.maximum_scans + c.verification_scans
     if len(kept) < needed:
         raise UnreachableScanner(
-            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table or itself; "
+            f"Only {len(kept)} of {needed} calibration poses can be reached without contact of the arm with the table, the surroundings or itself; "
             "choose another home_deg or fewer maximum_scans."
         )
     return tuple(kept)

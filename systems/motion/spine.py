@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pydrake.systems.framework import LeafSystem, OutputPort
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.motion.command_arbiter import CommandArbiter
 from weldcal.systems.motion.flange_mover import FlangeMover
 from weldcal.systems.motion.operator_panel import OperatorPanel
@@ -15,7 +16,6 @@ from weldcal.systems.motion.slew_limiter import SlewLimiter
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.guards import SlewLimits
 
-FIRST = "ur10e"
 MOVE_SPEED, MOVE_ACCELERATION = 1.0, 2.5  # rad/s and rad/s^2 of the fastest joint, at speed_factor 1
 MOVE_TIMEOUT_S = 20.0  # at speed_factor 1
 JERK_LIMIT = 150.0  # rad/s^3: 100 ms to the acceleration limit of the large joints

@@ -3,17 +3,50 @@
 import math
 
 from weldcal.calibration.published.algorithm1 import named_cost
+from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.errors import InputError
+from weldcal.models.robots import get_robot
 from weldcal.systems.drivers.config import NoDevice
 from weldcal.systems.jobs.discovery import job_of, jobs
 from weldcal.systems.scenario.numbers import check_numbers
-from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.schema import PoseConfig, Scenario, ToolFile
 from weldcal.systems.scenario.workpiece import check_workpiece
 from weldcal.welding.servo.laws import get_law
 
 SLOWEST_FACTOR = 0.05
-FARTHEST_WORKPIECE_M = 2.0  # the UR10e reaches 1.3 m; its torch and half a plate add less than the rest
-DRAWN_ARMS = ("ur10e",)
+MASS_TOLERANCE_KG = 0.05  # as the pre-flight compares a payload
+BEYOND_REACH_M = 0.7  # torch and half a plate add less than this to an arm's reach
+
+
+def check_arm(scenario: Scenario) -> None:
+    """Check that the scenario's arm can be simulated and driven, and that it carries its tool.
+
+    Raises:
+        InputError: another arm than Universal Robots', or a tool heavier than its payload.
+    """
+    if scenario.arm not in known_arms():
+        raise InputError(
+            f"A cell runs with an arm of Universal Robots: {', '.join(known_arms())}; '{scenario.arm}' is none of them. "
+            "Other arms, and a URDF, serve recorded data: weldcal calibrate DATASET and weldcal hand-eye --robot my_arm.urdf."
+        )
+    payload, robot = get_robot(scenario.arm).payload_kg, scenario.robot
+    told = getattr(robot, "payload_kg", None)
+    if told is not None and told > payload:
+        raise InputError(
+            f"robot.payload_kg is {told:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
+            "lighter tool."
+        )
+    loaded = scenario.loaded_tool()
+    mass = 0.0 if loaded is None else loaded.tool.mass_kg
+    if isinstance(scenario.tool, ToolFile) and told is not None and abs(told - mass) > MASS_TOLERANCE_KG:
+        raise InputError(
+            f"robot.payload_kg is {told:g} kg, and the tool of {scenario.tool.file} weighs {mass:g} kg: make them equal."
+        )
+    if mass > payload:
+        raise InputError(
+            f"The tool weighs {mass:g} kg, and the payload of a {scenario.arm} is {payload:g} kg: take a stronger arm or a "
+            "lighter tool."
+        )
 
 
 def check_scenario(scenario: Scenario) -> None:
@@ -22,14 +55,16 @@ def check_scenario(scenario: Scenario) -> None:
     Raises:
         InputError: one sentence that says what to change.
     """
-    if scenario.arm not in DRAWN_ARMS:
-        raise InputError(
-            f"The arm must be {' or '.join(DRAWN_ARMS)}, whose shape the clearance checks know, not '{scenario.arm}'."
-        )
+    check_arm(scenario)
     if isinstance(scenario.robot, NoDevice):
         raise InputError("A cell needs a robot: write robot: !SimulatedUr {} in the scenario.")
     found = job_of(scenario)  # raises for the parts of two jobs
     check_numbers(scenario)
+    if found.key and scenario.base != PoseConfig():
+        raise InputError(
+            f"A {found.key} job runs with the robot's base upright at the world's origin only: leave out base, or calibrate with "
+            "the default job (job.weld: false)."
+        )
     for job in jobs():
         job.check(scenario)
     if not found.key and not scenario.job.calibrate and not scenario.job.weld:
@@ -48,9 +83,13 @@ def check_scenario(scenario: Scenario) -> None:
     if calibration.feature not in ("tool_ring", "flange"):
         raise InputError(f"calibration.feature must be tool_ring or flange, not '{calibration.feature}'.")
     named_cost(calibration.cost, 1e-3 * calibration.work_radius_mm, calibration.cost_axes)
-    if scenario.tool not in ("welding", "pen", "none"):
-        raise InputError(f"tool must be welding, pen or none, not '{scenario.tool}'.")
-    if (calibration.feature == "tool_ring") != (scenario.tool == "welding"):
+    if isinstance(scenario.tool, str) and scenario.tool not in ("welding", "pen", "none"):
+        raise InputError(f"tool must be welding, pen, none or {{file: my_tool.yaml}}, not '{scenario.tool}'.")
+    loaded = scenario.loaded_tool()
+    ring = loaded is not None and loaded.tool.ring is not None
+    if loaded is not None and not ring and calibration.feature == "tool_ring":
+        raise InputError(f"The tool of {loaded.file.name} has no ring to measure: write calibration.feature: flange.")
+    if (calibration.feature == "tool_ring") != ring:
         raise InputError("calibration.feature tool_ring goes with tool: welding, and flange with tool: none.")
     if not 4 <= calibration.minimum_scans <= calibration.maximum_scans:
         raise InputError("calibration.minimum_scans must be at least 4 and not above calibration.maximum_scans.")
@@ -59,13 +98,13 @@ def check_scenario(scenario: Scenario) -> None:
     ):
         raise InputError("A weld needs a workpiece, tool: welding and a finger_camera in the scenario.")
     get_law(scenario.welding.law)
-    workpiece = scenario.workpiece
+    workpiece, farthest = scenario.workpiece, get_robot(scenario.arm).reach_m + BEYOND_REACH_M
     if workpiece is not None:
         check_workpiece(workpiece)
-    if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > FARTHEST_WORKPIECE_M:
+    if workpiece is not None and math.hypot(*workpiece.pose_guess.xyz_m) > farthest:
         raise InputError(
-            f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; no arm reaches beyond "
-            f"{FARTHEST_WORKPIECE_M:g} m."
+            f"workpiece.pose_guess.xyz_m is {math.hypot(*workpiece.pose_guess.xyz_m):.3g} m from the robot; a {scenario.arm} with "
+            f"its torch does not reach beyond {farthest:.3g} m."
         )
     if scenario.workpiece is not None and scenario.workpiece.located_by not in ("scan", "drawing"):
         raise InputError(f"workpiece.located_by must be scan or drawing, not '{scenario.workpiece.located_by}'.")

@@ -7,19 +7,21 @@ from operator import or_
 from pathlib import Path
 from typing import Any
 
-from pydrake.common.yaml import yaml_load_typed
+from pydrake.common.yaml import yaml_load, yaml_load_typed
 
 from weldcal.models.documents import parse_document
 from weldcal.models.errors import InputError
 from weldcal.models.files import read_text
 from weldcal.models.limits import LARGEST_DOCUMENT
+from weldcal.models.scanners import get_scanner, is_scanner_file
 from weldcal.systems.drivers.config import DEVICES
 from weldcal.systems.drivers.discovery import default_config, driver_configs
 from weldcal.systems.jobs.discovery import jobs
 from weldcal.systems.scenario.checks import check_scenario
+from weldcal.systems.scenario.keys import check_keys
 from weldcal.systems.scenario.schema import Scenario
-from weldcal.systems.scenario.workpiece import resolved
 
+LARGEST_WIDTH = 4096
 SCENARIO_FOLDER = Path(__file__).resolve().parents[2] / "models" / "scenarios"
 
 
@@ -49,26 +51,92 @@ def load_scenario(name: str, overrides: str = "") -> Scenario:
     Raises:
         InputError: unknown name, unknown key, wrong type; the message says which.
     """
-    path = Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
-    if not path.exists():
-        raise InputError(
-            f"There is no scenario '{name}': choose one of {', '.join(scenario_names())} or give a YAML file."
-        )
-    schema = scenario_class()
-    scenario = schema()
-    for label, text in ((str(path.name), read_text(path, LARGEST_DOCUMENT)), ("the overrides", overrides)):
-        if not text.strip():
-            continue
-        parse_document(label, text)  # within bounds, no key twice
-        try:
-            scenario = yaml_load_typed(schema=schema, data=text, defaults=scenario)
-        except Exception as error:  # Drake's loader raises several types, and not every message names the key
-            what = " ".join(str(error).split())
-            raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
-    if scenario.workpiece is not None:
-        scenario.workpiece = resolved(scenario.workpiece, path.resolve().parent)
+    scenario = _read(name, ())
+    if overrides.strip():
+        scenario = _merged(scenario, "the overrides", overrides)
+        resolve_files(scenario, _path_of(name).parent)
+    _use_width_of_scanner_file(scenario)
+    _use_camera_of(scenario)
     check_scenario(scenario)
     return scenario
+
+
+def _path_of(name: str) -> Path:
+    return Path(name) if name.endswith((".yaml", ".yml")) else SCENARIO_FOLDER / f"{name}.yaml"
+
+
+def _read(name: str, before: tuple[Path, ...]) -> Scenario:
+    """The scenario of a file over the one that it extends; `before` are the files that have led to it."""
+    path = _path_of(name)
+    if not path.exists():
+        asked = (
+            f"{before[-1].name} extends '{name}', which does not exist" if before else f"There is no scenario '{name}'"
+        )
+        raise InputError(f"{asked}: choose one of {', '.join(scenario_names())} or give a YAML file.")
+    if path.resolve() in before:
+        raise InputError(f"{before[0].name} extends itself by way of {path.name}: remove one `extends`.")
+    text = read_text(path, LARGEST_DOCUMENT)
+    document = parse_document(path.name, text) if text.strip() else None  # within bounds, no key twice
+    base = document.get("extends") if isinstance(document, dict) else None
+    scenario = scenario_class()()
+    if base:
+        beside = path.parent / str(base)
+        scenario = _read(str(beside) if beside.suffix and beside.exists() else str(base), (*before, path.resolve()))
+    merged = _merged(scenario, path.name, text)
+    resolve_files(merged, path.parent)
+    return merged
+
+
+def _merged(scenario: Scenario, label: str, text: str) -> Scenario:
+    """A scenario with the keys of a YAML text in place of its own."""
+    if not text.strip():
+        return scenario
+    parse_document(label, text)
+    schema = scenario_class()
+    try:
+        check_keys(schema, yaml_load(data=text))
+        merged: Scenario = yaml_load_typed(schema=schema, data=text, defaults=scenario)
+    except InputError as error:
+        raise InputError(f"Scenario {label}: {str(error)[0].lower()}{str(error)[1:]}") from error
+    except Exception as error:  # Drake's loader raises several types, and not every message names the key
+        what = " ".join(str(error).split())
+        raise InputError(f"Scenario {label} cannot be read{_part_at_fault(text)}: {what}") from error
+    return merged
+
+
+def resolve_files(config: Any, folder: Path) -> None:
+    """Replace each relative path in a tree of configurations by the file beside the scenario, where there is one."""
+    for field in dc.fields(config):
+        value = getattr(config, field.name)
+        for item in value if isinstance(value, list) else [value]:
+            if dc.is_dataclass(item):
+                resolve_files(item, folder)
+        named = field.metadata.get("file") or (field.name.endswith("preset") and is_scanner_file(str(value)))
+        if named and value and not Path(value).is_absolute() and (folder / value).exists():
+            setattr(config, field.name, str(folder / value))
+
+
+def _use_width_of_scanner_file(scenario: Scenario) -> None:
+    """Make the image of a scanner from a file as wide as a preset's by default, in the file's shape."""
+    own = vars(scenario.scanner)
+    for key in [key for key in own if key.endswith("preset") and is_scanner_file(str(own[key]))]:
+        default = vars(type(scenario.scanner)())
+        if "width" in own and (own["width"], own["height"]) == (default["width"], default["height"]):
+            narrow = min(default["width"] or LARGEST_WIDTH, get_scanner(own[key]).width)
+            own["width"], own["height"] = narrow, None
+
+
+def _use_camera_of(scenario: Scenario) -> None:
+    """Give the finger camera what the tool's file says of it, where the scenario does not say otherwise."""
+    loaded, camera = scenario.loaded_tool(), scenario.finger_camera
+    if loaded is None:
+        return
+    for key in ("width", "height", "focal_px"):
+        if hasattr(camera, key) and getattr(camera, key) == getattr(type(camera)(), key):
+            setattr(camera, key, getattr(loaded.camera, key))
+    own = vars(camera)
+    if loaded.calibration and "calibration" in own and not own["calibration"]:
+        own["calibration"] = loaded.calibration
 
 
 def _part_at_fault(text: str) -> str:

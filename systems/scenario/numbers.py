@@ -26,7 +26,7 @@ NOT_NEGATIVE = {
     *("exposure_s", "latency_s", "noise_grey", "hidden_from_s", "knock_s", "verification_scans", "payload_kg"),
     *("repeatability_mm", "kinematic_error_mm", "warp_mm", "work_radius_mm"),
     *("translation_mm", "rotation_deg", "mounting_translation_mm", "mounting_rotation_deg"),
-    *("placement_translation_mm", "placement_rotation_deg"),
+    *("placement_translation_mm", "placement_rotation_deg", "margin_m"),
 }
 LENGTHS = {
     "xyz_m": 3,
@@ -35,6 +35,7 @@ LENGTHS = {
     "start_m": 3,
     "home_deg": 6,
     "payload_cog_m": 3,
+    "box_m": 3,
     "gradient_error_per_m": 2,
     "knock_mm": 3,
     "knock_deg": 3,
@@ -73,6 +74,10 @@ def check_numbers(config: Any, place: str = "") -> None:
         value, key = getattr(config, field.name), f"{place}{field.name}"
         if dc.is_dataclass(value):
             check_numbers(value, f"{key}.")
+            continue
+        if isinstance(value, list) and value and all(dc.is_dataclass(item) for item in value):
+            for k, item in enumerate(value):
+                check_numbers(item, f"{key}[{k}].")
             continue
         _check_type(key, field.type, value)
         if isinstance(value, list) and value and dc.is_dataclass(value[0]):

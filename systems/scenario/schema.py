@@ -1,17 +1,23 @@
 """The schema of a scenario YAML: typed configuration of one cell; devices and jobs add their own keys."""
 
 import dataclasses as dc
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.calibration.published.algorithm1 import COST_AXES
+from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.robots import get_robot
+from weldcal.models.tools.loading import WELDING, LoadedTool, load_tool
 from weldcal.systems.drivers.config import DriverConfig, NoDevice, ScannerConfig
 from weldcal.welding.locate.planning import PlanningMethod
 from weldcal.welding.record.process import WeldProcess
 
 JobConfigOf = TypeVar("JobConfigOf")
+FILE = {"file": True}
+"""Metadata of a key that names a file: a relative path is looked for beside the scenario first."""
 
 
 @dc.dataclass
@@ -24,6 +30,13 @@ class PoseConfig:
     def pose(self) -> RigidTransform:
         """The pose as a RigidTransform."""
         return RigidTransform(RollPitchYaw(np.deg2rad(self.rpy_deg)), self.xyz_m)
+
+
+@dc.dataclass
+class ToolFile:
+    """A tool of one's own: see docs/tool.md."""
+
+    file: str = dc.field(default="", metadata=FILE)
 
 
 @dc.dataclass
@@ -54,7 +67,7 @@ class CalibrationConfig:
     cost: str = "translation"  # cost metric of Algorithm 1: translation, work_radius or translation_and_rotation
     work_radius_mm: float = 200.0  # section 4.2: distance from the flange centre at which a rotation is weighted
     cost_axes: list[str] = dc.field(default_factory=lambda: list(COST_AXES))  # of work_radius: the weighted axes
-    table_z_m: float = 0.0
+    table_z_m: float = 0.0  # height of the table in the world W, whose origin is the base where `base` is not given
     clearance_m: float = 0.05
     work_point_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.05])  # used where there is no workpiece
 
@@ -63,7 +76,8 @@ class CalibrationConfig:
 class SeamConfig:
     """A seam on a part from a file: a polyline or edges."""
 
-    polyline: str | None = None  # CSV of x,y,z[,nx,ny,nz] in the part's frame and unit, relative to the scenario file
+    # CSV of x,y,z[,nx,ny,nz] in the part's frame and unit
+    polyline: str | None = dc.field(default=None, metadata=FILE)
     edges: list[int] = dc.field(default_factory=list)  # numbers from weldcal part FILE, in the order of travel
     direction: str = "forward"  # forward or reverse
     start_mm: float = 0.0  # cut off at the start
@@ -75,7 +89,8 @@ class WorkpieceConfig:
     """The nominal workpiece from its CAD, and the deviations of the true one."""
 
     shape: str = "s"  # s, straight or l; not used with a file
-    file: str | None = None  # STEP, STL, OBJ or PLY of a part of your own, relative to the scenario file
+    # STEP, STL, OBJ or PLY of a part of your own
+    file: str | None = dc.field(default=None, metadata=FILE)
     units: str | None = None  # of the file and its seams: mm, m or inch; null: the STEP file's own, mm for a mesh
     seams: list[SeamConfig] = dc.field(default_factory=list)  # of the file
     joint: str | None = None  # of the file: v_groove, butt, fillet or lap
@@ -88,6 +103,18 @@ class WorkpieceConfig:
     hole_from_mm: float | None = (
         None  # from this arc length on the true groove has no walls, which the scan does not show: contact is lost
     )
+
+
+@dc.dataclass
+class ObstacleConfig:
+    """A part of the cell's surroundings that the arm must not touch: a box, or the surface in a mesh file."""
+
+    name: str = ""  # in messages; empty: surroundings and a number
+    box_m: list[float] | None = None  # length along x, y and z of a box about the origin of its pose
+    mesh: str | None = dc.field(default=None, metadata=FILE)  # STEP, STL, OBJ or PLY file
+    unit: str = "mm"  # of the mesh: mm, m or inch
+    pose: PoseConfig = dc.field(default_factory=PoseConfig)  # in the robot's base
+    margin_m: float = 0.02  # how far the arm keeps away
 
 
 @dc.dataclass
@@ -160,10 +187,15 @@ class Scenario:
     """
 
     description: str = ""
-    arm: str = "ur10e"
-    kinematics: str | None = None  # a factory calibration in Universal Robots' kinematics.yaml schema
-    flange: str = "iso9409-1-50-4-m6"  # of the arm
-    tool: str = "welding"  # welding, pen or none
+    # a shipped scenario, or a YAML file beside this one: its values are used for the keys left out here
+    extends: str = ""
+    arm: str = "ur10e"  # a Universal Robots arm, ur3e to ur30
+    # X_WB: the robot's base in a world whose z points up; all other poses of a scenario are in B
+    base: PoseConfig = dc.field(default_factory=PoseConfig)
+    # a factory calibration in Universal Robots' kinematics.yaml schema
+    kinematics: str | None = dc.field(default=None, metadata=FILE)
+    flange: str = ""  # ISO 9409-1 designation of the arm's flange; empty: that of the arm (`weldcal robots`)
+    tool: ToolFile | str = "welding"  # welding, pen or none; or {file: my_tool.yaml}, relative to the scenario
     robot: DriverConfig = dc.field(default_factory=NoDevice)
     robot_2: DriverConfig = dc.field(default_factory=NoDevice)
     scanner: DriverConfig = dc.field(default_factory=NoDevice)
@@ -174,6 +206,7 @@ class Scenario:
     home_deg: list[float] = dc.field(default_factory=lambda: [0.0, -80.0, 110.0, -120.0, -90.0, 0.0])
     calibration: CalibrationConfig = dc.field(default_factory=CalibrationConfig)
     workpiece: WorkpieceConfig | None = None
+    surroundings: list[ObstacleConfig] = dc.field(default_factory=list)
     planning: PlanningConfig = dc.field(default_factory=PlanningConfig)
     welding: WeldingConfig = dc.field(default_factory=WeldingConfig)
     job: JobConfig = dc.field(default_factory=JobConfig)
@@ -183,6 +216,31 @@ class Scenario:
         """The part of the scenario of this type, such as a job's configuration; None where it has none."""
         found = (getattr(self, field.name) for field in dc.fields(self))
         return next((value for value in found if isinstance(value, kind)), None)
+
+    def table_height_m(self) -> float:
+        """Height of the table over the base's origin, against gravity, m."""
+        return self.calibration.table_z_m - self.base.xyz_m[2]
+
+    @property
+    def welds(self) -> bool:
+        """Whether the tool is one that welds."""
+        return self.tool == "welding" or isinstance(self.tool, ToolFile)
+
+    def loaded_tool(self) -> LoadedTool | None:
+        """The welding tool from its file; None for pen and none. Raises InputError where the file is no tool's."""
+        if not self.welds:
+            return None
+        return load_tool(Path(self.tool.file) if isinstance(self.tool, ToolFile) else WELDING)
+
+    def feature_standard(self) -> FlangeStandard:
+        """Dimensions of the feature that the scanner measures: the tool's ring, or the arm's flange."""
+        loaded = self.loaded_tool() if self.calibration.feature == "tool_ring" else None
+        ring = None if loaded is None else loaded.tool.ring
+        return get_flange(self.flange_name()) if ring is None else ring
+
+    def flange_name(self) -> str:
+        """Designation of the arm's flange: the scenario's, or that of the arm's maker."""
+        return self.flange or get_robot(self.arm).flange
 
     def scanner_config(self) -> ScannerConfig | None:
         """The scanner's configuration; None where there is no scanner."""

@@ -1,6 +1,5 @@
 """Makes a scenario's workpiece from its file: the part as drawn with its seam, and the part as it was made."""
 
-import dataclasses as dc
 import math
 from pathlib import Path
 
@@ -16,16 +15,6 @@ from weldcal.models.workpieces.shape import UNITS_M
 from weldcal.systems.scenario.schema import SeamConfig, WorkpieceConfig
 
 OF_PLATES = ("bend_radius_mm", "hole_from_mm")
-
-
-def resolved(spec: WorkpieceConfig, folder: Path) -> WorkpieceConfig:
-    """The workpiece with the paths of its files relative to the scenario's folder made absolute."""
-    if spec.file is None:
-        return spec
-    seams = [
-        seam if seam.polyline is None else dc.replace(seam, polyline=str(folder / seam.polyline)) for seam in spec.seams
-    ]
-    return dc.replace(spec, file=str(folder / spec.file), seams=seams)
 
 
 def check_workpiece(spec: WorkpieceConfig) -> None:

@@ -9,10 +9,11 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.bodies.tool import TABLE, add_flange, add_tool, show
+from weldcal.systems.bodies.tool import TABLE, add_flange, add_surroundings, add_tool, show
 
 
 def add_drawn_arm(
@@ -20,10 +21,11 @@ def add_drawn_arm(
     arm: ArmModel,
     tool: WeldingTool | None,
     flange: str,
-    table_z_m: float,
+    table: RigidTransform,
     position_measured: OutputPort,
+    surroundings: Surroundings,
 ) -> SceneGraph:
-    """Add a scene with the arm, its tool (tip at rest) and the table; frame: the world is the robot base B.
+    """Add a scene with arm, tool (tip at rest), table, its top's frame at `table` in B, and surroundings; frame: the world is the base B.
 
     `position_measured` (6) rad sets the arm's pose. The scene has no dynamics, no contact and no rendered sensors.
     """
@@ -36,8 +38,8 @@ def add_drawn_arm(
     add_flange(plant, instance, flange)
     if tool is not None:
         add_tool(plant, instance, tool, tool.tip_radius_m / 2)
-    table = RigidTransform([0.45, 0.0, table_z_m - 0.02])
-    show(plant, plant.world_body(), table, Box(1.5, 1.2, 0.04), "table", TABLE)
+    show(plant, plant.world_body(), table @ RigidTransform([0.0, 0.0, -0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    add_surroundings(plant, surroundings)
     plant.Finalize()
     poses = builder.AddSystem(MultibodyPositionToGeometryPose(plant))
     poses.set_name("drawn_poses")

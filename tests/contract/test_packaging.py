@@ -74,8 +74,10 @@ def test_the_list_of_packages_is_complete() -> None:
         for folder in FOLDERS
         for path in (ROOT / folder).rglob("__init__.py")
     }
-    assert sorted(listed) == sorted(there)
-    assert not (ROOT / "__init__.py").exists(), "the root is a namespace, not a package"
+    assert sorted(listed) == sorted({"weldcal"} | there)
+    assert [path.name for path in ROOT.glob("*.py")] == ["__init__.py"], (
+        "the root is the package weldcal, and nothing else"
+    )
 
 
 def test_each_folder_with_python_files_is_a_package() -> None:

@@ -31,7 +31,7 @@ from weldcal.tools.emulators.ur.versions import parse_version
 from weldcal.tools.studies.robot.bench import Bench
 from weldcal.tools.studies.robot.faults import recover
 
-OUTPUT = 3
+OUTPUT, VALVE = 3, 4
 TURNING = [0.1, 0.0, 0.0, 0.0, 0.0, 0.0]
 BASE = 24
 SILENT = 3
@@ -41,10 +41,10 @@ SPEED_J, SPEED_STOP, END = 9, 15, 255
 class Guarded:
     """The guard in a controller, frame by frame; a negative number asks for the process."""
 
-    def __init__(self, output: int | None = OUTPUT) -> None:
+    def __init__(self, output: int | None = OUTPUT, gas: int | None = None) -> None:
         self.controller = Controller(load_arm(), np.array(HOME), parse_version("5.21"))
         self.controller.terminals.digital_outputs = 0xFF  # somebody left them on
-        self.controller.submit(guard_script(True, output))
+        self.controller.submit(guard_script(True, output, gas))
         self.number = 0.0
         self.history: list[tuple[bool, float]] = []
         self.frames(5)
@@ -91,6 +91,15 @@ def test_the_guard_begins_with_the_process_off_and_burns_while_it_is_asked_to() 
     assert guarded.on  # an arc may burn while the arm stands
     guarded.speed(TURNING, 2, process=False)
     assert not guarded.on
+
+
+def test_the_gas_valve_closes_when_the_guard_ends_whoever_opened_it() -> None:
+    guarded = Guarded(OUTPUT, gas=VALVE)
+    guarded.speed(TURNING, 20, process=True)
+    assert guarded.controller.terminals.digital_outputs & 1 << VALVE  # the cell's own connection opens and closes it
+    guarded.frames(120, fed=False)  # nobody is there any more
+    assert not guarded.controller.terminals.digital_outputs & 1 << VALVE
+    assert guarded.controller.terminals.digital_outputs == 0xFF & ~(1 << VALVE) & ~(1 << OUTPUT)
 
 
 def test_a_guard_without_an_output_touches_none() -> None:
@@ -270,13 +279,13 @@ def test_the_cells_process_output_reaches_the_terminal_where_one_is_wired(bench:
     described.robot = UrRtde(host=bench.host, process_output=output)
     station = make_station(described, 0)
     with closing(station):
-        wired = station.diagram.HasInputPort("ur10e.process_on")
+        wired = station.diagram.HasInputPort("arm.process_on")
         assert wired == (output is not None)
         if not wired:
             return
         drive = Drive(station)
         clock = WallClock(1.0)
-        drive.set("ur10e.process_on", [1.0])
+        drive.set("arm.process_on", [1.0])
         for _ in range(50):
             drive.run(0.004)
             clock.wait_for(drive.time, moving=True)

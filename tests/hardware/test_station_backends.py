@@ -22,7 +22,7 @@ from weldcal.systems.messages import UrStatus
 from weldcal.systems.station import make_station
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
-SPEEDS = "ur10e.velocity_command"
+SPEEDS = "arm.velocity_command"
 PACE = 0.5
 SLOWLY = np.array([0.02, -0.03, 0.04, 0.05, -0.05, 0.06])  # rad/s
 REST_S = 0.3  # within which the arm must have come to rest, of the robot's time
@@ -49,7 +49,7 @@ class PacedDrive(Drive):
 
     @property
     def status(self) -> UrStatus:
-        found: UrStatus = self.get("ur10e.status")
+        found: UrStatus = self.get("arm.status")
         return found
 
     def moves_within(self, duration_s: float) -> float:
@@ -151,12 +151,12 @@ def test_a_worker_is_one_thread_that_runs_before_the_cell(backend: Backend, driv
 def test_the_position_is_held_from_the_start_and_zero_moves_nothing(drive: PacedDrive) -> None:
     start = drive.true_arm()
     assert drive.station.q_start == pytest.approx(start, abs=STILL_RAD)
-    assert drive.get("ur10e.position_measured") == pytest.approx(start, abs=STILL_RAD)
+    assert drive.get("arm.position_measured") == pytest.approx(start, abs=STILL_RAD)
     assert drive.moves_within(0.4) < STILL_RAD
-    assert drive.get("ur10e.position_measured") == pytest.approx(start, abs=STILL_RAD)
-    assert drive.get("ur10e.velocity_measured") == pytest.approx(0.0, abs=1e-3)
-    X_BF = forward_kinematics(drive.station.arm, drive.get("ur10e.position_measured"))
-    assert drive.get("ur10e.X_BF").IsNearlyEqualTo(X_BF, 1e-9)
+    assert drive.get("arm.position_measured") == pytest.approx(start, abs=STILL_RAD)
+    assert drive.get("arm.velocity_measured") == pytest.approx(0.0, abs=1e-3)
+    X_BF = forward_kinematics(drive.station.arm, drive.get("arm.position_measured"))
+    assert drive.get("arm.X_BF").IsNearlyEqualTo(X_BF, 1e-9)
     assert drive.status.ready
 
 
@@ -164,9 +164,9 @@ def test_a_velocity_is_followed_and_the_sample_carries_its_own_time(drive: Paced
     drive.run(0.1)
     drive.set(SPEEDS, SLOWLY)
     drive.run(0.3)
-    before, t_before = drive.get("ur10e.position_measured"), drive.get("ur10e.sample_time")[0]
+    before, t_before = drive.get("arm.position_measured"), drive.get("arm.sample_time")[0]
     drive.run(0.4)
-    after, t_after = drive.get("ur10e.position_measured"), drive.get("ur10e.sample_time")[0]
+    after, t_after = drive.get("arm.position_measured"), drive.get("arm.sample_time")[0]
     # A busy machine's late commands slow the arm along its path (`time_scale`), and delay a sample's arrival.
     moved = (after - before) / (t_after - t_before)
     kept = float(moved @ SLOWLY / (SLOWLY @ SLOWLY))
@@ -174,10 +174,10 @@ def test_a_velocity_is_followed_and_the_sample_carries_its_own_time(drive: Paced
     assert 0.0 < kept < 1.05
     assert t_after == pytest.approx(drive.time, abs=0.03)
     for _ in range(40):
-        if drive.get("ur10e.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3):
+        if drive.get("arm.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3):
             break
         drive.run(0.05)
-    assert drive.get("ur10e.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3), "reached while nothing is late"
+    assert drive.get("arm.velocity_measured") == pytest.approx(SLOWLY, abs=2e-3), "reached while nothing is late"
     world = drive.station.world
     seen = drive.station.world.plant.GetPositions(drive.plant, world.arm)
     assert seen == pytest.approx(drive.true_arm(), abs=2e-3), "what the cameras see is where the arm is"

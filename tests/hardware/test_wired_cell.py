@@ -183,8 +183,8 @@ def test_the_wired_cell_is_the_simulated_one_but_for_the_stations_inside(
         torch = {
             "process_on",
             "arc_established",
-            "ur10e.process_on",
-            "ur10e.arc_established",
+            "arm.process_on",
+            "arm.arc_established",
         }  # wired to a real one only
         wired, rendered = (structure(cell.diagram, torch) for cell in (welded[0].run.cell, simulated))
         assert rendered == wired

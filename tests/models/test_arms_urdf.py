@@ -19,8 +19,16 @@ from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import DiagramBuilder
 
 from weldcal.models.arms import kinematics as module
-from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian, link_frames, load_arm
-from weldcal.models.arms.urdf import FLANGE_DISC_M, WRIST_3_LENGTH_M, WRIST_3_RADIUS_M, arm_urdf, link_capsules
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian, known_arms, link_frames, load_arm
+from weldcal.models.arms.urdf import (
+    FLANGE_DISC_M,
+    WRIST_3_LENGTH_M,
+    WRIST_3_RADIUS_M,
+    arm_urdf,
+    link_capsules,
+    wrist_3_size,
+)
+from weldcal.models.robots import get_robot
 
 Array = NDArray[np.float64]
 
@@ -156,12 +164,13 @@ def beyond_capsules(arm: ArmModel, index: int, points: Array) -> Array:
     return np.min(outside, axis=0)
 
 
-def test_capsules_enclose_the_body_without_much_air() -> None:
-    arm = load_arm()
+@pytest.mark.parametrize("name", known_arms())
+def test_capsules_enclose_the_body_without_much_air(name: str) -> None:
+    arm = load_arm(name)
     for index, points in drawn_points(arm).items():
         outside = beyond_capsules(arm, index, points)
         assert outside.max() < 1e-3, arm.link_names[index]
-        assert np.median(outside) > -0.025, arm.link_names[index]
+        assert np.median(outside) > -0.025 / 0.076 * arm.housings.shoulder, arm.link_names[index]
     assert {c.link_index for c in link_capsules(arm)} == set(range(7))
 
 
@@ -172,16 +181,25 @@ def test_the_body_stops_where_the_flange_disc_begins() -> None:
     assert np.hypot(points[:, 0], points[:, 1]).max() == pytest.approx(WRIST_3_RADIUS_M, abs=1e-9)
 
 
-def test_neighbouring_links_touch_but_do_not_swallow_each_other() -> None:
+@pytest.mark.parametrize("name", known_arms())
+def test_the_last_link_carries_its_flange(name: str) -> None:
+    radius, length = wrist_3_size(load_arm(name))
+    assert radius >= 0.5 * get_robot(name).standard.outer_m
+    assert length > 0.012  # thickness of the drawn flange, which lies in it
+
+
+@pytest.mark.parametrize("name", known_arms())
+def test_neighbouring_links_touch_but_do_not_swallow_each_other(name: str) -> None:
     # Along each joint axis the housings of two neighbours meet at one seam: no gap wider than the seal, no overlap.
-    arm = load_arm()
+    arm = load_arm(name)
     frames = link_frames(arm, np.zeros(6))
     points = drawn_points(arm)
+    reach = arm.housings.shoulder + 0.004  # of the largest housing
     for child in range(1, 7):
         X_BC = frames[child]
         mine = points[child]
         theirs = (X_BC.inverse() @ frames[child - 1] @ points[child - 1].T).T
-        near = {name: p[np.hypot(p[:, 0], p[:, 1]) < 0.08] for name, p in {"mine": mine, "theirs": theirs}.items()}
+        near = {name: p[np.hypot(p[:, 0], p[:, 1]) < reach] for name, p in {"mine": mine, "theirs": theirs}.items()}
         gap = min(
             abs(near["mine"][:, 2].min() - near["theirs"][:, 2].max()),
             abs(near["theirs"][:, 2].min() - near["mine"][:, 2].max()),

@@ -27,7 +27,11 @@ UR_DH = {
     "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
     "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922),
     "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
+    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996),
+    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655),
     "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655),
+    "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543),
+    "ur30": (0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543),
 }
 
 
@@ -151,7 +155,8 @@ def test_a_pose_out_of_reach_has_no_joint_angles() -> None:
 
 def test_every_robot_has_a_flange_and_known_names_are_told() -> None:
     for robot in ROBOTS.values():
-        assert robot.standard.designation == "iso9409-1-50-4-m6"
+        large = robot.name in ("ur20", "ur30")
+        assert robot.standard.designation == ("iso9409-1-80-6-m8" if large else "iso9409-1-50-4-m6")
         assert robot.standard.pin_angle_rad == robot.pin_angle_rad
         assert (robot.inverse == CLOSED_FORM) == robot.name.startswith("ur")
         assert robot.source

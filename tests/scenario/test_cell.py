@@ -223,7 +223,7 @@ def assert_at_rest_with_torch_off(result: DemoResult) -> None:
     simulator.clear_monitor()
     simulator.AdvanceTo(simulator.get_context().get_time() + 1.0)
     station = cell.station.diagram
-    measured = station.GetOutputPort("ur10e.velocity_measured").Eval(station.GetMyContextFromRoot(result.run.root))
+    measured = station.GetOutputPort("arm.velocity_measured").Eval(station.GetMyContextFromRoot(result.run.root))
     assert np.abs(measured).max() < 1e-3
     torch = cell.logs["torch_on"].FindLog(result.run.root).data()[0]
     assert torch[-1] == 0.0

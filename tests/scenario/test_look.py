@@ -49,5 +49,5 @@ def test_a_click_holds_the_job_for_good(live: tuple[Meshcat, Cell, Simulator], b
     assert "person" in str(command.reason)
     simulator.AdvanceTo(simulator.get_context().get_time() + 1.0)
     station = cell.station.diagram
-    speed = station.GetOutputPort("ur10e.velocity_measured").Eval(station.GetMyContextFromRoot(simulator.get_context()))
+    speed = station.GetOutputPort("arm.velocity_measured").Eval(station.GetMyContextFromRoot(simulator.get_context()))
     assert abs(speed).max() < 1e-3, "the arm rests"

@@ -82,9 +82,9 @@ def test_the_run_leaves_what_the_calibration_reads(demo: Demo) -> None:
 
 def test_it_is_the_one_station_with_a_pen_a_camera_and_a_tablet(demo: Demo) -> None:
     diagram = demo.station.diagram
-    for name in ("wrist_camera.trigger", "ur10e.velocity_command"):
+    for name in ("wrist_camera.trigger", "arm.velocity_command"):
         assert diagram.HasInputPort(name)
-    for name in ("wrist_camera.picture", "digitizer.touch", "ur10e.position_measured", "cheat.truth"):
+    for name in ("wrist_camera.picture", "digitizer.touch", "arm.position_measured", "cheat.truth"):
         assert diagram.HasOutputPort(name)
     assert not diagram.HasInputPort("scanner.trigger")
     assert demo.station.truth.tablet is not None

@@ -65,7 +65,7 @@ class Drive:
         self.station = station
         self.simulator = Simulator(station.diagram)
         self.context: Context = self.simulator.get_mutable_context()
-        for name in ("ur10e.velocity_command", "scanner.trigger", "finger_camera.streaming"):
+        for name in ("arm.velocity_command", "scanner.trigger", "finger_camera.streaming"):
             if station.diagram.HasInputPort(name):
                 self.set(name, np.zeros(station.diagram.GetInputPort(name).size()))
 
@@ -106,6 +106,6 @@ class Drive:
         if world.tool is not None:
             world.plant.SetPositions(self.plant, world.tool, np.zeros(3) if deflection_T is None else deflection_T)
             world.plant.SetVelocities(self.plant, world.tool, np.zeros(3))
-        servo = self.station.diagram.GetSubsystemByName("ur10e_servo")
+        servo = self.station.diagram.GetSubsystemByName("arm_servo")
         memory = servo.GetMyMutableContextFromRoot(self.context).get_mutable_discrete_state_vector()
         memory.SetFromVector(np.concatenate([q, np.zeros(6), q, np.zeros(6), [self.time, 0.0]]))

@@ -57,6 +57,6 @@ def ApplyDriverConfig(config: KinematicArm, build: StationBuild) -> None:
     """Add the integrator and show the ports of an arm."""
     arm = build.builder.AddSystem(JointIntegrator(build.arm, build.q_start))
     arm.set_name("kinematic_arm")
-    build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
+    build.inputs["arm.velocity_command"] = arm.GetInputPort("velocity_command")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
-        build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)
+        build.outputs[f"arm.{name}"] = arm.GetOutputPort(name)

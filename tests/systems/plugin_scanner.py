@@ -77,7 +77,7 @@ def ApplyDriverConfig(config: RayScanner, build: StationBuild) -> RigidTransform
     sensor = build.builder.AddSystem(RaySensor(X_BC, config.scanner()))
     sensor.set_name("ray_scanner")
     for name in ("X_BF", "sample_time"):
-        build.builder.Connect(build.outputs[f"ur10e.{name}"], sensor.GetInputPort(name))
+        build.builder.Connect(build.outputs[f"arm.{name}"], sensor.GetInputPort(name))
     build.inputs["scanner.trigger"] = sensor.GetInputPort("trigger")
     build.outputs["scanner.scan"] = sensor.GetOutputPort("scan")
     return X_BC

@@ -30,10 +30,10 @@ from weldcal.models.scanners import get_scanner
 from weldcal.models.workpieces.plate import make_workpiece
 from weldcal.systems.background_system import BackgroundSystem
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Rules
+from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.watch import DeviceWatch
 from weldcal.systems.drivers.sensors.wired_camera import WiredPictures
-from weldcal.systems.drivers.sensors.wired_profiler import WiredProfiles
-from weldcal.systems.drivers.sensors.wired_scanner import WiredScanSensor, WiredScanStream
+from weldcal.systems.drivers.sensors.wired_scanner import WiredScanStream
 from weldcal.systems.drivers.simulated.picture_scene import KnockedStand, PicturePoses
 from weldcal.systems.drivers.simulated.profiler_fixture import draw_fixture
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair
@@ -141,9 +141,8 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     DepthStream: lambda: DepthStream(IDEAL, ScannerStream(), StreamingScanner(), 0, 0.002),
     DeviceWatch: lambda: DeviceWatch(acquisition()),
-    WiredScanSensor: lambda: WiredScanSensor(acquisition()),
+    OnTrigger: lambda: OnTrigger(acquisition(), "scan", Scan, 0.02),
     WiredScanStream: lambda: WiredScanStream(acquisition()),
-    WiredProfiles: lambda: WiredProfiles(acquisition()),
     WiredPictures: lambda: WiredPictures(acquisition()),
     FrameQueue: FrameQueue,
     FrameReplay: lambda: FrameReplay([np.zeros((2, 2, 3), np.float32)], lambda time: Q_HOME, 20.0, 0.1),
@@ -277,9 +276,8 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "newest_capture": 2,
     },
     DeviceWatch: {"robot_status": UrStatus, "status": UrStatus},
-    WiredScanSensor: {"trigger": 1, "scan": Scan},
+    OnTrigger: {"trigger": 1, "scan": Scan},
     WiredScanStream: {"streaming": 1, "stream": ScanStream},
-    WiredProfiles: {"trigger": 1, "profile": ProfileScan},
     WiredPictures: {"streaming": 1, "image": Image, "capture_time": 1},
     FrameReplay: {"stream": ScanStream, "joints": 6, "time": 1},
     FrameQueue: {"stream": ScanStream, "flange_estimate": FlangeEstimate, "scan": StreamedScan, "counts": 3},

@@ -6,8 +6,10 @@ import dataclasses as dc
 import re
 import types
 import typing
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from pydrake.common.yaml import yaml_dump_typed, yaml_load, yaml_load_typed
 
@@ -18,10 +20,13 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario, scenario_class, scenario_names
 from weldcal.systems.scenario.numbers import check_numbers
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
+from weldcal.systems.scenario.surroundings import surroundings_of
 
 ONE_OF_EVERYTHING = """
 description: Every option, each with a value that is not its default.
+extends: s_groove
 arm: ur10e
+base: {xyz_m: [0.1, 0.2, 0.3], rpy_deg: [180.0, 1.0, 2.0]}
 kinematics: my_robot/kinematics.yaml
 flange: iso9409-1-80-6-m8
 tool: pen
@@ -193,6 +198,13 @@ workpiece:
   hole_from_mm: 200.0
   bend_radius_mm: 250.0
   located_by: drawing
+surroundings:
+- name: fence
+  box_m: [0.02, 2.0, 1.0]
+  mesh: fence.stl
+  unit: m
+  pose: {xyz_m: [1.2, 0.1, 0.5], rpy_deg: [1.0, 2.0, 3.0]}
+  margin_m: 0.05
 planning: {method: cloud, search: anywhere, start_m: [0.6, -0.1, 0.0]}
 welding:
   speed_mm_s: 6.0
@@ -236,14 +248,14 @@ def compare(schema: type, text: dict[str, Any], value: Any, default: Any, where:
     wrong = [f"{where}{key} is not in the text" for key in hints.keys() - text.keys()]
     for key in hints.keys() & text.keys():
         written, loaded = text[key], getattr(value, key)
-        if sections(hints[key]):
+        if sections(hints[key]) and not isinstance(loaded, str):
             assert isinstance(loaded, tuple(sections(hints[key])))
             below = {k: v for k, v in written.items() if k != "_tag"}
             wrong += compare(type(loaded), below, loaded, type(loaded)(), f"{where}{key}.")
             continue
-        if isinstance(loaded, list) and loaded and dc.is_dataclass(loaded[0]):
-            for row, (text_row, loaded_row) in enumerate(zip(written, loaded, strict=True)):
-                wrong += compare(type(loaded_row), text_row, loaded_row, type(loaded_row)(), f"{where}{key}[{row}].")
+        if isinstance(loaded, list) and loaded and all(dc.is_dataclass(item) for item in loaded):
+            for k, (words, item) in enumerate(zip(written, loaded, strict=True)):
+                wrong += compare(type(item), words, item, type(item)(), f"{where}{key}[{k}].")
             continue
         if loaded != written:
             wrong.append(f"{where}{key} was lost: {written} became {loaded}")
@@ -337,7 +349,8 @@ def test_a_pose_needs_three_and_three_finite_numbers(pose: PoseConfig) -> None:
 @pytest.mark.parametrize(
     ("overrides", "named"),
     [
-        ("arm: ur3e", "arm must be ur10e"),
+        ("arm: aubo_i5", "'aubo_i5' is none of them"),
+        ("arm: ur3e\nrobot: !UrRtde {payload_kg: 3.5}", "the payload of a ur3e is 3 kg"),
         ("home_deg: [.nan, 0, 0, 0, 0, 0]", "home_deg must be finite"),
         ("calibration: {work_point_m: [1, 2]}", "calibration.work_point_m must hold 3 numbers, not 2"),
         ("robot: !UrRtde {payload_cog_m: [1, 2]}", "robot.payload_cog_m must hold 3 numbers, not 2"),
@@ -377,8 +390,11 @@ def test_a_number_that_no_cell_can_work_with_is_named(overrides: str, named: str
         ("speeling: 1", "'speeling'"),
         ("welding: {speed_mm_per_s: 3}", "'speed_mm_per_s'"),
         ("robot: !SimulatedUr {following_eror_rad: 1}", "'following_eror_rad'"),
-        ("robot: !RealUr {}", "'RealUr'.*'robot'"),
-        ("scanner: !RenderedFingerCamera {}", "'RenderedFingerCamera'.*'scanner'"),
+        ("robot: !RealUr {}", "robot: there is no driver '!RealUr'"),
+        (
+            "scanner: !RenderedFingerCamera {}",
+            "scanner: there is no driver '!RenderedFingerCamera'; the nearest one is '!RenderedScanner'",
+        ),
         ("job: {calibrate: maybe}", "'calibrate'.*maybe"),
         ("calibration: {minimum_scans: 4.5}", "'minimum_scans'.*4.5"),
         ("description: 3", "'description'"),
@@ -456,3 +472,86 @@ def test_an_unknown_scenario_is_answered_with_the_known_ones() -> None:
 def test_a_law_or_workpiece_that_is_not_to_be_had_is_refused(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         load_scenario("s_groove", text)
+
+
+FENCED = """
+surroundings:
+- {name: fence, box_m: [0.02, 2.0, 1.0], pose: {xyz_m: [1.2, 0.0, 0.5]}}
+- {mesh: %s, unit: mm, pose: {xyz_m: [0.3, -0.6, 0.0]}, margin_m: 0.05}
+"""
+
+
+def test_surroundings_are_boxes_and_mesh_files_in_the_base(tmp_path: Path) -> None:
+    (tmp_path / "fixture.obj").write_text("v 0 0 0\nv 100 0 0\nv 0 100 0\nf 1 2 3\n")
+    (tmp_path / "my.yaml").write_text(FENCED % "fixture.obj")
+    fence, fixture = surroundings_of(
+        load_scenario(str(tmp_path / "my.yaml"), "robot: !SimulatedUr {}\njob: {weld: false}")
+    ).obstacles
+    assert (fence.name, fixture.name) == ("fence", "surroundings 2")
+    assert fence.mesh.bounds == pytest.approx(np.array([[1.19, -1.0, 0.0], [1.21, 1.0, 1.0]]))
+    assert fixture.mesh.bounds == pytest.approx(np.array([[0.3, -0.6, 0.0], [0.4, -0.5, 0.0]]))
+    assert fixture.margin_m == 0.05
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "named"),
+    [
+        ("{}", r"surroundings\[0\] needs either box_m: \[x, y, z\] or mesh: FILE"),
+        ("{box_m: [1.0, 1.0, 0.0]}", r"surroundings\[0\].box_m needs three positive lengths"),
+        ("{box_m: [1.0, 1.0]}", r"surroundings\[0\].box_m must hold 3 numbers, not 2"),
+        ("{box_m: [1.0, 1.0, .nan]}", r"surroundings\[0\].box_m must be finite"),
+        ("{mesh: nowhere.stl}", "There is no file 'nowhere.stl'"),
+        ("{mesh: README.md}", "'README.md' is no part that can be read"),
+        ("{mesh: nowhere.stl, unit: km}", "units must be mm, m, inch, not 'km'"),
+        ("{box_m: [1.0, 1.0, 1.0], margin_m: -0.1}", r"surroundings\[0\].margin_m must not be negative"),
+    ],
+)
+def test_an_obstacle_that_cannot_be_built_is_refused_in_a_sentence(obstacle: str, named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        surroundings_of(load_scenario("s_groove", f"surroundings: [{obstacle}]"))
+
+
+def test_a_scenario_extends_a_shipped_one_or_a_file_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("extends: s_groove\nwelding: {speed_mm_s: 5.0}\n")
+    (tmp_path / "slow.yaml").write_text("extends: mine.yaml\njob: {speed_factor: 0.5}\n")
+    shipped, slow = load_scenario("s_groove"), load_scenario(str(tmp_path / "slow.yaml"))
+    assert (slow.welding.speed_mm_s, slow.job.speed_factor) == (5.0, 0.5)
+    assert slow.scanner == shipped.scanner
+    assert slow.workpiece == shipped.workpiece
+
+
+def test_a_file_named_in_a_base_is_looked_for_beside_the_base(tmp_path: Path) -> None:
+    (tmp_path / "cell").mkdir()
+    (tmp_path / "cell" / "clamp.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    (tmp_path / "cell" / "base.yaml").write_text("extends: s_groove\nsurroundings: [{mesh: clamp.obj}]\n")
+    (tmp_path / "job.yaml").write_text("extends: cell/base.yaml\n")
+    loaded = load_scenario(str(tmp_path / "job.yaml"))
+    assert loaded.surroundings[0].mesh == str(tmp_path / "cell" / "clamp.obj")
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("extends: nowhere\n", "mine.yaml extends 'nowhere', which does not exist: choose one of"),
+        ("extends: mine.yaml\n", "mine.yaml extends itself by way of mine.yaml"),
+    ],
+)
+def test_a_base_that_cannot_be_used_is_named(tmp_path: Path, text: str, named: str) -> None:
+    (tmp_path / "mine.yaml").write_text(text)
+    with pytest.raises(InputError, match=named):
+        load_scenario(str(tmp_path / "mine.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ("weldin: {speed_mm_s: 5}", "the key 'weldin' is not known; the nearest one is 'welding'"),
+        ("welding: {speed_mm: 5}", "the key 'speed_mm' in welding is not known; the nearest one is 'speed_mm_s'"),
+        ("robot: !UrRtde {hots: a}", "the key 'hots' in robot is not known; the nearest one is 'host'"),
+        ("surroundings: [{nam: a}]", r"the key 'nam' in surroundings\[0\] is not known; the nearest one is 'name'"),
+        ("workpiece: {pose_guess: {xyz: [0, 0, 0]}}", "'xyz' in workpiece.pose_guess .* nearest one is 'xyz_m'"),
+    ],
+)
+def test_an_unknown_key_is_answered_with_the_nearest_known_one(overrides: str, named: str) -> None:
+    with pytest.raises(InputError, match=named):
+        load_scenario("s_groove", overrides)

@@ -25,13 +25,13 @@ from weldcal.systems.scenario.loading import scenario_class
 from weldcal.systems.station import Station, apply_driver_config, make_station
 from weldcal.systems.wall_clock import WallClock
 
-INPUTS = {"ur10e.velocity_command", "scanner.trigger", "finger_camera.streaming"}
+INPUTS = {"arm.velocity_command", "scanner.trigger", "finger_camera.streaming"}
 OUTPUTS = {
-    "ur10e.position_measured",
-    "ur10e.velocity_measured",
-    "ur10e.X_BF",
-    "ur10e.sample_time",
-    "ur10e.status",
+    "arm.position_measured",
+    "arm.velocity_measured",
+    "arm.X_BF",
+    "arm.sample_time",
+    "arm.status",
     "scanner.scan",
     "finger_camera.image",
     "finger_camera.capture_time",
@@ -95,7 +95,7 @@ def test_a_driver_may_say_which_arm_there_is_and_where_it_stands(monkeypatch: py
     assert [type(a) for a in asked[0]] == [SimulatedUr, type(the_arm())]
     assert (station.arm, station.q_start is robot.q_start, station.pace) == (robot.arm, True, 0.5)
     drive = Drive(station)
-    assert drive.get("ur10e.position_measured") == pytest.approx(robot.q_start)
+    assert drive.get("arm.position_measured") == pytest.approx(robot.q_start)
     assert station.world.plant.GetPositions(drive.plant, station.world.arm) == pytest.approx(robot.q_start)
     station.close()
     assert isinstance(robot.handle, OpenLine)

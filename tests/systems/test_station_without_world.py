@@ -64,5 +64,5 @@ def test_the_viewer_shows_the_arm_where_it_is_measured() -> None:
     inspector = query.inspector()
     (flange,) = (f for f in inspector.GetAllFrameIds() if inspector.GetName(f).endswith("flange"))
     shown = query.GetPoseInWorld(flange)
-    measured = cell.station.diagram.GetOutputPort("ur10e.X_BF").Eval(cell.station.diagram.GetMyContextFromRoot(context))
+    measured = cell.station.diagram.GetOutputPort("arm.X_BF").Eval(cell.station.diagram.GetMyContextFromRoot(context))
     assert np.linalg.norm(shown.translation() - measured.translation()) < 1e-9

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from weldcal.models.errors import InputError
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.drivers.sensors.finger_file import read_finger_file
+from weldcal.models.tools.finger_file import read_finger_file
 from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamera
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.station import make_station

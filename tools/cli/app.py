@@ -20,7 +20,9 @@ from weldcal.tools.cli import (
     reproduce,
     robots,
     runs,
+    scenarios,
     tablet,
+    tool,
     verify,
     view,
 )
@@ -29,8 +31,8 @@ PURPOSE = "Calibrate a 3D scanner to a robot by the robot's own flange, then wel
 COMMANDS = (
     *(runs.demo, calibrate.calibrate, verify.verify, monitor.monitor, plan_motion.plan_motion, runs.weld, view.view),
     *(robots.robots, robots.emulate_ur, emulate_cell.emulate_cell, robots.check_robot),
-    part.part,
-    *(cell.check_cell, cell.print_board, cell.finger_calibrate),
+    *(scenarios.new, scenarios.schema, part.part),
+    *(cell.check_cell, cell.print_board, cell.finger_calibrate, tool.tool_check),
     *benchmark.COMMANDS,
     *benchmark_flange.COMMANDS,
     *reproduce.COMMANDS,
@@ -44,6 +46,7 @@ GROUPS = {
     "benchmark": "Measure speed and accuracy.",
     "reproduce": "Repeat the published studies.",
     "finger": "Calibrate the finger camera and the soft tip.",
+    "tool": "Check a tool of your own.",
     "tablet": "Calibrate a wrist camera with a tablet as target.",
     "hand-eye": "Calibrate a camera from pairs of poses.",
     "profiler": "Calibrate a laser profiler and map a seam.",

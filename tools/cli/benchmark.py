@@ -131,6 +131,24 @@ def seeds(
     return run_seeds(scenario, folder, range(call.seed, call.seed + runs), call.progress)
 
 
+@command("benchmark arms")
+def arms(
+    call: Call,
+    names: Annotated[list[str] | None, option("--arm", "NAME", "Only this arm; repeat for more.")] = None,
+    seam: Annotated[float, option("--seam", "MM", "How much of the seam is welded.", min=20.0)] = 80.0,
+    robot: Annotated[
+        str | None, option("--robot", "WHERE", "simulated, or emulated: a controller on this computer.")
+    ] = None,
+) -> Outcome:
+    """Run the demo, scaled to the reach, on UR3e, UR5e, UR10e, UR16e, UR20 and UR30; the scenarios are written too."""
+    from weldcal.models.robots import get_robot
+    from weldcal.tools.studies.arms.demo import ARMS, arms_table, run_arms
+
+    chosen = [get_robot(name).name for name in names] if names else list(ARMS)
+    summary, rows = run_arms(call.folder("benchmark", "arms"), chosen, call.seed, seam, robot, call.progress)
+    return Outcome(summary, text=arms_table(rows))
+
+
 @command("benchmark robot-faults", options=("address",))
 def robot_faults(
     call: Call,
@@ -222,6 +240,7 @@ COMMANDS = (
     profiler,
     cell,
     seeds,
+    arms,
     fuzz_files,
     robot_faults,
     robot,

@@ -77,11 +77,15 @@ def finger_calibrate(
     touches: Annotated[
         Path | None, option("--touches", "FILE", "Table of touches on a plate: picture, x_mm, y_mm, z_mm, forces.")
     ] = None,
+    tool: Annotated[
+        Path | None,
+        option("--tool", "FILE", "Tool file of the tool that carries the tag.", show_default="the welding tool"),
+    ] = None,
 ) -> Outcome:
     """Calibrate the finger: intrinsics from pictures of the board; tag, seat and stiffness from touches on a known plate."""
     from weldcal.tools.commands.finger_calibrate import calibrate_finger
 
-    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name))
+    report = calibrate_finger(folder, board, touches, call.folder("finger-calibrate", folder.name), tool)
     found = report.document()
     camera = found["camera"]
     values = {

@@ -19,7 +19,8 @@ MountingOption = Annotated[
 ]
 UnitOption = Annotated[str | None, option("--unit", "UNIT", "Unit of the positions: m, mm or cm.", show_default="m")]
 RobotOption = Annotated[
-    str | None, option("--robot", "NAME", "The arm, for example ur10e: the next pose is then within its reach.")
+    str | None,
+    option("--robot", "NAME", "The arm, for example ur10e or my_arm.urdf: the next pose is then within its reach."),
 ]
 ScannerOption = Annotated[
     str | None, option("--camera", "NAME", "The scanner, for example phoxi_s: the next pose is then in its view.")

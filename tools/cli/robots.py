@@ -38,14 +38,19 @@ def check_robot(
     host: Annotated[str, typer.Argument(metavar="HOST", help="Name or address of the robot's controller.")],
     scenario: Annotated[
         str | None,
-        option("--scenario", "NAME", "Compare the payload with this scenario's; without it, the welding tool's."),
+        option("--scenario", "NAME", "Compare arm and payload with this scenario's; without it, the welding tool's."),
     ] = None,
+    arm: Annotated[str, option("--arm", "NAME", "The arm, where no scenario is given: ur3e, ur5e, ur20 ...")] = "ur10e",
 ) -> Outcome:
     """Check whether a robot and this computer are ready: what is right and what to change. Nothing moves or is written."""
+    from weldcal.models.arms.kinematics import load_arm
     from weldcal.systems.drivers.ur.readiness.preflight import preflight
+    from weldcal.systems.scenario.arm import nominal_arm
+    from weldcal.systems.scenario.loading import load_scenario
     from weldcal.tools.commands.check_robot import as_json, emit_table, expected_load, with_host
 
-    report = with_host(preflight(host, load=expected_load(host, scenario)))
+    nominal = nominal_arm(load_scenario(scenario)) if scenario is not None else load_arm(arm)
+    report = with_host(preflight(host, nominal=nominal, load=expected_load(host, scenario)))
     problem = "" if report.first_problem is None else report.first_problem.operator_action
     return Outcome(as_json(report), text=partial(emit_table, report), problem=problem)
 
@@ -54,6 +59,7 @@ def check_robot(
 def emulate_ur(
     call: Call,
     polyscope: Annotated[str, option("--polyscope", "VERSION", "Controller version: 5.12, 5.21, 10.7 ...")] = "5.21",
+    arm: Annotated[str, option("--arm", "NAME", "The arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")] = "ur10e",
     kinematics: Annotated[Path | None, option("--kinematics", "FILE", "A robot's factory calibration.")] = None,
     host: Annotated[str, option("--host", "ADDRESS", "Loopback address 127.x.y.z.")] = "127.0.0.1",
     control_port: Annotated[
@@ -69,6 +75,7 @@ def emulate_ur(
         host=host,
         control_port=control_port,
         polyscope=polyscope,
+        robot=arm,
         kinematics=kinematics,
         pace=pace,
         lockstep=lockstep,

@@ -17,12 +17,13 @@ from pydrake.systems.analysis import Simulator
 
 from weldcal.calibration.errors import FlangeNotFound, UnreachableScanner
 from weldcal.calibration.flange.fit import FlangeGuess, fit_flange
-from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.models.arms.kinematics import forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import WeldcalError
-from weldcal.models.tool import WeldingTool
+from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.systems.drivers.config import DEVICES, DriverConfig, FingerCameraConfig, NoDevice
 from weldcal.systems.drivers.sensors.preflight import Sensed
+from weldcal.systems.drivers.sensors.wired_camera import WiredFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.errors import RobotUnreachable
@@ -31,6 +32,7 @@ from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.drivers.ur.wire.rtde_client import RtdeProbe
 from weldcal.systems.host_timing import measure_host
 from weldcal.systems.jobs.weld.settings import feature_standard, plan_poses
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import make_station
 from weldcal.tools.commands.check_robot import state_of
@@ -99,7 +101,7 @@ def check_cell(
         if device == "scanner" and sensed.datum is not None:
             rows.append((device, _flange(scenario, sensed.datum, X_BF)))
         if device == "finger_camera" and sensed.datum is not None and isinstance(config, FingerCameraConfig):
-            rows.append((device, _tag(config, sensed.datum)))
+            rows.append((device, _tag(scenario, config, sensed.datum)))
     tell("computer", 0.95)
     return CellReport(name, (*rows, *_torch(scenario), *_computer()))
 
@@ -129,7 +131,7 @@ def _alone(scenario: Scenario, device: str) -> Scenario:
 def _robot(scenario: Scenario, q: Array) -> tuple[list[tuple[str, Check]], RigidTransform | None]:
     """The robot's checks, and the pose of its flange where it could be read."""
     config = scenario.robot
-    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+    arm = nominal_arm(scenario)
     if isinstance(config, UrRtde):
         report = preflight(config.host, upper_registers=config.upper_registers, nominal=arm, load=config.load())
         X_BF = None if report.arm is None or report.arm_q is None else forward_kinematics(report.arm, report.arm_q)
@@ -151,6 +153,9 @@ def _sensed(scenario: Scenario, device: str, config: DriverConfig, seed: int, q:
         look = partial(_simulated, scenario, device, seed, q)
     if look is None:
         return Sensed((_unknown(device.replace("_", " "), config),))
+    if isinstance(scenario.robot, UrRtde) and isinstance(config, WiredFingerCamera):
+        # an emulated cell's camera runs at the emulator's pace, which is 1 for a robot
+        config = dc.replace(config, rate_hz=config.rate_hz * scenario.robot.pace)
     try:
         found: Sensed = look(config)
     except WeldcalError as error:
@@ -163,7 +168,7 @@ def _simulated(scenario: Scenario, device: str, seed: int, q: Array, config: Dri
     ask, port = {"scanner": ("trigger", "scan"), "finger_camera": ("streaming", "image")}.get(device, ("", ""))
     if not ask:  # a part of a job's furnishing
         return Sensed((Check(device.replace("_", " "), True, "simulated"),))
-    arm = load_arm(scenario.arm, None if scenario.kinematics is None else Path(scenario.kinematics))
+    arm = nominal_arm(scenario)
     station = make_station(_alone(scenario, device), seed, PreparedRobot(arm, q))
     try:
         if not station.diagram.HasOutputPort(f"{device}.{port}"):
@@ -185,9 +190,10 @@ def _simulated(scenario: Scenario, device: str, seed: int, q: Array, config: Dri
 def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) -> Check:
     """Whether the feature of the calibration is in a scan, near where the arm's pose and the scanner's nominal pose put it."""
     standard, on_tool = feature_standard(scenario), scenario.calibration.feature == "tool_ring"
+    loaded = scenario.loaded_tool()
     guess = None
     if X_BF is not None and scenario.calibration.configuration == "eye_on_base":
-        X_BR = X_BF @ (WeldingTool().X_FR if on_tool else RigidTransform())
+        X_BR = X_BF @ (loaded.tool.X_FR if on_tool and loaded is not None else RigidTransform())
         X_CR = scenario.calibration.mounting_guess.pose().InvertAndCompose(X_BR)
         radius = 1e-3 * scenario.calibration.guess_radius_mm + 0.5 * standard.outer_m
         guess = FlangeGuess(X_CR.translation(), radius, X_CR.rotation().matrix()[:, 2])
@@ -204,9 +210,10 @@ def _flange(scenario: Scenario, points_C: Array, X_BF: RigidTransform | None) ->
     return Check("flange", True, found)
 
 
-def _tag(config: FingerCameraConfig, picture: Array) -> Check:
+def _tag(scenario: Scenario, config: FingerCameraConfig, picture: Array) -> Check:
     """Whether the tag is in a picture, and how sharp its edges are."""
-    tool = WeldingTool()
+    loaded = scenario.loaded_tool()
+    tool = (load_tool(WELDING) if loaded is None else loaded).tool
     tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
     pixels = np.asarray(picture, dtype=np.uint8)
     seen = detect_tag(pixels, config.camera().camera_matrix, tag)

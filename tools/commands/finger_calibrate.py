@@ -14,7 +14,8 @@ from weldcal.models.documents import read_document
 from weldcal.models.errors import InputError
 from weldcal.models.images import read_grey_image
 from weldcal.models.tool import WeldingTool
-from weldcal.systems.drivers.sensors.finger_file import SCHEMA
+from weldcal.models.tools.finger_file import SCHEMA
+from weldcal.models.tools.loading import WELDING, load_tool
 from weldcal.tools.commands.print_board import Board
 from weldcal.tools.report.render import write_atomic
 from weldcal.welding.servo.deformation import TagModel, TagObservation, deflection_from_tag, detect_tag
@@ -76,13 +77,17 @@ class FingerReport:
         return found
 
 
-def calibrate_finger(folder: Path, board: Path, touches: Path | None, out: Path) -> FingerReport:
+def calibrate_finger(
+    folder: Path, board: Path, touches: Path | None, out: Path, tool: Path | None = None
+) -> FingerReport:
     """Calibrate from a folder of pictures of the board, and a table of touches with a picture each; writes finger.yaml to `out`.
+    `tool` is the file of the tool that carries the tag; None: the welding tool.
 
     Raises:
         InputError: what was given cannot be used; nothing is written.
     """
     opencv = read_board(board).opencv()
+    carrier = load_tool(WELDING if tool is None else tool).tool
     names = sorted(p for p in folder.iterdir() if p.suffix.lower() in PICTURES) if folder.is_dir() else []
     if not names:
         raise InputError(f"'{folder}' holds no pictures: give the folder of the pictures of the board, png or jpg.")
@@ -99,7 +104,7 @@ def calibrate_finger(folder: Path, board: Path, touches: Path | None, out: Path)
     camera = calibrate_intrinsics(seen, size)
     report = FingerReport(camera, None, tuple(without))
     if touches is not None:
-        report = _with_touches(report, touches, size)
+        report = _with_touches(report, touches, size, carrier)
     out.mkdir(parents=True, exist_ok=True)
     write_atomic(out / "finger.yaml", yaml.safe_dump(report.document(), sort_keys=False))
     return report
@@ -124,14 +129,14 @@ def _same_size(size: tuple[int, int] | None, picture: NDArray[np.uint8], name: P
     return found
 
 
-def _with_touches(report: FingerReport, table: Path, size: tuple[int, int]) -> FingerReport:
+def _with_touches(report: FingerReport, table: Path, size: tuple[int, int], tool: WeldingTool) -> FingerReport:
     """The report with what the touches show."""
     header, rows = read_rows(table)
     if not {"picture", *COLUMNS} <= set(header):
         raise InputError(
             f"'{table.name}' needs the columns picture, {', '.join(COLUMNS)}; forces are fx_N, fy_N, fz_N."
         )
-    tool, camera = WeldingTool(), report.camera
+    camera = report.camera
     tag = TagModel(tool.tag_dictionary, tool.tag_id, tool.tag_size_m)
     R_TK = tool.X_FT.rotation().inverse() @ tool.X_FK.rotation()
     rest: TagObservation | None = None

@@ -141,7 +141,7 @@ def run_motion_live(scenario: Scenario, options: RunOptions, progress: Progress)
     if added.recorder is not None:
         stream, scanner = posed_stream(record, finished.cell.station.arm), scenario.scanner_config()
         assert scanner is not None
-        added.recorder.finish(stream, scenario.arm, scenario.flange, scanner.scanner())
+        added.recorder.finish(stream, scenario.arm, scenario.flange_name(), scanner.scanner())
     write_atomic(options.out / "run.json", json.dumps(outcome.summary(), indent=1) + "\n")
     finished.write_recording(options.out)
     return outcome
@@ -168,7 +168,7 @@ def calibration_result(outcome: MotionOutcome, e: MotionEstimate) -> Calibration
         unobservable=e.unobservable,
         warnings=e.warnings,
         robot=scenario.arm,
-        flange=scenario.flange,
+        flange=scenario.flange_name(),
         scanner="" if scanner is None else scanner.scanner().name,
         sigma_position_mm=1e3 * e.sigma_position_m,
         sigma_normal_deg=float(np.degrees(e.sigma_normal_rad)),

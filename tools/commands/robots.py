@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import controller_address, is_loopback, loopback_address
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
@@ -15,12 +14,14 @@ from weldcal.systems.drivers.station_build import PreparedRobot
 from weldcal.systems.drivers.ur.readiness.preflight import preflight, require_ready
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.pacing import draw_in_this_thread
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, emulator_process
 
 SIMULATED, EMULATED = "simulated", "emulated"
 EMULATED_PACE = 0.7  # two cores almost keep up at 1; at this pace they do with other load
 SLOWEST_PACE = 0.05
+GRAVITY = 9.82  # m/s^2, as a controller has it
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -83,10 +84,11 @@ def chosen_robot(
     kinematics = None if scenario.kinematics is None else Path(scenario.kinematics)
     q_home = np.deg2rad(scenario.home_deg)
     with emulator_process(
-        host=wanted, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
+        host=wanted, robot=scenario.arm, q=q_home.tolist(), kinematics=kinematics, pace=pace, lockstep=LOCKSTEP_S
     ) as emulator:
         load = (scenario.robot if isinstance(scenario.robot, UrRtde) else robot_at(emulator.host, scenario)).load()
         emulator.do("set_payload", mass=load.mass_kg, cog=list(load.cog_m))
+        emulator.do("set_gravity", gravity=(GRAVITY * nominal_arm(scenario).up).tolist())
         yield _at(emulator.host, "an emulated controller", scenario, dry_run=dry_run, pace=pace, lockstep=True)
 
 
@@ -115,7 +117,9 @@ def robot_at(host: str, scenario: Scenario) -> UrRtde:
         return UrRtde(host=host, payload_kg=0.0, payload_cog_m=[0.0, 0.0, 0.0])
     if scenario.tool == "pen":
         return UrRtde(host=host, payload_kg=0.42, payload_cog_m=[0.03, 0.0, 0.02])
-    return UrRtde(host=host)
+    loaded = scenario.loaded_tool()
+    assert loaded is not None
+    return UrRtde(host=host, payload_kg=loaded.tool.mass_kg, payload_cog_m=list(loaded.tool.centre_of_mass_m))
 
 
 def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
@@ -125,7 +129,7 @@ def look_at(config: UrRtde, scenario: Scenario) -> PreparedRobot:
         RobotRefused: the controller does not answer, or a check of the pre-flight failed; the message gives the operator action.
     """
     report = preflight(
-        config.host, upper_registers=config.upper_registers, nominal=load_arm(scenario.arm), load=config.load()
+        config.host, upper_registers=config.upper_registers, nominal=nominal_arm(scenario), load=config.load()
     )
     require_ready(report)
     assert report.arm is not None

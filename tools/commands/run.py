@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
@@ -63,7 +64,8 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
         cell = build_cell(scenario, options.seed, meshcat, robot.prepared)
         with closing(cell.station):
             if meshcat is not None:
-                _set_the_scene(meshcat, *cell.job.view())
+                camera, target = cell.job.view()
+                _set_the_scene(meshcat, camera, target, scenario.base.pose())
                 if options.browser:
                     webbrowser.open(meshcat.web_url())
                     time.sleep(2.0 if options.realtime else 0.5)  # the page needs a moment to load
@@ -72,8 +74,11 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
     return JobRun(run, meshcat, robot.title)
 
 
-def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array) -> None:
-    """Set the background and the viewer's camera."""
+def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:
+    """Set the background and the viewer's camera; everything is drawn in B, and shown as the base stands in the world."""
+    if not X_WB.IsExactlyIdentity():
+        meshcat.SetTransform("/drake", X_WB)
+        camera, target = camera + X_WB.translation(), X_WB @ target
     meshcat.SetProperty("/Background", "top_color", [0.93, 0.95, 0.97])
     meshcat.SetProperty("/Background", "bottom_color", [0.78, 0.82, 0.86])
     meshcat.SetProperty("/Grid", "visible", False)

@@ -76,5 +76,5 @@ def watch(build: StationBuild, device: Watched, name: str) -> None:
     build.closables.append(device)
     watching = build.builder.AddSystem(DeviceWatch(device))
     watching.set_name(f"{name}_watch")
-    build.builder.Connect(build.outputs["ur10e.status"], watching.GetInputPort("robot_status"))
-    build.outputs["ur10e.status"] = watching.GetOutputPort("status")
+    build.builder.Connect(build.outputs["arm.status"], watching.GetInputPort("robot_status"))
+    build.outputs["arm.status"] = watching.GetOutputPort("status")

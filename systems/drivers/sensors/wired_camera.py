@@ -13,9 +13,9 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 
 from weldcal.models.errors import InputError
 from weldcal.models.tool import FingerCamera
+from weldcal.models.tools.finger_file import FingerFile, read_finger_file
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Garbage, Rules, Source
-from weldcal.systems.drivers.sensors.finger_file import FingerFile, read_finger_file
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild

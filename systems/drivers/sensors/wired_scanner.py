@@ -13,6 +13,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.scanners import ScannerPreset, get_scanner
 from weldcal.systems.drivers.config import ScannerConfig
 from weldcal.systems.drivers.sensors.acquisition import Acquisition, Frame, Garbage, Rules, Source
+from weldcal.systems.drivers.sensors.on_trigger import OnTrigger
 from weldcal.systems.drivers.sensors.stamps import DiagramTime
 from weldcal.systems.drivers.sensors.watch import watch
 from weldcal.systems.drivers.station_build import StationBuild
@@ -98,53 +99,6 @@ def checked_cloud(points: NDArray[Any], metres: float, far_m: float) -> Cloud:
     return cloud
 
 
-class WiredScanSensor(LeafSystem):
-    """Asks the scanner for one cloud per trigger.
-
-    .. pydrake_system::
-
-        name: WiredScanSensor
-        input_ports:
-        - trigger
-        output_ports:
-        - scan
-
-    Ports as those of the simulated scanner. The Diagram does not wait for the scan, unless it may (`waits`). The capture time
-    is that of the scan's stamp, and at the earliest that of its trigger: from then on the arm is at rest.
-    """
-
-    def __init__(self, acquisition: Acquisition[Cloud], waits: bool = False) -> None:
-        super().__init__()
-        self.acquisition, self._waits = acquisition, waits
-        self._times, self._shown = DiagramTime(), Scan()
-        self._trigger = self.DeclareVectorInputPort("trigger", 1)
-        state = self.DeclareDiscreteState([0.0, 0.0, 0.0])  # number asked for, its time, number shown
-        ticket = {self.discrete_state_ticket(state)}
-        self.DeclareAbstractOutputPort("scan", lambda: AbstractValue.Make(Scan()), self._output, ticket)
-        self.DeclarePeriodicDiscreteUpdateEvent(PERIOD_S, 0.0, self._update)
-
-    def _update(self, context: Context, discrete: DiscreteValues) -> None:
-        now = context.get_time()
-        self._times.add(time.monotonic(), now)
-        asked, asked_at, shown = context.get_discrete_state_vector().value()
-        wanted = int(self._trigger.Eval(context)[0])
-        if wanted > asked:
-            asked, asked_at = float(wanted), now
-            self.acquisition.request(wanted)
-        if asked > shown:
-            number = int(asked)
-            found = self.acquisition.wait_for_answer(number) if self._waits else self.acquisition.answer(number)
-            if found is not None:
-                captured = max(self._times.at(found.stamp.captured), asked_at)
-                self._shown = Scan(number, captured, found.datum)
-                shown = asked
-        discrete.set_value([asked, asked_at, shown])
-
-    def _output(self, context: Context, output: Any) -> None:
-        shown = context.get_discrete_state_vector()[2] > 0.5
-        output.set_value(self._shown if shown else Scan())
-
-
 class WiredScanStream(LeafSystem):
     """Shows the newest frames of a scanner that runs freely.
 
@@ -209,7 +163,7 @@ def add_scanner(config: WiredScanner, source: Source[Cloud], build: StationBuild
         build.outputs["scanner.stream"] = stream.GetOutputPort("stream")
         stream.set_name("scanner")
         return
-    sensor = build.builder.AddSystem(WiredScanSensor(acquisition, build.may_wait))
+    sensor = build.builder.AddSystem(OnTrigger(acquisition, "scan", Scan, PERIOD_S, build.may_wait))
     sensor.set_name("scanner")
     build.inputs["scanner.trigger"] = sensor.GetInputPort("trigger")
     build.outputs["scanner.scan"] = sensor.GetOutputPort("scan")

@@ -40,7 +40,7 @@ class RenderedScanner(ScannerConfig):
 
     DEFAULT_FOR: ClassVar[tuple[str, ...]] = ("scanner",)
     SIMULATED: ClassVar[bool] = True
-    preset: str = "phoxi_m"
+    preset: str = "phoxi_m"  # or a scanner file, relative to the scenario: docs/scanners.md
     width: int | None = 824  # 0.5 Mpx; null: the scanner's full resolution
     height: int | None = 616
     xyz_m: list[float] = dc.field(default_factory=lambda: [0.65, 0.0, 0.95])  # nominal X_BC
@@ -81,13 +81,16 @@ class RenderedScanner(ScannerConfig):
         preset = self.scanner()
         if len(self.gradient_error_per_m) != 2:
             raise InputError("scanner.gradient_error_per_m must be two numbers, along x and along y.")
+        own = preset.noise  # of a scanner file; a preset by name has no such errors
+        gradient = (self.gradient_error_per_m[0], self.gradient_error_per_m[1])
+        warp_m = self.warp_mm * 1e-3 or own.warp_m
         noise = dc.replace(
-            preset.noise,
-            scale_error=self.scale_error,
-            gradient_per_m=(self.gradient_error_per_m[0], self.gradient_error_per_m[1]),
-            warp_m=self.warp_mm * 1e-3,
+            own,
+            scale_error=self.scale_error or own.scale_error,
+            gradient_per_m=gradient if any(gradient) else own.gradient_per_m,
+            warp_m=warp_m,
             # no draw where it is not needed: the other devices' random numbers stay the same
-            device=int(rng.integers(2**31)) if self.warp_mm else 0,
+            device=int(rng.integers(2**31)) if warp_m else 0,
         )
         return dc.replace(preset, noise=noise)
 

@@ -1,6 +1,7 @@
 """Adds a second arm to the simulated plant, with its base at its true pose."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,8 @@ from weldcal.models.arms.kinematics import ArmModel, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.systems.jobs.mounting.config import SecondArm
 
-SECOND = "ur10e_2"
-"""Prefix of the second arm's ports; `ur10e` is the prefix of the first arm's."""
+FIRST, SECOND = "arm", "arm_2"
+"""Prefixes of the ports of the first and of the second arm, whatever their models."""
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -36,9 +37,9 @@ def place_second_arm(config: SecondArm, off: RigidTransform) -> PlacedArm:
 
 
 def add_second_arm(
-    plant: MultibodyPlant, placed: PlacedArm, stiffness: tuple[float, ...], damping: tuple[float, ...]
+    plant: MultibodyPlant, placed: PlacedArm, stiffness: Sequence[float], damping: Sequence[float]
 ) -> ModelInstanceIndex:
-    """Add the arm to a plant that is not finalised, with joint servos like the first arm's."""
+    """Add the arm to a plant that is not finalised, with joint servos of its own size."""
     (instance,) = Parser(plant).AddModelsFromString(arm_urdf(placed.arm, SECOND), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance), placed.X_BD)
     for name, p, d in zip(placed.arm.joint_names, stiffness, damping, strict=True):

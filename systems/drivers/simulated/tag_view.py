@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.models.arrays import Array
 from weldcal.models.tool import FingerCamera, WeldingTool
-from weldcal.systems.bodies.tool import SOFT, TAG_PLATE_DEPTH_M, TAG_PLATE_M, printed_tag, tool_tag
+from weldcal.systems.bodies.tool import SOFT, TAG_PLATE_DEPTH_M, printed_tag, tool_tag
 
 Pixels = NDArray[np.uint8]
 _SUBPIXEL_BITS = 8
@@ -27,7 +27,10 @@ class TagView:
         # the outer corners of the print's first and last texels, clockwise from the upper left
         self._texels = np.array([[-0.5, -0.5], [w - 0.5, -0.5], [w - 0.5, h - 0.5], [-0.5, h - 0.5]], dtype=np.float32)
         square = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-        self._print_M, self._plate_M = 0.5 * size * square, 0.5 * TAG_PLATE_M * square - [0.0, 0.0, TAG_PLATE_DEPTH_M]
+        self._print_M, self._plate_M = (
+            0.5 * size * square,
+            0.5 * tool.tag_plate_m * square - [0.0, 0.0, TAG_PLATE_DEPTH_M],
+        )
 
     def picture(self, X_FM: RigidTransform) -> Pixels:
         """The grey picture (H, W) of the tag whose frame M (x right, y up, z out of the print) is at X_FM in the flange frame."""

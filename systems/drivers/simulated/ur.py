@@ -1,4 +1,4 @@
-"""Simulated UR10e: the controller's speedj on top of the MultibodyPlant's implicit joint servos."""
+"""Simulated UR arm: the controller's speedj on top of the MultibodyPlant's implicit joint servos."""
 
 import dataclasses as dc
 from typing import Any, ClassVar
@@ -165,9 +165,9 @@ def ApplyDriverConfig(config: SimulatedUr, build: StationBuild) -> None:
     # no draw where it is not needed: the other devices' random numbers stay the same
     seed = int(build.rng.integers(2**32)) if config.repeatability_mm else 0
     servo = build.builder.AddSystem(SpeedJointServo(build.arm, config, build.q_start, seed))
-    servo.set_name("ur10e_servo")
+    servo.set_name("arm_servo")
     build.builder.Connect(world.plant.get_state_output_port(world.arm), servo.GetInputPort("arm_state"))
     build.builder.Connect(servo.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
-    build.inputs["ur10e.velocity_command"] = servo.GetInputPort("velocity_command")
+    build.inputs["arm.velocity_command"] = servo.GetInputPort("velocity_command")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
-        build.outputs[f"ur10e.{name}"] = servo.GetOutputPort(name)
+        build.outputs[f"arm.{name}"] = servo.GetOutputPort(name)

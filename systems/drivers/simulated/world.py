@@ -9,26 +9,49 @@ from pydrake.geometry import AddContactMaterial, AddRigidHydroelasticProperties,
 from pydrake.math import RigidTransform
 from pydrake.multibody.parsing import Parser
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
-from pydrake.multibody.tree import JointActuatorIndex, ModelInstanceIndex, PdControllerGains, PrismaticJoint
+from pydrake.multibody.tree import (
+    JointActuatorIndex,
+    ModelInstanceIndex,
+    PdControllerGains,
+    PrismaticJoint,
+    UniformGravityFieldElement,
+)
 from pydrake.systems.controllers import InverseDynamics
 from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, Demultiplexer
 
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.base_circles import BaseCircle
 from weldcal.models.flanges import flange_mesh
 from weldcal.models.tool import WeldingTool
 from weldcal.models.workpieces.part import WeldPart
-from weldcal.systems.bodies.tool import STEEL, TABLE, TIP_FRICTION, add_flange, add_tool, mesh_shape, show
+from weldcal.systems.bodies.tool import (
+    STEEL,
+    TABLE,
+    TIP_FRICTION,
+    add_flange,
+    add_surroundings,
+    add_tool,
+    mesh_shape,
+    show,
+)
 from weldcal.systems.drivers.simulated.picture_scene import PictureScene, add_picture_scene
 from weldcal.systems.drivers.simulated.profiler_world import ProfilerFixture, TouchPair, add_fixture
 from weldcal.systems.drivers.simulated.second_arm import PlacedArm, add_second_arm
 from weldcal.systems.messages import Message
 
 SCANNER_RENDERER = "scanner"
-JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of the arm's joint servos
+JOINT_STIFFNESS = (2e5, 2e5, 1e5, 2e4, 2e4, 1e4)  # N m / rad, of a UR10e's joint servos
 JOINT_DAMPING = (4e3, 4e3, 2e3, 3e2, 3e2, 1.5e2)  # N m s / rad
+SERVO_EFFORT = (330.0, 330.0, 150.0, 54.0, 54.0, 54.0)  # N m, of that arm: another arm's servos are stiff in proportion
+
+
+def servo_gains(arm: ArmModel) -> tuple[list[float], list[float]]:
+    """Stiffness (6) N m / rad and damping (6) N m s / rad of an arm's joint servos, in proportion to its joints' torques."""
+    share = arm.effort_limit / np.array(SERVO_EFFORT)
+    return list(share * JOINT_STIFFNESS), list(share * JOINT_DAMPING)
 
 
 @dataclass(frozen=True)
@@ -73,7 +96,7 @@ def build_world(
     q_start: np.ndarray,
     *,
     flange: str,
-    table_z_m: float,
+    table: RigidTransform,
     workpiece: WeldPart | None,
     X_BP: RigidTransform | None,
     fittings: Sequence[Fittings] = (),
@@ -81,9 +104,11 @@ def build_world(
     time_step_s: float = 0.002,
     second: PlacedArm | None = None,
     foot: BaseCircle | None = None,
+    surroundings: Surroundings | None = None,
 ) -> SimulatedWorld:
     """Build the plant of the station, with the arm at `q_start`, held by implicit joint servos.
 
+    Gravity pulls against the arm's `up`. `table` is the pose in B of the table's top, z up.
     A robot driver sets the servos' reference: the simulated controller, or a real arm that the simulated one follows.
     Frame: the world is the robot base B. `workpiece` is the true part (it may differ from its CAD), placed at X_BP.
     `second` is another arm; `foot` is the ring of the base mounting, with a mesh finer than a scan resolves.
@@ -96,19 +121,22 @@ def build_world(
         ),
         builder,
     )
+    plant.mutable_gravity_field().set_gravity_vector(-UniformGravityFieldElement.kDefaultStrength * arm.up)
     (instance,) = Parser(builder=builder, plant=plant).AddModelsFromString(arm_urdf(arm), "urdf")
     plant.WeldFrames(plant.world_frame(), plant.GetFrameByName("base", instance))
     add_flange(plant, instance, flange)
     tool_instance, tip_joints = (None, ()) if tool is None else add_tool(plant, instance, tool, tool.tip_radius_m / 2)
-    second_arm = None if second is None else add_second_arm(plant, second, JOINT_STIFFNESS, JOINT_DAMPING)
+    second_arm = None if second is None else add_second_arm(plant, second, *servo_gains(second.arm))
     if second_arm is not None:
         add_flange(plant, second_arm, flange)
-    touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, table_z_m)
+    touch_pair = None if profiler is None else add_fixture(plant, instance, profiler, float(table.translation()[2]))
     world_body = plant.world_body()
     if foot is not None:
         ring = mesh_shape(flange_mesh(foot.standard, foot.standard.bore_depth_m), "foot.obj")
         show(plant, plant.GetBodyByName("base", instance), foot.X_BR, ring, "base_circle", STEEL)
-    show(plant, world_body, RigidTransform([0.45, 0.0, table_z_m - 0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    show(plant, world_body, table @ RigidTransform([0.0, 0.0, -0.02]), Box(1.5, 1.2, 0.04), "table", TABLE)
+    if surroundings is not None:
+        add_surroundings(plant, surroundings)
     if workpiece is not None and X_BP is not None:
         show(plant, world_body, X_BP, mesh_shape(workpiece.mesh, "workpiece.obj"), "workpiece", STEEL)
         rigid = ProximityProperties()
@@ -119,9 +147,10 @@ def build_world(
                 world_body, X_BP, mesh_shape(workpiece.groove_mesh, "groove.obj"), "groove", rigid
             )
     fitted = [fitting.add(plant, instance) for fitting in fittings]
+    stiffness, damping = servo_gains(arm)
     for k in range(6):  # by index: the indices of one model instance are not known before Finalize
         servo = plant.get_joint_actuator(JointActuatorIndex(k))
-        servo.set_controller_gains(PdControllerGains(p=JOINT_STIFFNESS[k], d=JOINT_DAMPING[k]))
+        servo.set_controller_gains(PdControllerGains(p=stiffness[k], d=damping[k]))
     plant.Finalize()
     actuators = [plant.get_joint_actuator(i) for i in plant.GetJointActuatorIndices(instance)]
     if len(actuators) != 6 or not all(a.has_controller() for a in actuators):

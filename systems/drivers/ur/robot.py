@@ -32,7 +32,7 @@ FIRST_LIMIT_S = 2.0
 ANSWER_LIMIT_S = 2.0
 START_LIMIT_S = 8.0
 EXCUSED_S = 0.5
-ONLY_WITH_OUTPUT = "# only with an output"
+ONLY_WITH_OUTPUT, ONLY_WITH_VALVE = "# only with an output", "# only with a gas valve"
 READ_BACK = ("tcp_offset", "payload", "payload_cog")
 READ_BACK_LIMIT_S = 1.0
 SCALINGS = ("speed_scaling", "target_speed_fraction")
@@ -55,16 +55,17 @@ class Refused(Exception):
         self.fault = fault
 
 
-def guard_script(upper_registers: bool, output: int | None = None) -> str:
-    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share; `output`: the
-    standard digital output of the process, None where none is wired.
+def guard_script(upper_registers: bool, output: int | None = None, gas: int | None = None) -> str:
+    """The text of the guard script for the register range in use: 24 to 47, or 0 to 23, which fieldbuses share; `output` and
+    `gas`: the standard digital outputs of the process and of the gas valve, None where none is wired.
     """
     text = files("weldcal.systems.drivers.ur").joinpath("guard.script").read_text(encoding="utf-8")
-    if output is None:
-        # a controller may refuse a program for the name of a function that it never calls
-        text = "".join(line for line in text.splitlines(keepends=True) if ONLY_WITH_OUTPUT not in line)
-    else:
-        text = text.replace("global output = -1", f"global output = {output}")
+    for number, name, mark in ((output, "output", ONLY_WITH_OUTPUT), (gas, "valve", ONLY_WITH_VALVE)):
+        if number is None:
+            # a controller may refuse a program for the name of a function that it never calls
+            text = "".join(line for line in text.splitlines(keepends=True) if mark not in line)
+        else:
+            text = text.replace(f"global {name} = -1", f"global {name} = {number}")
     if upper_registers:
         return text
     changed = text.replace("global base = 24", "global base = 0").replace("global word = 36", "global word = 12")
@@ -88,7 +89,7 @@ class Robot:
         self._host = host
         base = UPPER_OFFSET if upper else 0
         self._output, self._arm, self._pace = output, arm, pace
-        self._script = guard_script(upper, output)
+        self._script = guard_script(upper, output, gas)
         self._arc_inputs = arc_inputs or ArcInputs()
         self.clock = ClockMap(pace)
         self._answer, self._latch = f"output_int_register_{base}", f"output_int_register_{base + 12}"

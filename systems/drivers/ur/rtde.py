@@ -35,9 +35,8 @@ class UrRtde(DriverConfig):
     rate_hz: float = 250.0  # of the worker's loop
     pace: float = 1.0  # seconds of the controller per second of this computer; other than 1 only for the emulator
     lockstep: bool = False  # only for the emulator: its time waits for this computer
-    follow: bool = (
-        False  # only for an emulator in lockstep: the cell's time waits for it too, as for a world of its own
-    )
+    # only for an emulator in lockstep: the cell's time waits for it too, as for a world of its own
+    follow: bool = False
     velocity_share: float = 0.6  # of the arm's limits; a faster command is refused
     upper_registers: bool | None = None  # from 24 on (fieldbuses use those from 0 on); null: true
     payload_kg: float = 1.4  # of the welding tool
@@ -61,6 +60,10 @@ class UrRtde(DriverConfig):
         if self.follow:
             return limits.in_lockstep(FOLLOWING_PATIENCE_S, held_s=0.0)
         return limits.in_lockstep() if self.lockstep else limits
+
+    def torch_delay_s(self) -> float:
+        """The time of gas before the torch, where a valve is wired."""
+        return 0.0 if self.gas_output is None else self.gas_before_s
 
     def load(self, owner: str = "the scenario") -> ExpectedLoad:
         """The payload with which the pre-flight compares the controller's."""
@@ -193,8 +196,8 @@ def PrepareRobot(config: UrRtde, nominal: ArmModel) -> PreparedRobot:
             )
         if config.gas_output == config.process_output:
             raise InputError("robot.gas_output and robot.process_output must be two outputs.")
-        if not (0.0 <= config.gas_before_s <= 1.5 and 0.0 <= config.gas_after_s <= 10.0):
-            raise InputError("robot.gas_before_s must be from 0 to 1.5, and gas_after_s from 0 to 10.")
+        if not (0.0 <= config.gas_before_s <= 10.0 and 0.0 <= config.gas_after_s <= 10.0):
+            raise InputError("robot.gas_before_s and robot.gas_after_s must be from 0 to 10.")
     report = preflight(config.host, upper_registers=config.upper_registers, nominal=nominal, load=config.load())
     require_ready(report)
     arm = report.arm
@@ -225,13 +228,13 @@ def ApplyDriverConfig(config: UrRtde, build: StationBuild) -> None:
     if build.robot is None or not isinstance(build.robot.handle, UrLink) or build.robot.clock is None:
         raise RuntimeError("the robot was not prepared")
     arm = build.builder.AddSystem(UrRtdeArm(build.arm, build.robot.handle, build.robot.clock))
-    arm.set_name("ur10e_link")
+    arm.set_name("arm_link")
     if (world := build.find(SimulatedWorld)) is not None:
         build.builder.Connect(arm.GetOutputPort("desired_state"), world.plant.get_desired_state_input_port(world.arm))
-    build.inputs["ur10e.velocity_command"] = arm.GetInputPort("velocity_command")
+    build.inputs["arm.velocity_command"] = arm.GetInputPort("velocity_command")
     if config.process_output is not None:
-        build.inputs["ur10e.process_on"] = arm.GetInputPort("process_on")
+        build.inputs["arm.process_on"] = arm.GetInputPort("process_on")
     if config.arc_input is not None:
-        build.outputs["ur10e.arc_established"] = arm.GetOutputPort("arc_established")
+        build.outputs["arm.arc_established"] = arm.GetOutputPort("arc_established")
     for name in ("position_measured", "velocity_measured", "X_BF", "sample_time", "status"):
-        build.outputs[f"ur10e.{name}"] = arm.GetOutputPort(name)
+        build.outputs[f"arm.{name}"] = arm.GetOutputPort(name)

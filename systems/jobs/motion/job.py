@@ -12,6 +12,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.motion.calibrator import MotionCalibrator
 from weldcal.systems.jobs.motion.collector import MotionCollector
@@ -25,7 +26,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand
 from weldcal.systems.motion.clear_moves import clear_move, station_bodies
 from weldcal.systems.motion.drift_monitor import DriftMonitor, DriftStatus, MonitoredCalibration
 from weldcal.systems.motion.frame_queue import FrameQueue
-from weldcal.systems.motion.spine import FIRST, JobPorts, Spine
+from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 from weldcal.systems.viewer.drift_view import DriftView

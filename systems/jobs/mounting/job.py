@@ -24,6 +24,7 @@ from weldcal.systems.jobs.mounting.messages import MountingState, MountingStatus
 from weldcal.systems.jobs.mounting.procedure import MountingProcedure
 from weldcal.systems.motion.spine import JobPorts, Spine
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.scenario.surroundings import surroundings_of
 from weldcal.systems.station import Station
 from weldcal.systems.wiring import Wiring
 
@@ -153,7 +154,7 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, Fl
     carrier = scanner.mounted_on
     link = {"base": 0, "flange": FLANGE}.get(carrier, 1 + LINKS.index(carrier) if carrier in LINKS else 0)
     circle = base_circle(scenario.arm) if c.configuration in FOOT else None
-    standard = get_flange(scenario.flange) if circle is None else circle.standard
+    standard = get_flange(scenario.flange_name()) if circle is None else circle.standard
     second = job.second_arm
     scene = MountingScene(
         configuration=c.configuration,
@@ -168,6 +169,7 @@ def mounting_scene(scenario: Scenario, arm: ArmModel) -> tuple[MountingScene, Fl
         arm_2=None if second is None else load_arm(second.arm),
         X_BD=None if second is None else second.pose(),
         q_home_2=None if second is None else np.deg2rad(second.home_deg),
+        surroundings=surroundings_of(scenario),
     )
     return scene, standard
 

@@ -56,7 +56,7 @@ class Profiler(Job[PlanningContext]):
             scenario.part(ProfilerJob),
             has_profiler=not isinstance(scenario.profiler, NoDevice),
             has_groove=scenario.workpiece is not None,
-            tool=scenario.tool,
+            tool=str(scenario.tool),
         )
 
     def furnish(
@@ -123,6 +123,7 @@ def planning_context(scenario: Scenario, station: Station) -> PlanningContext:
         cad=station.cad,
         X_BP=None if spec is None else spec.pose_guess.pose(),
         table_z_m=scenario.calibration.table_z_m,
+        surroundings=station.surroundings,
     )
 
 

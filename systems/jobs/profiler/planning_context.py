@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from weldcal.calibration.planning.clearance import Body, arm_bodies, path_clearance
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.calibration.profiler.motion import FlangePoses
 from weldcal.calibration.profiler.plan import Field
 from weldcal.models.arms.inverse import nearest_solution
@@ -36,6 +37,7 @@ class PlanningContext:
     cad: WeldPart | None = None
     X_BP: RigidTransform | None = None
     table_z_m: float = 0.0
+    surroundings: Surroundings = field(default_factory=Surroundings)
 
     @property
     def radius_m(self) -> float:
@@ -83,6 +85,8 @@ class PlanningContext:
         for u in np.linspace(0.0, 1.0, n):
             if self.gap(forward_kinematics(self.arm, q_a + u * (q_b - q_a))) < 0.5e-3 * self.job.clearance_mm:
                 return False
+        if self.surroundings.touched_on_path(self.arm, self.bodies(), q_a, q_b):
+            return False
         lowest, gap = path_clearance(self.arm, self.bodies(), q_a, q_b, 2.0 * STEP_RAD)
         return lowest > self.table_z_m and gap > 0.0
 

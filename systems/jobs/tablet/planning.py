@@ -102,6 +102,6 @@ def check_moves(scenario: Scenario, station: Station, plan: TabletPlan) -> None:
     for k in range(len(goals) - 1):
         if not clear_move(scenario, station, bodies, goals[k], goals[k + 1]):
             raise InputError(
-                f"The move from {names[k]} to {names[k + 1]} would touch the table or the arm itself: choose another home_deg, "
+                f"The move from {names[k]} to {names[k + 1]} would touch the table, the surroundings or the arm itself: choose another home_deg, "
                 "a smaller tablet.turn_deg, or another place for the tablet."
             )

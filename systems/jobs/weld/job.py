@@ -216,6 +216,7 @@ def _add_welding(
                 welding.clearance_mm * 1e-3,
                 None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
                 scenario.planning.planning_method(),
+                station.surroundings,
             ),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
             station.background,
@@ -234,11 +235,11 @@ def _add_welding(
         planned_seam=planner.GetOutputPort("planned_seam"),
         deformation=finger.GetOutputPort("deformation"),
         position_measured=position,
-        sample_time=out("ur10e.sample_time"),
+        sample_time=out("arm.sample_time"),
         job=command,
     )
-    if station.diagram.HasOutputPort("ur10e.arc_established"):
-        wiring.connect(servo, arc_established=out("ur10e.arc_established"))
+    if station.diagram.HasOutputPort("arm.arc_established"):
+        wiring.connect(servo, arc_established=out("arm.arc_established"))
     guard = wiring.add("singularity_guard", SingularityGuard(station.arm, tool.X_FT))
     wiring.connect(guard, V_BT=servo.GetOutputPort("V_BT"), position_measured=position)
     logged = {

@@ -1,15 +1,19 @@
 """SeamPlanner: plans the seam in the base, and the arm's approach, from a scan of the workpiece."""
 
 import dataclasses as dc
+import itertools
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import AngleAxis
 from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.planning.clearance import arm_bodies
+from weldcal.calibration.planning.surroundings import Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
@@ -18,13 +22,16 @@ from weldcal.models.workpieces.part import WeldPart
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
+from weldcal.systems.jobs.weld.levelled import plan_root_anyhow
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam, Scan
-from weldcal.welding.locate.planning import PlanningMethod, RootPlan, plan_root
+from weldcal.welding.locate.planning import PlanningMethod, RootPlan
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
 from weldcal.welding.seam.room import check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
+
+CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -40,6 +47,7 @@ class SeamPlanning:
     clearance_m: float
     seam_length_m: float | None
     method: PlanningMethod = dc.field(default_factory=PlanningMethod)
+    surroundings: Surroundings = dc.field(default_factory=Surroundings)
 
     def above_m(self) -> float | None:
         """Height of the seated tip above the drawn root, m; None where the groove's angle is found in the scan."""
@@ -53,13 +61,18 @@ class SeamPlanning:
         """Joint positions of the approach; see arm_waypoints.
 
         Raises:
-            WeldcalError: the seam is not feasible, the tool has no room beside the part at X_BP, or it is out of reach.
+            WeldcalError: the seam is not feasible, the tool has no room beside the part at X_BP, it is out of reach, or something is in
+                the arm's way.
         """
         if X_BP is not None:
             tool = self.tool
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        return arm_waypoints(self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m)
+        q_start, q_above, q_retract = arm_waypoints(
+            self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m
+        )
+        check_weld_path(self, seam, q_start, q_above, q_retract)
+        return q_start, q_above, q_retract
 
 
 class SeamPlanner(BackgroundSystem):
@@ -120,7 +133,9 @@ def plan_seam(
     points_C = points_C[np.all(np.isfinite(points_C), axis=1)]
     points_B = correction.points(points_C) @ X_BC.rotation().matrix().T + X_BC.translation()
     try:
-        found = plan_root(points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation())
+        found = plan_root_anyhow(
+            points_B, planning.workpiece, planning.X_BP_guess, planning.method, X_BC.translation(), planning.arm.up
+        )
         seam = seam_above(found, planning.tool, planning.seam_length_m, planning.above_m())
         q_start, q_above, q_retract = planning.waypoints(seam, found.X_BP)
     except WeldcalError as error:
@@ -141,6 +156,47 @@ def plan_seam(
 
 
 _LEVEL = math.cos(math.radians(20.0))
+
+
+def check_weld_path(
+    planning: SeamPlanning,
+    seam: SeamCurve,
+    q_start: NDArray[np.float64],
+    q_above: NDArray[np.float64],
+    q_retract: NDArray[np.float64],
+) -> None:
+    """Check that approach, weld and retreat keep away from the cell's surroundings.
+
+    Raises:
+        SeamObstructed: something is in the way; SeamOutOfReach: the arm cannot follow the seam.
+    """
+    if not planning.surroundings.obstacles:
+        return
+    X_BT = touch_start_pose(seam, planning.config)
+    along, q = [planning.q_near, q_above, q_start], q_start
+    first = seam.frame(0.0)
+    for s in np.arange(CHECKED_EVERY_M, seam.length, CHECKED_EVERY_M):
+        at = seam.frame(float(s))
+        turn = math.atan2(
+            float(np.dot(np.cross(first.tangent, at.tangent), first.up)), float(np.dot(first.tangent, at.tangent))
+        )
+        R = RotationMatrix(AngleAxis(turn, np.asarray(first.up) / np.linalg.norm(first.up))) @ X_BT.rotation()
+        found = nearest_solution(planning.arm, RigidTransform(R, at.position) @ planning.tool.X_FT.inverse(), q)
+        if found is None:
+            raise SeamOutOfReach(f"The arm cannot follow the seam at {1e3 * s:.0f} mm: move the workpiece.")
+        along.append(found)
+        q = found
+    bodies = arm_bodies(planning.arm, planning.tool.capsules())
+    for a, b in itertools.pairwise([*along, q_retract, planning.q_near]):
+        if name := planning.surroundings.touched_on_path(planning.arm, bodies, a, b):
+            raise SeamObstructed(
+                f"The arm or its tool would come too close to '{name}' on its way along the seam: move it or the workpiece, or "
+                "correct surroundings in the scenario."
+            )
+
+
+class SeamObstructed(WeldcalError):
+    """Something in the cell's surroundings is in the arm's way along the seam."""
 
 
 class SeamOutOfReach(WeldcalError):
@@ -191,8 +247,8 @@ def arm_waypoints(
     solutions = []
     q = q_near
     end = seam.frame(seam.length)
-    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * _away(seam.frame(0.0).up))
-    X_BE = RigidTransform(X_BT.rotation(), end.position + (clearance_m + 0.05) * _away(end.up))
+    lifted = RigidTransform(X_BT.rotation(), X_BT.translation() + clearance_m * _away(seam.frame(0.0).up, arm.up))
+    X_BE = RigidTransform(X_BT.rotation(), end.position + (clearance_m + 0.05) * _away(end.up, arm.up))
     for pose in (lifted, X_BT, X_BE):
         found = nearest_solution(arm, pose @ tool.X_FT.inverse(), q)
         if found is None:
@@ -205,10 +261,9 @@ def arm_waypoints(
     return q_start, q_above, q_retract
 
 
-def _away(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _away(up: NDArray[np.float64], vertical: NDArray[np.float64]) -> NDArray[np.float64]:
     """Direction (3,) out of a joint: vertical on a level face, along the bisector of a leaning joint."""
-    vertical = np.array([0.0, 0.0, 1.0])
-    return vertical if up[2] > _LEVEL else up
+    return vertical if float(up @ vertical) > _LEVEL else up
 
 
 class DrawnSeamPlanner(SeamPlanner):

@@ -5,7 +5,7 @@ from pydrake.math import RigidTransform
 
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
-from weldcal.models.flanges import FlangeStandard, get_flange
+from weldcal.models.flanges import FlangeStandard
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import JobPlan
@@ -13,7 +13,14 @@ from weldcal.systems.motion.clear_moves import clear_poses, station_bodies
 from weldcal.systems.motion.spine import MOVE_TIMEOUT_S
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
-from weldcal.welding.servo.settings import DeflectionControl, GapConfig, ServoConfig, ToolGeometry, TouchConfig
+from weldcal.welding.servo.settings import (
+    DeflectionControl,
+    GapConfig,
+    ServoConfig,
+    ToolGeometry,
+    TorchControl,
+    TouchConfig,
+)
 
 SPARE_POSES = 3  # one for Algorithm 1's verification cloud, two to replace refused scans
 ZERO_FRAMES = 10  # frames of the tag with the tip free: 1/3 s before the descent
@@ -29,7 +36,7 @@ def feature_on_flange(scenario: Scenario, station: Station) -> RigidTransform:
 
 def feature_standard(scenario: Scenario) -> FlangeStandard:
     """Dimensions of that feature."""
-    return get_flange("tool-ring-63" if scenario.calibration.feature == "tool_ring" else scenario.flange)
+    return scenario.feature_standard()
 
 
 def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
@@ -54,6 +61,7 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
+        torch=TorchControl(ignition_limit_s=TorchControl().ignition_limit_s + scenario.robot.torch_delay_s()),
     )
 
 
@@ -79,10 +87,11 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
     config = PlannerConfig(
         seed=seed,
         theta_max_rad=np.deg2rad(c.theta_max_deg),
-        table_z_m=c.table_z_m,
+        table_z_m=scenario.table_height_m(),
         margin_m=c.clearance_m,
         feature_radius_m=0.5 * feature_standard(scenario).outer_m,
         work_point_B=tuple(work_point(scenario)),
+        surroundings=station.surroundings,
     )
     poses = plan_calibration_poses(
         station.arm,

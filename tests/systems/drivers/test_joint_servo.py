@@ -17,7 +17,7 @@ from weldcal.systems.scenario.loading import scenario_class
 from weldcal.systems.station import make_station
 
 TICK_S = 0.002
-SPEEDS = "ur10e.velocity_command"
+SPEEDS = "arm.velocity_command"
 
 
 @pytest.fixture
@@ -78,10 +78,10 @@ def test_what_is_measured_is_the_newest_step_and_says_when_it_was_taken(drive: D
     drive.run(0.1)  # under way
     for time in drive.ticks(0.02):
         # Between two ticks the plant shows the step made at the first of them, and that is the sample's time.
-        assert drive.get("ur10e.sample_time")[0] == pytest.approx(time - 0.5 * TICK_S)
-        assert drive.get("ur10e.position_measured") == pytest.approx(position(drive), abs=1e-12)
-        assert drive.get("ur10e.velocity_measured") == pytest.approx(velocity(drive), abs=1e-12)
-    X_BF = drive.get("ur10e.X_BF")
+        assert drive.get("arm.sample_time")[0] == pytest.approx(time - 0.5 * TICK_S)
+        assert drive.get("arm.position_measured") == pytest.approx(position(drive), abs=1e-12)
+        assert drive.get("arm.velocity_measured") == pytest.approx(velocity(drive), abs=1e-12)
+    X_BF = drive.get("arm.X_BF")
     assert X_BF.IsNearlyEqualTo(forward_kinematics(the_arm(), position(drive)), 1e-12)
 
 
@@ -93,7 +93,7 @@ def test_the_plants_flange_stands_where_the_kinematics_say(drive: Drive) -> None
 
 def test_speed_and_acceleration_stay_within_the_arms_limits_whatever_is_asked(drive: Drive) -> None:
     arm = the_arm()
-    servo = drive.station.diagram.GetSubsystemByName("ur10e_servo")
+    servo = drive.station.diagram.GetSubsystemByName("arm_servo")
     reference = servo.GetOutputPort("desired_state")
     context = servo.GetMyContextFromRoot(drive.context)
     drive.set(SPEEDS, [-50.0, 50.0, -50.0, 50.0, -50.0, 50.0])
@@ -113,7 +113,7 @@ def test_speed_and_acceleration_stay_within_the_arms_limits_whatever_is_asked(dr
 def test_a_command_that_is_no_number_stops_the_arm_for_good(drive: Drive, nonsense: float) -> None:
     drive.set(SPEEDS, [0.3] * 6)
     drive.run(0.2)
-    assert drive.get("ur10e.status").ready
+    assert drive.get("arm.status").ready
     drive.set(SPEEDS, [0.3, 0.3, nonsense, 0.3, 0.3, 0.3])
     drive.run(0.25)
     rest = position(drive)
@@ -121,7 +121,7 @@ def test_a_command_that_is_no_number_stops_the_arm_for_good(drive: Drive, nonsen
     drive.set(SPEEDS, [0.3] * 6)  # a sound command does not wake it again
     drive.run(0.2)
     assert np.abs(position(drive) - rest).max() < 1e-4
-    status: UrStatus = drive.get("ur10e.status")
+    status: UrStatus = drive.get("arm.status")
     assert not status.ready
     assert status.safety_mode == "PROTECTIVE_STOP"
     assert "not finite" in (status.fault or "")
@@ -133,7 +133,7 @@ def test_an_arm_that_cannot_follow_stops(drive: Drive) -> None:
     q[0] += 0.1  # something has pushed it far from its reference
     world.plant.SetPositions(drive.plant, world.arm, q)
     drive.run(0.01)
-    status: UrStatus = drive.get("ur10e.status")
+    status: UrStatus = drive.get("arm.status")
     assert not status.ready
     assert "did not follow" in (status.fault or "")
 

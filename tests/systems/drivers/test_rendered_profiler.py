@@ -133,10 +133,10 @@ def test_a_profile_taken_in_motion_meets_the_pose_of_its_own_time() -> None:
     # 40 mm/s downwards, begun a little above: a wrong step of 4 ms would be off by 160 um
     qd = np.linalg.solve(jacobian(station.arm, q), [0.0, 0.0, 0.0, 0.0, 0.0, -0.04])
     plant.SetPositions(plant.GetMyMutableContextFromRoot(root), station.world.arm, q - 0.3 * qd)
-    servo = station.diagram.GetSubsystemByName("ur10e_servo")
+    servo = station.diagram.GetSubsystemByName("arm_servo")
     state = np.concatenate([q - 0.3 * qd, np.zeros(6), q - 0.3 * qd, np.zeros(6), [0.0, 0.0]])
     servo.GetMyMutableContextFromRoot(root).SetDiscreteState(state)
-    command, trigger = (station.diagram.GetInputPort(n) for n in ("ur10e.velocity_command", "profiler.trigger"))
+    command, trigger = (station.diagram.GetInputPort(n) for n in ("arm.velocity_command", "profiler.trigger"))
     command.FixValue(root, qd)
     trigger.FixValue(root, [0.0])
     simulator.AdvanceTo(0.284)
@@ -145,8 +145,8 @@ def test_a_profile_taken_in_motion_meets_the_pose_of_its_own_time() -> None:
         if k == 4:
             trigger.FixValue(root, [1.0])
         simulator.AdvanceTo(root.get_time() + 0.004)
-        sampled = round(float(out("ur10e.sample_time").Eval(root)[0]), 6)
-        known[sampled] = np.array(out("ur10e.position_measured").Eval(root))
+        sampled = round(float(out("arm.sample_time").Eval(root)[0]), 6)
+        known[sampled] = np.array(out("arm.position_measured").Eval(root))
     scan = out("profiler.profile").Eval(root)
     assert scan.sequence == 1
     X = forward_kinematics(station.arm, known[round(scan.capture_time, 6)]) @ truth.X_FS

@@ -68,8 +68,8 @@ def slide(drive: Drive, groove: Groove, duration_s: float) -> None:
     """Along the groove at the speed of a weld."""
     p_FT = np.array(TOOL.X_FT.translation())
     for _ in range(round(duration_s / 0.05)):
-        _, _, J = kinematics_and_jacobian(drive.station.arm, drive.get("ur10e.position_measured"), p_FT)
-        drive.set("ur10e.velocity_command", np.linalg.solve(J, [0.0, 0.0, 0.0, *(SPEED_M_S * groove.tangent)]))
+        _, _, J = kinematics_and_jacobian(drive.station.arm, drive.get("arm.position_measured"), p_FT)
+        drive.set("arm.velocity_command", np.linalg.solve(J, [0.0, 0.0, 0.0, *(SPEED_M_S * groove.tangent)]))
         drive.run(0.05)
 
 
@@ -151,7 +151,7 @@ def test_as_the_finger_camera_feels_it_the_tip_sits_where_the_tools_numbers_say(
     def felt(drive: Drive) -> tuple[RigidTransform, np.ndarray]:
         drive.set("finger_camera.streaming", [1.0])
         slide(drive, groove, 0.4)
-        seen = measure_deformation(drive.get("finger_camera.image"), drive.get("ur10e.X_BF"), TOOL, tag, K).sample
+        seen = measure_deformation(drive.get("finger_camera.image"), drive.get("arm.X_BF"), TOOL, tag, K).sample
         assert seen is not None
         assert seen.valid
         return seen.X_BT_at_capture, seen.deflection_T

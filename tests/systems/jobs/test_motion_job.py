@@ -122,7 +122,7 @@ def streamed() -> tuple[dict[int, float], dict[int, float], dict[int, StreamedSc
     simulator = Simulator(builder.Build())
     context = diagram.GetMyMutableContextFromRoot(simulator.get_mutable_context())
     diagram.GetInputPort("scanner.streaming").FixValue(context, [1.0])
-    diagram.GetInputPort("ur10e.velocity_command").FixValue(context, np.full(6, 0.3))
+    diagram.GetInputPort("arm.velocity_command").FixValue(context, np.full(6, 0.3))
     seen: dict[int, float] = {}
     captures: dict[int, float] = {}
     frames: dict[int, StreamedScan] = {}

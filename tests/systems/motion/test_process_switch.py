@@ -47,7 +47,7 @@ class Welding:
 
     def arm(self, q: np.ndarray, fault: float = 0.0) -> None:
         station = self.diagram.GetSubsystemByName("station")
-        servo = station.GetSubsystemByName("ur10e_servo").GetMyMutableContextFromRoot(self.root)
+        servo = station.GetSubsystemByName("arm_servo").GetMyMutableContextFromRoot(self.root)
         memory = np.concatenate([q, np.zeros(6), q, np.zeros(6), [0.0, fault]])
         servo.get_mutable_discrete_state_vector().SetFromVector(memory)
 

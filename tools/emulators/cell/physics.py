@@ -60,7 +60,7 @@ class Physics:
         assert self.station.world is not None
         assert self.station.tool is not None
         self.world: SimulatedWorld = self.station.world
-        self._table_z_m = scenario.calibration.table_z_m
+        self._table_z_m = scenario.table_height_m()
         self._joints = Repeatability(arm, repeatability_mm, seed)
         self._arm = arm
         self._bodies = station_bodies(self.station)
@@ -97,7 +97,10 @@ class Physics:
                 self.torch.append(np.array(self._torch_port.Eval(self._context)))
         if self._frame % COLLISION_EVERY == 0:
             frames = link_frames(self._arm, true_q)
-            touches = lowest_point(self._bodies, frames) < self._table_z_m or self_distance(self._bodies, frames) < 0.0
+            touches = (
+                lowest_point(self._bodies, frames, self.station.arm.up) < self._table_z_m
+                or self_distance(self._bodies, frames) < 0.0
+            )
             self.collisions += int(touches and not self._touches)
             self._touches = touches
 

@@ -13,7 +13,6 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.addresses import loopback_address
@@ -22,6 +21,7 @@ from weldcal.systems.drivers.sensors.video_finger_camera import VideoFingerCamer
 from weldcal.systems.drivers.simulated.rendered_finger_camera import RenderedFingerCamera
 from weldcal.systems.drivers.simulated.ur import SimulatedUr
 from weldcal.systems.drivers.ur.rtde import UrRtde
+from weldcal.systems.scenario.arm import nominal_arm
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.cell.arc import Arc
@@ -84,8 +84,8 @@ def wires_of(cell: Scenario) -> Wires:
         robot.payload_kg,
         (x, y, z),
         robot.process_output,
-        getattr(robot, "arc_input", None),
-        getattr(robot, "arc_fault_input", None),
+        robot.arc_input,
+        robot.arc_fault_input,
         Path(scanner.folder),
         (loopback_address(trigger.hostname or ""), trigger.port or 0),
         (loopback_address(stream.hostname or ""), stream.port or 0),
@@ -207,7 +207,7 @@ def run_world(
     if not isinstance(camera, RenderedFingerCamera):
         raise InputError("The world's finger camera is !RenderedFingerCamera.")
     wires.folder.mkdir(parents=True, exist_ok=True)
-    arm = load_arm(world.arm, None if world.kinematics is None else Path(world.kinematics))
+    arm = nominal_arm(world)
     q_home = np.deg2rad(world.home_deg)
     millimetres = device.repeatability_mm if isinstance(device, SimulatedUr) else 0.0
     context = get_context("spawn")

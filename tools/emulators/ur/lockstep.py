@@ -7,9 +7,8 @@ from weldcal.tools.emulators.ur.controller.modes import RuntimeState
 from weldcal.tools.emulators.ur.controller.motions import STEP_S
 from weldcal.tools.emulators.ur.wire.net import Connection
 
-AHEAD_FRAMES = (
-    5  # so far the controller goes past a stream's newest package, and no further apart are those of a stream
-)
+# so far the controller goes past a stream's newest package, and no further apart are those of a stream
+AHEAD_FRAMES = 5
 STREAM_PACKAGES = 5  # of one recipe: from then on it is a stream
 
 

@@ -237,6 +237,7 @@ def main() -> None:
     parser.add_argument("--host", default=DEFAULT, help="loopback address to listen on")
     parser.add_argument("--control-port", type=int, default=CONTROL_PORT, help="port of the control channel")
     parser.add_argument("--polyscope", default="5.21", help="controller version: 5.12, 5.21, 10.7 ...")
+    parser.add_argument("--robot", default="ur10e", help="the arm: ur3e, ur5e, ur10e, ur16e, ur20, ur30 ...")
     parser.add_argument("--kinematics", type=Path, help="a robot's factory calibration (YAML)")
     parser.add_argument("--q", type=float, nargs=6, default=HOME, help="joint angles at the start (rad)")
     parser.add_argument("--pace", type=float, default=1.0, help="controller seconds per host second, 0.05 to 1")

@@ -98,6 +98,7 @@ def emulator_process(
     host: str | None = None,
     control_port: int = CONTROL_PORT,
     polyscope: str = "5.21",
+    robot: str = "ur10e",
     q: Sequence[float] | None = None,
     kinematics: Path | None = None,
     pace: float = 1.0,
@@ -114,6 +115,7 @@ def emulator_process(
         host: the loopback address, each with its own lock; None: one that nobody uses.
         control_port: port of the control channel.
         polyscope: controller version, such as 5.12, 5.21 or 10.7.
+        robot: name of the arm.
         q: joint angles at the start (6,) (rad); the emulator's home where None.
         kinematics: a robot's factory calibration; nominal where None.
         pace: controller seconds per host second, 0.05 to 1.
@@ -127,7 +129,7 @@ def emulator_process(
     ports = (*PORTS, control_port)
     with take_address(host, wait_for_lock_s) if host is not None else free_address(ports) as address:
         command = [sys.executable, "-m", "weldcal.tools.emulators.ur", "--parent", str(os.getpid()), "--host", address]
-        command += ["--control-port", str(control_port), "--polyscope", polyscope]
+        command += ["--control-port", str(control_port), "--polyscope", polyscope, "--robot", robot]
         command += ["--pace", str(pace), "--lockstep", str(lockstep), "--seed", str(seed)]
         if q is not None:
             command += ["--q", *(repr(float(angle)) for angle in q)]

@@ -109,7 +109,7 @@ def _replayed(
 ) -> Throughput:
     builder = DiagramBuilder()
     builder.AddSystem(station.diagram)
-    for name, values in (("ur10e.velocity_command", np.zeros(6)), ("scanner.trigger", np.zeros(1))):
+    for name, values in (("arm.velocity_command", np.zeros(6)), ("scanner.trigger", np.zeros(1))):
         still = builder.AddSystem(ConstantVectorSource(values))
         builder.Connect(still.get_output_port(), station.diagram.GetInputPort(name))
     delay_s = 0.14

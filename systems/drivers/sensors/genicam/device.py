@@ -144,7 +144,7 @@ class GenicamDevice:
         """The value of a feature; None where the device has none of this name."""
         try:
             return self.nodes.get_node(feature).value
-        except Exception:
+        except Exception:  # the producers' bindings raise types of their own, of no common base
             return None
 
     def close(self) -> None:

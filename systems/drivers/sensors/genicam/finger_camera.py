@@ -2,10 +2,11 @@
 
 import dataclasses as dc
 
-from weldcal.systems.drivers.sensors.acquisition import Delivery, Source
+from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import picture_of
-from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
+from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
+from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_camera
 from weldcal.systems.drivers.sensors.wired_camera import (
@@ -38,8 +39,8 @@ class GenicamFingerCamera(WiredFingerCamera):
         return OwnProcess(self.title, GenicamPictures, self)
 
 
-class GenicamPictures(Source[Picture]):
-    """The device as a source of grey pictures."""
+class GenicamPictures(GenicamSource[Picture]):
+    """The device, running freely, as a source of grey pictures."""
 
     def __init__(self, config: GenicamFingerCamera) -> None:
         profile = get_profile(config.profile)
@@ -48,30 +49,13 @@ class GenicamPictures(Source[Picture]):
             own["ExposureTime"] = f"{1e3 * config.exposure_ms:.6g}"  # microseconds in the naming convention
         if config.gain is not None:
             own["Gain"] = f"{config.gain:.6g}"
+        features = profile.features(streams=True, own=own)
+        super().__init__(GenicamDevice(config.producer, config.device, features, profile.alive), config.title)
         self._config = config
-        self.device = GenicamDevice(
-            config.producer, config.device, profile.features(streams=True, own=own), profile.alive
-        )
-        self.name = config.title
 
-    def open(self) -> None:
-        """See Source."""
-        self.device.open()
-
-    def ask(self, request: int) -> None:
-        """See Source."""
-
-    def next(self, timeout_s: float) -> Delivery[Picture] | None:
-        """See Source."""
-        taken = self.device.take(timeout_s)
-        if taken is None:
-            return None
-        picture = checked_picture(picture_of(taken.components), self._config.width, self._config.height)
-        return Delivery(picture, taken.arrived, taken.device_time, number=taken.number)
-
-    def close(self) -> None:
-        """See Source."""
-        self.device.close()
+    def datum(self, components: tuple[Component, ...]) -> Picture:
+        """See GenicamSource."""
+        return checked_picture(picture_of(components), self._config.width, self._config.height)
 
 
 def preflight(config: GenicamFingerCamera) -> Sensed:

@@ -3,10 +3,11 @@
 import dataclasses as dc
 import math
 
-from weldcal.systems.drivers.sensors.acquisition import Delivery, Source
+from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import UNIT_SCALING, profile_of
-from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
+from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
+from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_profiler import (
@@ -46,25 +47,27 @@ class GenicamProfiler(WiredProfiler):
         return OwnProcess(self.title, GenicamProfiles, self)
 
 
-class GenicamProfiles(Source[Profile]):
+class GenicamProfiles(GenicamSource[Profile]):
     """The device as a source of profiles."""
 
     def __init__(self, config: GenicamProfiler) -> None:
         profile = get_profile(config.profile)
-        self._config, self._trigger = config, profile.trigger
-        self.device = GenicamDevice(
-            config.producer, config.device, profile.features(streams=False, own=config.settings), profile.alive
-        )
-        self.name = config.title
+        features = profile.features(streams=False, own=config.settings)
+        device = GenicamDevice(config.producer, config.device, features, profile.alive)
+        super().__init__(device, config.title, profile.trigger)
+        self._config = config
         self._unit = profile.unit if config.unit == "device" else config.unit
         self._metres, self._scaling = 1e-3, UNIT_SCALING
-        self._request, self._skip = 0, 0
 
     def open(self) -> None:
         """See Source."""
-        self.device.open()
+        super().open()
         self._metres = _METRES.get(self._unit, self.device.metres or 1e-3)
         self._scaling = (self._read_scaling("CoordinateA"), self._read_scaling("CoordinateC"))
+
+    def datum(self, components: tuple[Component, ...]) -> Profile:
+        """See GenicamSource."""
+        return checked_profile(profile_of(components, self._scaling), self._metres, self._config)
 
     def _read_scaling(self, axis: str) -> tuple[float, float]:
         """Scale and offset of a coordinate; 1 and 0 where the device has none."""
@@ -73,31 +76,6 @@ class GenicamProfiles(Source[Profile]):
         found = [self.device.read(f"Scan3dCoordinate{name}") for name in ("Scale", "Offset")]
         scale, offset = (math.nan if value is None else float(value) for value in found)
         return (1.0 if math.isnan(scale) else scale, 0.0 if math.isnan(offset) else offset)
-
-    def ask(self, request: int) -> None:
-        """See Source."""
-        while self.device.take(0.001) is not None:  # frames of before the request
-            pass
-        self._request = request
-        if self._trigger:
-            self.device.execute(self._trigger)
-        else:
-            self._skip = 1
-
-    def next(self, timeout_s: float) -> Delivery[Profile] | None:
-        """See Source."""
-        taken = self.device.take(timeout_s)
-        if taken is None:
-            return None
-        if self._skip:
-            self._skip -= 1
-            return None
-        points = checked_profile(profile_of(taken.components, self._scaling), self._metres, self._config)
-        return Delivery(points, taken.arrived, taken.device_time, number=taken.number, request=self._request)
-
-    def close(self) -> None:
-        """See Source."""
-        self.device.close()
 
 
 def preflight(config: GenicamProfiler) -> Sensed:

@@ -2,10 +2,11 @@
 
 import dataclasses as dc
 
-from weldcal.systems.drivers.sensors.acquisition import Delivery, Garbage, Source
+from weldcal.systems.drivers.sensors.acquisition import Source
 from weldcal.systems.drivers.sensors.genicam.components import cloud_of
-from weldcal.systems.drivers.sensors.genicam.device import GenicamDevice
+from weldcal.systems.drivers.sensors.genicam.device import Component, GenicamDevice
 from weldcal.systems.drivers.sensors.genicam.profiles import get_profile
+from weldcal.systems.drivers.sensors.genicam.source import GenicamSource
 from weldcal.systems.drivers.sensors.own_process import OwnProcess
 from weldcal.systems.drivers.sensors.preflight import Sensed, look_at_scanner
 from weldcal.systems.drivers.sensors.wired_scanner import Cloud, WiredScanner, acquire, add_scanner, checked_cloud
@@ -46,52 +47,26 @@ class GenicamScanner(WiredScanner):
         return OwnProcess(self.title, GenicamClouds, self)
 
 
-class GenicamClouds(Source[Cloud]):
+class GenicamClouds(GenicamSource[Cloud]):
     """The device as a source of clouds."""
 
     def __init__(self, config: GenicamScanner) -> None:
         profile = get_profile(config.profile)
         features = profile.features(streams=config.streams, own=config.settings)
-        self._config, self._trigger = config, "" if config.streams else profile.trigger
+        device = GenicamDevice(config.producer, config.device, features, profile.alive)
+        super().__init__(device, config.title, "" if config.streams else profile.trigger)
         self._asks_device = config.unit == "device" and profile.unit == "device"
         self._metres, self._far_m = config.metres, config.scanner().far_m
-        self.device = GenicamDevice(config.producer, config.device, features, profile.alive)
-        self.name = config.title
-        self._request, self._skip = 0, 0
 
     def open(self) -> None:
         """See Source."""
-        self.device.open()
+        super().open()
         if self._asks_device and self.device.metres is not None:
             self._metres = self.device.metres
 
-    def ask(self, request: int) -> None:
-        """See Source."""
-        while self.device.take(0.001) is not None:  # frames of before the request
-            pass
-        self._request = request
-        if self._trigger:
-            self.device.execute(self._trigger)
-        else:
-            self._skip = 1  # the frame whose exposure was under way
-
-    def next(self, timeout_s: float) -> Delivery[Cloud] | None:
-        """See Source."""
-        taken = self.device.take(timeout_s)
-        if taken is None:
-            return None
-        if self._skip:
-            self._skip -= 1
-            return None
-        try:
-            cloud = checked_cloud(cloud_of(taken.components), self._metres, self._far_m)
-        except Garbage as error:
-            raise Garbage(f"in frame {taken.number}: {error}") from error
-        return Delivery(cloud, taken.arrived, taken.device_time, number=taken.number, request=self._request)
-
-    def close(self) -> None:
-        """See Source."""
-        self.device.close()
+    def datum(self, components: tuple[Component, ...]) -> Cloud:
+        """See GenicamSource."""
+        return checked_cloud(cloud_of(components), self._metres, self._far_m)
 
 
 def preflight(config: GenicamScanner) -> Sensed:

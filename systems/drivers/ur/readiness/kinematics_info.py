@@ -1,5 +1,6 @@
 """Reads a robot's factory kinematics from its primary port and checks it against the controller's flange pose."""
 
+import re
 import struct
 from dataclasses import dataclass
 
@@ -11,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, with_link_transforms
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
+from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.systems.drivers.ur.errors import RobotRefused
+from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.wire.line import Line
 
 PRIMARY_PORT = 30001
@@ -20,6 +23,7 @@ KINEMATICS_TOLERANCE_M = 5e-5
 KINEMATICS_TOLERANCE_RAD = float(np.deg2rad(0.02))
 
 _ROBOT_STATE, _KINEMATICS_INFO = 16, 5
+_ROBOT_MODEL = re.compile(r"\bUR\d+", re.IGNORECASE)
 _HEADER, _PART = struct.Struct(">iB"), struct.Struct(">IB")
 _BODY = struct.Struct(">6I24dI")
 _LONGEST_PACKAGE = 1 << 20
@@ -92,6 +96,14 @@ def _parse(body: bytes) -> KinematicsInfo:
     exact = max(np.abs(theta).max(), np.abs(square - np.round(square)).max(), abs(d[1]), abs(d[2]), abs(a[0])) < _EXACT
     checksum = "calib_" + "".join(f"{number:08x}" for number in numbers[:6])
     return KinematicsInfo(theta, a, d, alpha, calibrated=not exact, checksum=checksum)
+
+
+def model_finding(told: str, wanted: str) -> tuple[bool, str, str]:
+    """Whether the controller's name of its arm, such as UR10, fits the scenario's arm; what was found; the operator action."""
+    if not (found := _ROBOT_MODEL.search(told)):
+        return True, f"the dashboard says {told!r}; the kinematics tell", ""
+    same = found[0].upper() in (CONTROLLER_MODELS[wanted][0], wanted.upper().rstrip("E"))
+    return same, found[0] if same else f"{found[0]}, not a {wanted}", actions.model(found[0], wanted)
 
 
 def calibrated_arm(nominal: ArmModel, info: KinematicsInfo) -> ArmModel:

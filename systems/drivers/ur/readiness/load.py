@@ -5,10 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from weldcal.models.arrays import Array
 from weldcal.systems.drivers.ur.readiness import operator_actions as actions
 from weldcal.systems.drivers.ur.wire.rtde_client import Value
 
 PAYLOAD_OUTPUTS = ("payload", "payload_cog")
+GRAVITY_OUTPUT = "target_gravity"
+MOUNTING_TOLERANCE_RAD = float(np.deg2rad(5.0))  # a mounting is set in whole degrees, and meant within a few
 # A pendant shows hundredths of a kilogram and millimetres; a weighed tool is known no better than this.
 MASS_TOLERANCE_KG = 0.05
 COG_TOLERANCE_M = 0.005
@@ -29,6 +32,18 @@ class ExpectedLoad:
     def text(self) -> str:
         """Such as: 1.40 kg at (30, 0, 50) mm."""
         return _text(self.mass_kg, self.cog_m)
+
+
+def mounting_finding(seen: Mapping[str, Value], up: Array) -> Finding:
+    """Compare the controller's gravity (3,) in the base, which points up in its convention, with the scenario's `up` (3,)."""
+    wanted = _direction(up)
+    if GRAVITY_OUTPUT not in seen or not np.linalg.norm(seen[GRAVITY_OUTPUT]) > 1.0:
+        return True, f"not readable; Installation > General > Mounting must agree: up is {wanted} in the base", ""
+    gravity = np.array(seen[GRAVITY_OUTPUT], dtype=np.float64)
+    found = gravity / np.linalg.norm(gravity)
+    right = float(np.arccos(np.clip(found @ up, -1.0, 1.0))) <= MOUNTING_TOLERANCE_RAD
+    told = f"up is {_direction(found)} in the base"
+    return right, told if right else f"{told}, not {wanted}", actions.mounting(wanted)
 
 
 def payload_finding(seen: Mapping[str, Value], expected: ExpectedLoad | None) -> Finding:
@@ -63,3 +78,7 @@ def mode_finding(answer: str) -> Finding:
 def _text(mass_kg: float, cog_m: tuple[float, ...]) -> str:
     x, y, z = (round(1e3 * value) + 0 for value in cog_m)
     return f"{mass_kg:.2f} kg at ({x}, {y}, {z}) mm"
+
+
+def _direction(up: Array) -> str:
+    return "(" + ", ".join(f"{value:.2f}" for value in up + 0.0) + ")"

@@ -114,6 +114,22 @@ def payload(owner: str, text: str) -> str:
     )
 
 
+def mounting(wanted: str) -> str:
+    """The operator action where the robot is mounted in another way than in the scenario."""
+    return (
+        "The robot's mounting is not that of the scenario: set it under Installation > General > Mounting on the pendant, or correct "
+        f"base.rpy_deg in the scenario, by which up is {wanted} in the robot's base."
+    )
+
+
+def model(told: str, wanted: str) -> str:
+    """The operator action where the controller's arm is another model than the scenario's."""
+    return (
+        f"The controller says that its arm is a {told}, and the scenario's is a {wanted}: connect a {wanted}, or write this robot's "
+        "arm in the scenario as arm."
+    )
+
+
 def limits(joint: str) -> str:
     """The operator action where a joint is too near its limit."""
     return f"The {joint} joint is less than 5 degrees from its limit: turn it back with the Move tab of the pendant."

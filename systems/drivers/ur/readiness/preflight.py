@@ -21,14 +21,18 @@ from weldcal.systems.drivers.ur.readiness.kinematics_info import (
     KinematicsInfo,
     calibrated_arm,
     cross_check,
+    model_finding,
     read_kinematics,
 )
 from weldcal.systems.drivers.ur.readiness.load import (
+    GRAVITY_OUTPUT,
     PAYLOAD_OUTPUTS,
     ExpectedLoad,
     mode_finding,
+    mounting_finding,
     payload_finding,
 )
+from weldcal.systems.drivers.ur.readiness.needs import OUTPUTS, WAITS_FOR
 from weldcal.systems.drivers.ur.readiness.registers import UPPER_OFFSET, ranges, register_names
 from weldcal.systems.drivers.ur.readiness.releases import POLYSCOPE_X, is_supported
 from weldcal.systems.drivers.ur.wire.dashboard import ask
@@ -41,17 +45,6 @@ LOCAL = "LOCAL"
 LIMIT_MARGIN_RAD = float(np.deg2rad(5.0))
 REST_RAD_S = 0.005
 
-OUTPUTS = (
-    "runtime_state",
-    "robot_mode",
-    "safety_mode",
-    "speed_scaling",
-    "target_speed_fraction",
-    "actual_q",
-    "actual_qd",
-    "actual_TCP_pose",
-    "tcp_offset",
-)
 CHECKS = (
     "answer",
     "version",
@@ -62,23 +55,15 @@ CHECKS = (
     "joint limits",
     "TCP",
     "payload",
+    "mounting",
     "speed slider",
     "registers",
+    "model",
     "kinematics",
     "flange pose",
     "operational mode",
     "remote control",
 )
-
-# Without power there are no joint positions and no kinematics; without a dashboard remote control cannot be checked.
-WAITS_FOR = {
-    "standstill": ("power",),
-    "joint limits": ("power",),
-    "kinematics": ("power",),
-    "flange pose": ("power", "kinematics"),
-    "operational mode": ("program",),
-    "remote control": ("program",),
-}
 
 
 @dataclass(frozen=True)
@@ -220,11 +205,13 @@ class _Look:
         self._check_program()
         self._check_tcp()
         self._state("payload", *payload_finding(self._seen, self._load))
+        self._state("mounting", *mounting_finding(self._seen, self._nominal.up))
         self._check_speed()
         if self._done["power"].ok:
             self._check_standstill()
             self._check_limits()
             self._check_kinematics()
+        self._check_model()
         self._check_remote()
 
     @property
@@ -238,7 +225,7 @@ class _Look:
             if not self._check_version(rtde.version):
                 return {}
             claims = rtde.claim(register_names(self._offset))
-            self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, f"input_int_register_{self._offset}"))
+            self._seen = rtde.read((*OUTPUTS, *PAYLOAD_OUTPUTS, GRAVITY_OUTPUT, f"input_int_register_{self._offset}"))
         if missing := [name for name in OUTPUTS if name not in self._seen]:
             self._bad("version", f"{self._version_text} lacks {', '.join(missing)}", actions.VERSION)
         return claims
@@ -338,6 +325,19 @@ class _Look:
         # driver clears it, and the guard script ignores all commands until it has read zero there.
         stale = f"; command {command} is left over, the driver clears it" if command else ""
         self._ok("registers", f"{ranges(list(claims))} free{stale}")
+
+    def _check_model(self) -> None:
+        """Whether the controller's arm is the scenario's, as far as their names tell them apart."""
+        wanted = self._nominal.name
+        if self._is_x():
+            self._ok("model", "not readable on PolyScope X; the kinematics tell")
+            return
+        try:
+            told = self._ask("get robot model")
+        except RobotUnreachable as problem:
+            self._bad("model", "the dashboard does not answer", str(problem))
+            return
+        self._state("model", *model_finding(told, wanted))
 
     def _check_kinematics(self) -> None:
         try:

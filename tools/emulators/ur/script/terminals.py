@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from weldcal.models.robots import get_robot
 from weldcal.tools.emulators.ur.controller.registers import register_index
 from weldcal.tools.emulators.ur.script.answers import Answers
 from weldcal.tools.emulators.ur.script.syntax import ScriptError
@@ -76,6 +77,11 @@ class TerminalFunctions(Answers):
         self._controller.terminals.tool_voltage = int(voltage)
 
     def set_payload(self, m: float, cog: Any = None) -> None:
+        model = self._controller.arm.model.name
+        if (
+            not 0.0 <= float(m) <= (most := get_robot(model).payload_kg)
+        ):  # [M] what a controller answers is not documented
+            raise ScriptError(f"The payload of a {model} is 0 to {most:g} kg, not {m!r}.")
         self._controller.payload.mass = float(m)
         if cog is not None:
             self.set_payload_cog(cog)

@@ -105,6 +105,7 @@ class ControlServer(Server):
             "set_tcp": lambda r, now: c.set_tcp(_six(r, "pose")),
             "set_q": lambda r, now: c.arm.place(np.array(_six(r, "q"))),
             "set_payload": self._payload,
+            "set_gravity": lambda r, now: setattr(c, "gravity", _several(r, "gravity", 3)),
             "clear_links": self._clear_links,
             "recover": self._recover,
             "expect_silence": lambda r, now: lockstep.expect_silence(),

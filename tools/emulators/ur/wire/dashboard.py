@@ -2,16 +2,22 @@
 
 from collections.abc import Callable
 
+from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.modes import OPERATIONAL_MODES, RobotMode, RuntimeState, SafetyMode
 from weldcal.tools.emulators.ur.wire.net import Connection, Server
 
+FIRST_IS_ONE = ("ur10e", *(name for name in CONTROLLER_MODELS if name != "ur10e"))
 GREETING = "Connected: Universal Robots Dashboard Server"
-SERIAL = "20235500001"
 TOO_EARLY = (
     "Cannot unlock protective stop until 5s after occurrence. Always inspect cause of protective stop before unlocking"
 )
 IDLE_PROGRAM = "def {name}():\n  while True:\n    sync()\n  end\nend\n"
+
+
+def serial_number(arm: str) -> str:
+    """A serial number for an emulated arm, another for each model."""
+    return f"202355{1 + FIRST_IS_ONE.index(arm):05d}"
 
 
 class DashboardServer(Server):
@@ -29,8 +35,8 @@ class DashboardServer(Server):
         self._fixed: dict[str, Callable[[], str]] = {
             "polyscopeversion": lambda: f"URSoftware {v.major}.{v.minor}.{v.bugfix}.{v.build} (Jan 01 2025)",
             "version": lambda: f"{v.major}.{v.minor}.{v.bugfix}.{v.build}",
-            "get serial number": lambda: SERIAL,
-            "get robot model": lambda: "UR10",
+            "get serial number": lambda: serial_number(c.arm.model.name),
+            "get robot model": lambda: CONTROLLER_MODELS[c.arm.model.name][0],
             "is in remote control": lambda: str(c.remote).lower(),
             "robotmode": lambda: f"Robotmode: {c.robot_mode.name}",
             "safetymode": lambda: f"Safetymode: {c.safety_mode.name}",
@@ -179,5 +185,7 @@ class DashboardServer(Server):
         if what.startswith("flight report"):
             return f"Flight Report generated with id: {self._count}"
         if what.startswith("support file"):
-            return f"Completed successfully: ursupport_{SERIAL}_{self._count}.zip"
+            return (
+                f"Completed successfully: ursupport_{serial_number(self._controller.arm.model.name)}_{self._count}.zip"
+            )
         return f"could not understand: 'generate {what}'"

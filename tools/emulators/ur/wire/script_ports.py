@@ -4,6 +4,7 @@ import struct
 from collections.abc import Callable
 
 from weldcal.models.arms.kinematics import ArmModel
+from weldcal.models.robots import CONTROLLER_MODELS
 from weldcal.tools.emulators.ur.controller.core import Controller
 from weldcal.tools.emulators.ur.controller.dh import dh_parameters
 from weldcal.tools.emulators.ur.controller.events import Event, SafetyChanged
@@ -18,7 +19,6 @@ CALIBRATED, NOMINAL = 2, 0
 VERSION = 3
 SOURCE_CONTROLLER = -2
 REAL_TIME_BYTES = 1220
-ROBOT_TYPE = 2  # UR10 and UR10e
 
 
 class ScriptServer(Server):
@@ -162,9 +162,9 @@ def kinematics_info(model: ArmModel) -> bytes:
 
 
 def _configuration(model: ArmModel) -> bytes:
-    dh = dh_parameters(model)
+    dh, robot_type = dh_parameters(model), CONTROLLER_MODELS[model.name][1]
     limits = [v for pair in zip(model.position_lower, model.position_upper, strict=True) for v in pair]
     speeds = [v for pair in zip(model.velocity_limit, model.acceleration_limit, strict=True) for v in pair]
     defaults = [1.05, 1.4, 0.25, 1.2, 0.35]
     body = struct.pack(">29d", *limits, *speeds, *defaults)
-    return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, ROBOT_TYPE, 0)
+    return body + struct.pack(">24d4i", *dh.a, *dh.d, *dh.alpha, *dh.theta, 1, 2, robot_type, 0)

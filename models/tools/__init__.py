@@ -1,0 +1,1 @@
+"""Tools as users describe them: the file's schema, its reader, and the welding tool's own file."""

@@ -1,0 +1,231 @@
+"""Files of parts: units, sizes, meshes, and every file that cannot be used refused by one sentence."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from weldcal.models.errors import InputError
+from weldcal.models.mesh import TriMesh, extrude
+from weldcal.models.workpieces.reading import read_shape
+from weldcal.models.workpieces.seam_input import SeamSource, chained, read_polyline, seam_of
+from weldcal.tools.studies.part_welds.step_parts import PARTS, write_step
+
+if TYPE_CHECKING:
+    from tests.models.workpieces.conftest import Shelf
+
+# The section of a T: a plate of 120 x 10 and a web of 10 x 50, mm.
+T_SECTION = np.array([(-60, -10), (60, -10), (60, 0), (5, 0), (5, 50), (-5, 50), (-5, 0), (-60, 0)], dtype=float)
+
+
+def t_mesh(scale: float = 1.0) -> TriMesh:
+    """A T of 200 mm along z, in mm (times a scale)."""
+    fine = []
+    for a, b in zip(T_SECTION, np.roll(T_SECTION, -1, axis=0), strict=True):
+        fine += [a + k / 12.0 * (b - a) for k in range(12)]
+    return extrude(scale * np.array(fine), 0.0, scale * 200.0)
+
+
+def write_stl(path: Path, mesh: TriMesh) -> None:
+    rows = ["solid part"]
+    for triangle, normal in zip(mesh.vertices[mesh.triangles], mesh.normals, strict=True):
+        rows.append("facet normal {} {} {}\nouter loop".format(*normal))
+        rows += ["vertex {} {} {}".format(*corner) for corner in triangle]
+        rows.append("endloop\nendfacet")
+    path.write_text("\n".join([*rows, "endsolid part"]))
+
+
+def test_a_mesh_lists_its_sharp_edges_and_gives_its_seam(tmp_path: Path) -> None:
+    stl, obj = tmp_path / "t.stl", tmp_path / "t.obj"
+    write_stl(stl, t_mesh())
+    obj.write_text(t_mesh().to_obj())
+    for path in (stl, obj):
+        shape = read_shape(path)
+        concave = [edge for edge in shape.edges if edge.kind == "concave"]
+        assert [edge.id for edge in concave] == [1, 2]
+        assert [edge.length_m for edge in concave] == pytest.approx([0.2, 0.2], abs=1e-6)
+        assert [math.degrees(edge.angle_rad) for edge in concave] == pytest.approx([90.0, 90.0], abs=1e-3)
+        seam = seam_of(shape, SeamSource(edges=(1,)), "fillet")
+        assert seam.length_m == pytest.approx(0.2, abs=1e-4)
+        assert np.abs(np.abs(seam.points_P[:, 0]) - 0.005).max() < 1e-5
+        assert np.abs(seam.points_P[:, 1]).max() < 1e-5
+    assert read_shape(stl, "inch").mesh.bounds[1, 2] == pytest.approx(200.0 * 0.0254)
+
+
+def test_a_circle_on_a_mesh_has_its_radius(shelf: Shelf, tmp_path: Path) -> None:
+    _, shape, _ = shelf.get("pipe_on_plate")
+    path = tmp_path / "pipe.stl"
+    write_stl(path, TriMesh(1e3 * shape.mesh.vertices, shape.mesh.triangles))
+    radii = sorted(e.radius_m for e in read_shape(path).edges if e.kind == "concave" and e.radius_m is not None)
+    assert radii == pytest.approx([0.072, 0.080], abs=2e-5)
+
+
+@pytest.mark.parametrize(("unit", "word"), [("INCH", "inch"), ("M", "m"), ("MM", "mm")])
+def test_a_step_file_states_its_unit(tmp_path: Path, unit: str, word: str) -> None:
+    made, path = PARTS["straight_web"](), tmp_path / "part.step"
+    write_step(made.shape, path, unit)
+    for units in (None, word):
+        shape = read_shape(path, units)
+        assert np.ptp(shape.mesh.vertices, axis=0) == pytest.approx([0.2, 0.12, 0.06], abs=1e-6)
+        assert shape.unit_m == {"mm": 1e-3, "m": 1.0, "inch": 0.0254}[word]
+    other = "m" if word != "m" else "mm"
+    with pytest.raises(InputError, match=f"is in {word}, not in {other}"):
+        read_shape(path, other)
+
+
+def test_a_seam_is_in_the_unit_of_its_part(tmp_path: Path) -> None:
+    made = PARTS["straight_web"]()
+    write_step(made.shape, tmp_path / "part.step", "INCH")
+    np.savetxt(tmp_path / "seam.csv", made.line_mm / 25.4, delimiter=",")
+    seam = seam_of(read_shape(tmp_path / "part.step"), SeamSource(tmp_path / "seam.csv"), "fillet")
+    assert seam.length_m == pytest.approx(0.2, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("scale", "units", "says"),
+    [(1e-3, "mm", "0.2 mm long.* Its unit may be m"), (1.0, "m", "200 m long.* Its unit may be mm")],
+)
+def test_a_part_of_a_wrong_unit_is_refused_with_the_likely_one(
+    tmp_path: Path, scale: float, units: str, says: str
+) -> None:
+    path = tmp_path / "t.stl"
+    write_stl(path, t_mesh(scale))
+    with pytest.raises(InputError, match=says):
+        read_shape(path, units)
+
+
+def test_files_that_are_no_part_are_refused(tmp_path: Path) -> None:
+    def file(name: str, content: str | bytes) -> Path:
+        path = tmp_path / name
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return path
+
+    open_mesh = t_mesh()
+    write_stl(tmp_path / "open.stl", TriMesh(open_mesh.vertices, open_mesh.triangles[:-3]))
+    good = tmp_path / "good.step"
+    write_step(PARTS["lap"]().shape, good)
+    cases = [
+        (tmp_path / "none.step", "no file"),
+        (tmp_path, "no part|folder"),
+        (file("part.igs", "x"), r"ends in \.step"),
+        (file("text.step", "hello"), "not a STEP file"),
+        (file("empty.step", ""), "not a STEP file"),
+        (file("half.step", good.read_bytes()[: len(good.read_bytes()) // 2]), "cut off"),
+        (file("hole.step", good.read_bytes().replace(b"CLOSED_SHELL", b"#99999 =X(#88888)", 1)), "damaged|refers"),
+        (
+            file("header.step", "ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\nENDSEC;\nEND-ISO-10303-21;\n"),
+            "without any shape",
+        ),
+        (file("empty.stl", ""), "is empty"),
+        (file("text.stl", "hello world"), "text.stl"),
+        (file("noise.ply", bytes(range(256)) * 9), "noise.ply"),
+        (file("points.obj", "v 0 0 0\nv 1 0 0\n"), "no triangles"),
+        (tmp_path / "open.stl", "not a closed surface"),
+    ]
+    for path, says in cases:
+        with pytest.raises(InputError, match=says):
+            read_shape(path)
+    with pytest.raises(InputError, match="units must be"):
+        read_shape(good, "furlong")
+
+
+def test_a_sheet_without_a_volume_is_no_solid(tmp_path: Path) -> None:
+    from weldcal.tools.studies.part_welds.step_parts import _face
+
+    path = tmp_path / "face.step"
+    write_step(_face([(0, 0, 0), (100, 0, 0), (100, 100, 0)]), path)
+    with pytest.raises(InputError, match="no solid"):
+        read_shape(path)
+
+
+def test_without_opencascade_the_sentence_says_what_to_type(
+    shelf: Shelf, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shelf.get("lap")[0].write(tmp_path)
+    monkeypatch.setitem(sys.modules, "OCP.STEPControl", None)
+    with pytest.raises(InputError, match=r"pip install 'weldcal\[parts\]'"):
+        read_shape(tmp_path / "lap.step")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x,y,z\n0,0,0\n10,0,0\n10,5,0\n",
+        "0 0 0\n10 0 0\n10 5 0",
+        "\ufeffx;y;z\n0;0;0\n\n10;0;0 # corner\n10;5;0\n",
+        "# made by hand\n0,0,0,0,0,2\n10,0,0,0,0,2\n10,5,0,0,0,2\n",
+    ],
+)
+def test_a_polyline_is_read_in_every_usual_form(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "seam.csv"
+    path.write_text(text, encoding="utf-8")
+    points, normals = read_polyline(path)
+    assert points.tolist() == [[0, 0, 0], [10, 0, 0], [10, 5, 0]]
+    if normals is not None:
+        assert normals.tolist() == [[0, 0, 1]] * 3
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("x,y,z\n0,0,0\n", "holds 1 points"),
+        ("", "holds 0 points"),
+        ("0,0\n1,0\n", "line 1 has 2 numbers"),
+        ("0,0,0\n1,0,0,0,0,1\n", "line 2 has 6 numbers"),
+        ("0,0,0\nx,y,z\n", "line 2 is not numbers"),
+        ("0,0,0\n1,nan,0\n", "line 2 holds a number"),
+        ("0,0,0\n1e30,0,0\n", "line 2 holds a number"),
+        ("0,0,0,0,0,0\n1,0,0,0,0,1\n", "no length in row 1"),
+    ],
+)
+def test_a_polyline_that_is_wrong_names_its_line(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "seam.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=says):
+        read_polyline(path)
+
+
+def test_edges_chain_in_their_order_or_are_refused(shelf: Shelf) -> None:
+    _, shape, _ = shelf.get("grooved_plate")
+    by_ends = {
+        tuple(np.round(1e3 * np.sort(e.points_P[[0, -1], 0]), 3)): e.id for e in shape.edges if e.length_m > 0.15
+    }
+    assert by_ends
+    first = next(e for e in shape.edges if e.length_m > 0.15)
+    touching = [
+        e.id
+        for e in shape.edges
+        if e.id != first.id
+        and np.linalg.norm(e.points_P[[0, -1]][:, None] - first.points_P[[0, -1]], axis=2).min() < 1e-6
+    ]
+    line, closed = chained(shape, [touching[0], first.id])
+    assert not closed
+    steps = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
+    assert steps == pytest.approx(first.length_m + shape.edge(touching[0]).length_m)
+    apart = next(
+        e.id
+        for e in shape.edges
+        if np.linalg.norm(e.points_P[[0, -1]][:, None] - first.points_P[[0, -1]], axis=2).min() > 0.001
+    )
+    for ids, says in (
+        ([first.id, apart], "does not follow"),
+        ([first.id, first.id], "twice"),
+        ([999], "has no edge 999"),
+    ):
+        with pytest.raises(InputError, match=says):
+            chained(shape, ids)
+
+
+def test_a_seam_says_either_its_line_or_its_edges() -> None:
+    for wrong in ({}, {"polyline": Path("a.csv"), "edges": (1,)}):
+        with pytest.raises(InputError, match="either polyline"):
+            SeamSource(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="forward or reverse"):
+        SeamSource(edges=(1,), direction="left")
+    with pytest.raises(InputError, match="0 or more"):
+        SeamSource(edges=(1,), start_m=-0.001)

@@ -1,0 +1,87 @@
+"""A scenario's part from a file: paths, refusals before any work, and the same keys as for a plate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from weldcal.models.errors import InputError
+from weldcal.models.workpieces.part import Part
+from weldcal.systems.jobs.weld.settings import seated_tip, servo_config
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.workpiece import part_of
+from weldcal.systems.station import make_station
+from weldcal.tools.studies.part_welds.step_parts import PARTS
+from weldcal.tools.studies.part_welds.study import Trial, write_cell
+
+
+@pytest.fixture(scope="module")
+def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The path of a scenario that welds a fillet, beside its STEP file and its seam."""
+    return write_cell(PARTS["straight_web"](), tmp_path_factory.mktemp("cell"), Trial(located_by="drawing"))
+
+
+def test_its_paths_are_relative_to_the_scenarios_file(
+    cell: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    spec = load_scenario(str(cell)).workpiece
+    assert spec is not None
+    part = part_of(spec)
+    assert 1e3 * part.length_m == pytest.approx(200.0, abs=1e-6)
+    assert part.seam.joint == "fillet"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("file: straight_web.step", "file: other.step", "no file '.*other.step'"),
+        ("units: mm", "units: cm", "units must be mm, m, inch"),
+        ("joint: fillet", "joint: dovetail", "cannot be 'dovetail'"),
+        ("  joint: fillet\n", "", "joint is missing"),
+        ("seams: [{polyline: straight_web.csv}]", "seams: []", "seams is missing: .*weldcal part straight_web.step"),
+        ("seams: [{polyline: straight_web.csv}]", "seams: [{edges: [1]}, {edges: [2]}]", "2 seams"),
+        ("polyline: straight_web.csv", "polyline: none.csv", "no file '.*none.csv'"),
+        ("polyline: straight_web.csv", "polyline: straight_web.csv, edges: [1]", "either polyline"),
+        ("polyline: straight_web.csv", "edges: [1], start_mm: -1", "0 or more"),
+        ("  joint: fillet\n", "  joint: fillet\n  bend_radius_mm: 300\n", "bend_radius_mm is for the plates"),
+        ("  file: straight_web.step\n", "", "units belongs to a part from a file"),
+    ],
+)
+def test_a_mistake_is_one_sentence_before_any_work(cell: Path, old: str, new: str, says: str) -> None:
+    text = cell.read_text()
+    assert old in text
+    wrong = cell.with_name("wrong.yaml")
+    wrong.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=says):
+        load_scenario(str(wrong))
+
+
+def test_the_station_has_the_part_as_drawn_and_the_true_one_apart(cell: Path) -> None:
+    scenario = load_scenario(str(cell))
+    station = make_station(scenario, seed=3)
+    try:
+        cad, truth = station.cad, station.truth
+        assert isinstance(cad, Part)
+        assert isinstance(truth.workpiece, Part)
+        assert truth.X_BP is not None
+        assert scenario.workpiece is not None
+        off = truth.X_BP.translation() - scenario.workpiece.pose_guess.pose().translation()
+        assert float(np.linalg.norm(off)) == pytest.approx(0.006)
+        bow = np.linalg.norm(truth.workpiece.seam_P - cad.seam_P, axis=1)
+        assert bow.max() == pytest.approx(0.0005, abs=1e-6)
+        servo = servo_config(scenario, station)
+        assert servo.tool.side_offset_m == pytest.approx(-seated_tip(station).aside_m)
+        assert servo.deflection.delta_d_m < 0.0011  # a wide joint: 2 mm would climb its wall
+        assert servo.deflection.axial_d_m == pytest.approx(0.004)
+        assert servo.touch.offset_m == 0.0
+    finally:
+        station.close()
+
+
+def test_a_press_that_climbs_out_is_refused(cell: Path) -> None:
+    scenario = load_scenario(str(cell), "welding: {deflection_mm: 2.5, axial_deflection_mm: 3.0}")
+    with pytest.raises(InputError, match="climbs out"):
+        make_station(scenario, seed=0)

@@ -1,0 +1,148 @@
+"""The main uses of weldcal as Python functions; `import weldcal` has all of them."""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from weldcal.calibration.data import clouds
+from weldcal.calibration.flange import fit as flange_fit
+from weldcal.calibration.flange.fit import FlangeFit
+from weldcal.calibration.hand_eye.files import PosePairs
+from weldcal.calibration.hand_eye.solve import HandEyeResult
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.systems.cell import Cell
+from weldcal.systems.cell import build_cell as build
+from weldcal.systems.scenario.loading import load_scenario
+from weldcal.systems.scenario.schema import Scenario
+from weldcal.tools.commands.calibrate import calibrate_dataset
+from weldcal.tools.commands.hand_eye import solve_pairs
+from weldcal.tools.commands.procedures import run_procedure
+from weldcal.tools.commands.verify import verify_dataset
+from weldcal.tools.outcomes.calibration import CalibrationReport, VerifyReport
+from weldcal.tools.outcomes.options import RunOptions
+
+Floats = npt.NDArray[np.floating[Any]]
+FLANGE = "iso9409-1-50-4-m6"
+
+__all__ = [
+    "build_cell", "calibrate", "fit_flange", "hand_eye", "load_scenario", "read_cloud", "run", "verify",
+]  # fmt: skip
+
+
+def calibrate(
+    folder: str | Path,
+    out: str | Path | None = None,
+    *,
+    robot: str | None = None,
+    flange: str | None = None,
+    correct_scanner: bool = True,
+    seed: int = 0,
+) -> CalibrationReport:
+    """Calibrate a scanner from a folder of flange scans and robot poses; see docs/calibration.md for the folder.
+
+    Args:
+        folder: the dataset.
+        out: folder for calibration.yaml, its exports and report.html; None: nothing is kept.
+        robot, flange: in place of those in dataset.yaml.
+        correct_scanner: estimate and apply a correction of the scanner's own errors.
+
+    Returns:
+        `.result.X_BC` (pose of the camera in the robot's base, m), `.result.covariance` (6, 6), `.result.held_out_mm`, and more.
+
+    Raises:
+        InputError, TooFewPoses: the data cannot be used; the message says what to change.
+    """
+    options: dict[str, Any] = {"robot": robot, "flange": flange, "correct_scanner": correct_scanner, "seed": seed}
+    if out is not None:
+        return calibrate_dataset(Path(folder), Path(out), **options)
+    with tempfile.TemporaryDirectory() as kept_for_now:
+        return calibrate_dataset(Path(folder), Path(kept_for_now), **options)
+
+
+def verify(
+    result: str | Path, folder: str | Path, out: str | Path | None = None, *, limit_mm: float | None = None
+) -> VerifyReport:
+    """Verify a calibration (its folder, or calibration.yaml) on scans that it has not seen.
+
+    Args:
+        result: what `calibrate` wrote; folder: a dataset.
+        out: folder for verification.json and report.html; None: nothing is kept.
+        limit_mm: largest acceptable median error; None: the calibration's own statement decides.
+
+    Raises:
+        InputError: the result or the data cannot be used.
+    """
+    if out is not None:
+        return verify_dataset(Path(result), Path(folder), Path(out), limit_mm=limit_mm)
+    with tempfile.TemporaryDirectory() as kept_for_now:
+        return verify_dataset(Path(result), Path(folder), Path(kept_for_now), limit_mm=limit_mm)
+
+
+def read_cloud(file: str | Path, unit: str = "m") -> Floats:
+    """Points (N, 3), or organised (H, W, 3) with NaN where invalid, in metres, of a PLY, PCD, NPZ, NPY or text file.
+
+    Args:
+        unit: of the file's numbers, m or mm.
+
+    Raises:
+        CloudError: the file cannot be read. InputError: another unit.
+    """
+    metres = {"m": 1.0, "mm": 1e-3}.get(unit)
+    if metres is None:
+        raise InputError(f"The unit of a cloud must be m or mm, not '{unit}'.")
+    return metres * clouds.read_cloud(Path(file))
+
+
+def fit_flange(points_C: Floats, flange: str = FLANGE) -> FlangeFit:
+    """Find a robot's flange in a scan (N, 3), or organised (H, W, 3) with NaN where invalid; metres, camera frame.
+
+    Returns:
+        `.center_C` (3,) m, `.normal_C` (3,), their covariances, and what of the edge was seen.
+
+    Raises:
+        FlangeNotFound: it is not there, or too little of it is seen. InputError: an unknown designation.
+    """
+    return flange_fit.fit_flange(np.asarray(points_C), get_flange(flange))
+
+
+def hand_eye(robot: Floats, camera: Floats, mounting: str = "eye_in_hand") -> HandEyeResult:
+    """Calibrate a camera from pairs of poses (AX = XB, AX = YB).
+
+    Args:
+        robot: X_BF (n, 4, 4), the robot's flange in its base; camera: X_CM (n, 4, 4), the target in the camera; metres.
+        mounting: eye_in_hand or eye_on_base, and others of `weldcal hand-eye`.
+
+    Returns:
+        `.poses` by letter (X: the camera on what carries it, Y: the target), `.covariance`, `.held_out`, `.unobservable`.
+
+    Raises:
+        InputError: poses that cannot be used, or do not determine the answer.
+    """
+    shapes = np.shape(robot), np.shape(camera)
+    if any(len(shape) != 3 or shape[1:] != (4, 4) for shape in shapes) or shapes[0] != shapes[1]:
+        raise InputError(f"robot and camera must both be (n, 4, 4) matrices; they are {shapes[0]} and {shapes[1]}.")
+    pairs = PosePairs("the poses", np.asarray(robot, dtype=float), np.asarray(camera, dtype=float), mounting)
+    return solve_pairs(pairs)
+
+
+def build_cell(scenario: Scenario | str, seed: int = 0) -> Cell[Any]:
+    """Build the Drake Diagram of a scenario (or of its name or path); close its `.station` after use.
+
+    Raises:
+        InputError, UnreachableScanner: the scenario cannot be run.
+    """
+    return build(load_scenario(scenario) if isinstance(scenario, str) else scenario, seed)
+
+
+def run(scenario: str, out: str | Path, seed: int = 0, *, recording: bool = True) -> dict[str, object]:
+    """Run the job of a scenario (name or path) and write its result folder, as `weldcal demo` does; returns its summary.
+
+    Raises:
+        InputError, UnreachableScanner, RobotRefused: the scenario cannot be run; nothing has been written or moved.
+    """
+    options = RunOptions(scenario, Path(out), seed, recording=recording)
+    return dict(run_procedure(options, lambda stage, fraction: None).summary())

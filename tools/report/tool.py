@@ -1,0 +1,163 @@
+"""Draws a tool from three sides, and what its finger camera sees."""
+
+import io
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+from scipy.spatial import ConvexHull, QhullError
+
+from weldcal.models.arms.urdf import Capsule
+from weldcal.models.arrays import Array
+from weldcal.models.flanges import flange_mesh
+from weldcal.models.mesh import TriMesh, revolve
+from weldcal.models.tool import ToolShape
+from weldcal.models.tools.enclosing import shape_mesh
+from weldcal.models.tools.loading import LoadedTool
+from weldcal.systems.drivers.simulated.tag_view import TagView
+from weldcal.tools.outcomes.tool import ToolCheck
+from weldcal.tools.report.render import render
+
+COLOURS = {"dark": "#4a525c", "steel": "#a5abb3", "copper": "#c47a3d", "soft": "#3d7aa6", "white": "#f4f4f4"}
+KEEP, AXIS = "#b04a3a", "#20262c"
+_SEGMENTS = 32
+NAMES_APART_MM = 9.0
+
+
+def tool_report(check: ToolCheck, picture: bytes) -> str:
+    """The page of a tool as one self-contained HTML text."""
+    return render(
+        "tool.html.j2",
+        name=check.loaded.name,
+        file=check.loaded.file.name,
+        rows=list(check.rows().items()),
+        picture=picture,
+    )
+
+
+def tool_picture(loaded: LoadedTool) -> bytes:
+    """PNG: the tool from the side (x, z), from behind (y, z) and along the flange's axis (x, y), mm in F; the camera's picture."""
+    figure = Figure(figsize=(13.0, 9.5), layout="constrained")
+    axes = figure.subplots(2, 2)
+    for at, plane, names in ((axes[0, 0], (0, 2), "xz"), (axes[0, 1], (1, 2), "yz"), (axes[1, 0], (0, 1), "xy")):
+        _view(at, loaded, plane)
+        at.set_xlabel(f"{names[0]} of the flange, mm")
+        at.set_ylabel(f"{names[1]} of the flange, mm")
+        at.set_aspect("equal", adjustable="datalim")
+        at.grid(alpha=0.25)
+        if names[1] == "z":
+            at.invert_yaxis()
+    axes[0, 0].set_title("from the side; the flange is on top, the work below", fontsize=10, loc="left")
+    axes[0, 1].set_title("from behind", fontsize=10, loc="left")
+    axes[1, 0].set_title(
+        "along the flange's axis; dashed: kept clear of table and line of sight", fontsize=10, loc="left"
+    )
+    _camera_view(axes[1, 1], loaded)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110, facecolor="white", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def _view(axes: Axes, loaded: LoadedTool, plane: tuple[int, int]) -> None:
+    tool, i, j = loaded.tool, *plane
+    towards = 3 - i - j
+    drawn = [(_shape_points(s), COLOURS[s.colour]) for s in tool.drawn()]
+    if tool.ring is not None:
+        ring = flange_mesh(tool.ring, thickness_m=tool.ring_height_m).transformed(tool.X_FR)
+        drawn.append((np.asarray(ring.vertices), COLOURS["steel"]))
+    for points, colour in sorted(drawn, key=lambda d: -float(np.mean(d[0][:, towards]))):
+        _hull(axes, points[:, (i, j)], facecolor=colour, edgecolor=AXIS, linewidth=0.6, alpha=0.85)
+    axes.add_patch(Circle((0.0, 0.0), 2.0, color=AXIS, zorder=6))
+    axes.annotate("flange", (0.0, 0.0), xytext=(4, 4), textcoords="offset points", fontsize=8, zorder=7)
+    for capsule in tool.capsules():
+        _capsule(axes, capsule, plane)
+    tip, tag, camera, torch = (
+        1e3 * np.asarray(p)
+        for p in (tool.X_FT.translation(), tool.X_FM_rest.translation(), tool.X_FK.translation(), loaded.p_FW)
+    )
+    axes.plot(*np.array([tag, tip])[:, (i, j)].T, color=COLOURS["soft"], linewidth=2.0, zorder=5)
+    axes.add_patch(Circle((tip[i], tip[j]), 1e3 * tool.tip_radius_m, color=COLOURS["soft"], zorder=6))
+    axes.plot(tag[i], tag[j], "s", color=COLOURS["soft"], markersize=5, zorder=6)
+    axes.plot(camera[i], camera[j], "D", color="#2f7d4f", markersize=5, zorder=6)
+    axes.plot(*np.array([camera, tag])[:, (i, j)].T, ":", color="#2f7d4f", linewidth=1.2, zorder=5)
+    wire = np.array([torch - 25.0 * loaded.torch_axis, torch])
+    axes.plot(*wire[:, (i, j)].T, color=COLOURS["copper"], linewidth=2.5, zorder=5)
+    axes.plot(torch[i], torch[j], "o", color=KEEP, markersize=5, zorder=6)
+    middle = 1e3 * np.array(tool.centre_of_mass_m)
+    axes.plot(middle[i], middle[j], "P", color="black", markersize=7, zorder=6)
+    places = [(tip, "tip"), (tag, "tag"), (camera, "camera"), (torch, "wire point"), (middle, "weight")]
+    if tool.ring is not None:
+        ring_at, face = 1e3 * tool.X_FR.translation(), tool.X_FR.rotation().matrix()[:, 2]
+        places.append((ring_at, "ring"))
+        if np.hypot(face[i], face[j]) > 0.3:
+            axes.annotate(
+                "",
+                ring_at[[i, j]] + 35.0 * face[[i, j]],
+                xytext=ring_at[[i, j]],
+                arrowprops={"arrowstyle": "->"},
+                zorder=6,
+            )
+    named: list[Array] = []
+    for place, name in places:
+        if any(np.hypot(*(place - other)[[i, j]]) < NAMES_APART_MM for other in named):
+            continue  # one behind the other
+        named.append(place)
+        axes.annotate(name, (place[i], place[j]), xytext=(6, -9), textcoords="offset points", fontsize=8, zorder=7)
+    axes.margins(0.08)
+
+
+def _shape_points(shape: ToolShape) -> Array:
+    """Points (N, 3) whose hull is the shape's, in F, m."""
+    size = shape.size
+    if shape.kind == "mesh":
+        body: TriMesh = shape_mesh(shape)
+    elif shape.kind == "box":
+        signs = np.array(np.meshgrid([-0.5, 0.5], [-0.5, 0.5], [-0.5, 0.5])).reshape(3, 8).T
+        return np.asarray((shape.place.pose @ (signs * np.array(size)).T).T)
+    else:
+        radius, half = size[0], 0.5 * size[1] if len(size) > 1 else 0.0
+        if shape.kind == "cylinder":
+            profile = np.array([(0.0, -half), (radius, -half), (radius, half), (0.0, half)])
+        else:
+            angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 17)
+            profile = np.column_stack(
+                [radius * np.cos(angle), radius * np.sin(angle) + np.where(angle > 0.0, half, -half)]
+            )
+            profile[[0, -1], 0] = 0.0
+        body = revolve(profile, _SEGMENTS)
+    return np.asarray(body.transformed(shape.place.pose).vertices)
+
+
+def _hull(axes: Axes, points_m: Array, **style: object) -> None:
+    try:
+        hull = ConvexHull(points_m)
+    except QhullError:
+        return
+    axes.add_patch(Polygon(1e3 * points_m[hull.vertices], closed=True, **style))
+    axes.update_datalim(1e3 * points_m)
+
+
+def _capsule(axes: Axes, capsule: Capsule, plane: tuple[int, int]) -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 48)
+    circle = capsule.radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    ends = np.vstack([circle + end[list(plane)] for end in (capsule.p_start, capsule.p_end)])
+    _hull(axes, ends, fill=False, edgecolor=KEEP, linewidth=0.9, linestyle="--", zorder=4)
+
+
+def _camera_view(axes: Axes, loaded: LoadedTool) -> None:
+    tool, camera = loaded.tool, loaded.camera
+    axes.imshow(TagView(tool, camera).picture(tool.X_FM_rest), cmap="gray", vmin=0, vmax=255)
+    # how far the tag moves in the picture for a deflection as in a weld
+    X_KT = tool.X_FK.InvertAndCompose(tool.X_FT)
+    start = camera.camera_matrix @ tool.X_KM_rest.translation()
+    moved = tool.X_KM_rest.translation() + X_KT.rotation().matrix() @ np.array([0.0, 0.003, 0.0])
+    end = camera.camera_matrix @ moved
+    line = np.array([start[:2] / start[2], end[:2] / end[2]])
+    axes.plot(*line.T, color="#ffd24d", linewidth=2.5, label="tip 3 mm to the left of the torch's way")
+    axes.legend(fontsize=8, loc="lower right")
+    axes.set_title(f"what the finger camera sees: tag {tool.tag_id} of {tool.tag_dictionary}", fontsize=10, loc="left")
+    axes.set_xlabel("px")

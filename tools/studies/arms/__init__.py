@@ -1,0 +1,1 @@
+"""The demo on every arm of Universal Robots, its cell scaled to the arm's reach."""
