@@ -12,6 +12,7 @@ from weldcal.models.workpieces.part import Part, WeldPart
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
+from weldcal.welding.locate.part.registration import register_part
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.locate.registration import register_workpiece
 
@@ -71,16 +72,24 @@ def plan_part_root(
         raise InputError(
             "planning.method: cloud finds grooves in plates; a part from a file is planned with method: cad."
         )
-    seam = part.seam.transformed(X_BP_guess)
+    found = register_part(
+        points_B,
+        part.mesh,
+        X_BP_guess if method.search == "guess" else None,
+        eye_B,
+        X_BP_hint=X_BP_guess,
+        matters_P=part.seam_P,
+    )
+    seam = part.seam.transformed(found.X_BP)
     return RootPlan(
         root=seam.points_P,
         up=seam.up_P,
         half_angle_rad=part.half_angle_rad,
-        X_BP=X_BP_guess,
-        sigma_m=0.0,
-        rms_m=0.0,
-        confidence=1.0,
-        summary="the pose of the part is from the drawing; the scan was not used",
+        X_BP=found.X_BP,
+        sigma_m=float(np.sqrt(np.mean(found.sigma_at(part.seam_P) ** 2))),
+        rms_m=found.rms_m,
+        confidence=found.confidence,
+        summary=found.summary,
     )
 
 

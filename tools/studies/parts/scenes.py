@@ -52,11 +52,15 @@ def subject(name: str) -> Subject:
         return Subject(name, shape.mesh, seam_of(shape, SeamSource(csv, (), "forward", 0.0, 0.0), made.joint))
 
 
-def standing(mesh: TriMesh, rng: np.random.Generator, tilt_rad: float, lift_m: float, spread_m: float) -> RigidTransform:
+def standing(
+    mesh: TriMesh, rng: np.random.Generator, tilt_rad: float, lift_m: float, spread_m: float
+) -> RigidTransform:
     """X_BP of a part as it is drawn (its z up), at any turn, wedged up by a tilt in any direction."""
     heading, tilt = rng.uniform(-math.pi, math.pi), tilt_rad * math.sqrt(rng.uniform())
     axis = tilt * np.array([math.cos(heading), math.sin(heading)])
-    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(rng.uniform(-math.pi, math.pi))
+    R = RotationMatrix(RollPitchYaw(axis[0], axis[1], 0.0)) @ RotationMatrix.MakeZRotation(
+        rng.uniform(-math.pi, math.pi)
+    )
     turned = mesh.vertices @ R.matrix().T
     middle = 0.5 * (turned.min(axis=0) + turned.max(axis=0))
     at = MIDDLE[:2] + rng.uniform(-spread_m, spread_m, size=2) - middle[:2]

@@ -138,9 +138,10 @@ def step(surface: Equations, rims: Equations | None, c: float, sigma: float, pit
     b[:6] = (surface.rows * w[:, None]).T @ -surface.residual
     if rims is not None:
         J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
-        v = tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual))))) / (
-            RIM_SIGMA * pitch
-        ) ** 2
+        v = (
+            tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual)))))
+            / (RIM_SIGMA * pitch) ** 2
+        )
         A += (J * v[:, None]).T @ J
         b += (J * v[:, None]).T @ -rims.residual
     A[6, 6] += 1.0 / (INSET_SIGMA * pitch) ** 2
@@ -149,7 +150,9 @@ def step(surface: Equations, rims: Equations | None, c: float, sigma: float, pit
     return np.asarray(np.linalg.solve(A, b)[:6])
 
 
-def coarse_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gates: tuple[float, ...]) -> RigidTransform | None:
+def coarse_fit(
+    scan: PreparedScan, model: PartModel, X: RigidTransform, gates: tuple[float, ...]
+) -> RigidTransform | None:
     """A pose by the coarse points, its gate narrowing; None where they do not touch the part."""
     near = np.linalg.norm(scan.coarse - X.multiply(model.center), axis=1) < model.radius + 2.0 * gates[0]
     points, normals = scan.coarse[near], scan.coarse_normals[near]
@@ -174,7 +177,7 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
     stride = max(1.0, len(points) / MOST_POINTS)
     few = (np.arange(int(len(points) / stride)) * stride).astype(int)
     sigma = 0.5e-3
-    gates = [g for g in (gate, gate, 0.5 * gate, 0.004, 0.003, 0.002, 0.002, 0.002)]
+    gates = (gate, gate, 0.5 * gate, 0.004, 0.003, 0.002, 0.002, 0.002)
     edges, surface, rims = None, None, None
     for k, g in enumerate(gates):
         g = max(g, 3.5 * pitch if k < 4 else 2.5 * pitch)
@@ -228,9 +231,10 @@ def covariance(
     middle = score.T @ score + CREEP_M**2 * (lean.T @ lean) + np.diag([0.0] * 6 + [A[6, 6]])
     if rims is not None:
         J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
-        v = tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual))))) / (
-            RIM_SIGMA * pitch
-        ) ** 2
+        v = (
+            tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual)))))
+            / (RIM_SIGMA * pitch) ** 2
+        )
         H = J * v[:, None]
         A += H.T @ J
         r = np.minimum(np.abs(rims.residual), 2.0 * pitch)

@@ -76,9 +76,7 @@ class PartModel:
         found: list[tuple[float, Floats]] = []
         hull = ConvexHull(self.mesh.vertices)
         corners = self.mesh.vertices[hull.simplices]
-        area = 0.5 * np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
+        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         gravity = self.points.mean(axis=0)
         for normal, size in _grouped(hull.equations[:, :3], area):
             face = corners[hull.equations[:, :3] @ normal > 0.999].reshape(-1, 3)
@@ -127,9 +125,7 @@ class PartModel:
                     one = np.concatenate([tangent, mine, out / size, beyond, [float(k)]])
                     rows.append(np.hstack([at, np.broadcast_to(one, (count, 13))]))
         all_rows = np.concatenate(rows) if rows else np.zeros((0, 16))
-        return SharpEdges(
-            *(all_rows[:, 3 * c : 3 * c + 3] for c in range(5)), all_rows[:, 15].astype(np.int64)
-        )
+        return SharpEdges(*(all_rows[:, 3 * c : 3 * c + 3] for c in range(5)), all_rows[:, 15].astype(np.int64))
 
 
 def _grouped(normals: Floats, area: Floats) -> list[tuple[Floats, float]]:
@@ -153,6 +149,6 @@ def _above(face: Floats, normal: Floats, point: Floats) -> bool:
     at = np.array([point @ x, point @ np.cross(normal, x)])
     try:
         outline = ConvexHull(flat)
-    except Exception:  # noqa: BLE001 (a degenerate face holds nothing)
+    except Exception:
         return False
     return bool((outline.equations[:, :2] @ at + outline.equations[:, 2] < 0.0).all())

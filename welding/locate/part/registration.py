@@ -14,7 +14,14 @@ from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_nea
 from weldcal.welding.locate.part.fit import Fit, coarse_fit, fine_fit
 from weldcal.welding.locate.part.model import PartModel
 from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
-from weldcal.welding.locate.part.rivals import describe_turn, free_directions, harmless, same_pose, same_set, turned_poses
+from weldcal.welding.locate.part.rivals import (
+    describe_turn,
+    free_directions,
+    harmless,
+    same_pose,
+    same_set,
+    turned_poses,
+)
 from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
 from weldcal.welding.locate.part.search import rough_places
 
@@ -63,13 +70,15 @@ def register_part(
     starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
     fits = _fine(scan, model, starts, FINE_PLACES)
     if not fits:
-        raise PartNotFound("The scan shows nothing that fits the part: move it into view, or check the file and its unit.")
+        raise PartNotFound(
+            "The scan shows nothing that fits the part: move it into view, or check the file and its unit."
+        )
     best = fits[0]
     if X_BP_guess is not None:
         _check_near(best.X_BP, X_BP_guess, model, config)
     rivals = fits[1:]
     if X_BP_guess is None:
-        others = [X for X in turned_poses(model, best.X_BP)]
+        others = turned_poses(model, best.X_BP)
         rivals = rivals + _fine(scan, model, _screened(scan, model, others, best), FINE_RIVALS)
         better = [r for r in rivals if _better(r, best, scan, model)]
         if better:
@@ -99,9 +108,7 @@ def _near_starts(scan: PreparedScan, model: PartModel, guess: RigidTransform) ->
     return [X for X in fits if X is not None]
 
 
-def _screened(
-    scan: PreparedScan, model: PartModel, poses: list[RigidTransform], best: _Judged
-) -> list[RigidTransform]:
+def _screened(scan: PreparedScan, model: PartModel, poses: list[RigidTransform], best: _Judged) -> list[RigidTransform]:
     """The poses that agree roughly with the scan, best first."""
     scored = []
     for X in poses:
@@ -237,7 +244,9 @@ def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, conf
 
 def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats | None) -> PartRegistration:
     a = best.agreement
-    confidence = float(np.clip((a.met / max(1e-9, 1.0 - a.hidden) - a.passed) * (1.0 - max(0.0, runner_up - 0.7)), 0.0, 1.0))
+    confidence = float(
+        np.clip((a.met / max(1e-9, 1.0 - a.hidden) - a.passed) * (1.0 - max(0.0, runner_up - 0.7)), 0.0, 1.0)
+    )
     found = PartRegistration(
         best.X_BP, best.fit.covariance, best.fit.rms_m, a.met, a.passed, a.seen, confidence, runner_up, ""
     )

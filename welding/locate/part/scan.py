@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
 from scipy.spatial import cKDTree
 
 from weldcal.models.errors import InputError

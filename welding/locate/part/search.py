@@ -52,7 +52,11 @@ def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> li
         ups = [first.normal]
         for plane in scan.planes[1:]:
             cosines = [float(plane.normal @ u) for u in ups]
-            if len(ups) < 3 and max(cosines) < math.cos(math.radians(7.0)) and cosines[0] > math.cos(math.radians(50.0)):
+            if (
+                len(ups) < 3
+                and max(cosines) < math.cos(math.radians(7.0))
+                and cosines[0] > math.cos(math.radians(50.0))
+            ):
                 ups.append(plane.normal)
         ground = first if first.extent_m > GROUND_EXTENT * model.radius else None
     else:
@@ -71,7 +75,9 @@ def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> li
 
 
 def _near(A: RigidTransform, B: RigidTransform, model: PartModel) -> bool:
-    turn = math.acos(max(-1.0, min(1.0, 0.5 * (float(np.trace(A.rotation().matrix().T @ B.rotation().matrix())) - 1.0))))
+    turn = math.acos(
+        max(-1.0, min(1.0, 0.5 * (float(np.trace(A.rotation().matrix().T @ B.rotation().matrix())) - 1.0)))
+    )
     away = float(np.linalg.norm(A.multiply(model.center) - B.multiply(model.center)))
     return turn < math.radians(9.0) and away < 0.009
 
