@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from pydrake.math import RigidTransform
+from scipy.spatial import cKDTree
 
 from weldcal.welding.locate.part.fit import contour, into
 from weldcal.welding.locate.part.model import PartModel
@@ -19,6 +21,7 @@ MOST_RAYS = 9000
 NOT_MEASURED_COS = 0.22
 VISIBLE_SAMPLES = 2500
 BEYOND_M = 0.004
+SAME_FACE_COS = 0.95
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +44,7 @@ class Agreement:
     @property
     def score(self) -> float:
         """Met less twice the passed share and what goes on, times the square root of what is seen."""
-        return max(0.0, self.met - 2.0 * self.passed - self.goes_on) * self.seen**0.5
+        return max(0.0, self.met - 2.0 * self.passed - self.goes_on) * math.sqrt(self.seen)
 
 
 def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
@@ -52,7 +55,7 @@ def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_
     along = np.clip(d @ middle / far / np.linalg.norm(d, axis=1), -1.0, 1.0)
     near = scan.points[np.arccos(along) < np.arcsin(min(1.0, (model.radius + reach_m) / far))]
     stride = max(1.0, len(near) / MOST_RAYS)
-    return near[(np.arange(int(len(near) / stride)) * stride).astype(int)]
+    return np.asarray(near[(np.arange(int(len(near) / stride)) * stride).astype(int)])
 
 
 def agreement(
@@ -83,8 +86,6 @@ def agreement(
     s = s[np.abs(first - away) < 0.001]
     seen = 0.0
     if len(s) and met.any():
-        from scipy.spatial import cKDTree
-
         spacing = 2.0 * scan.pitch_m * max(1.0, (len(scan.points) / max(1, len(points))) ** 0.5)
         near, _ = cKDTree(into(X_BP, points[met])).query(s, distance_upper_bound=max(0.005, 2.0 * spacing))
         seen = float(np.mean(np.isfinite(near)))
@@ -110,7 +111,13 @@ def _goes_on(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, eye: Fl
         _on_face(scan, X_BP, edges.point + side * away * edges.outward, edges.normal, reach, 0.8 * tolerance_m)
         for side in (-1.0, 1.0)
     ]
-    shown = there[0]
+    # Across a gap of the part's own the same face begins again.
+    beyond = edges.point + away * edges.outward
+    q, m = model.closest(beyond)
+    own = (np.linalg.norm(beyond - q, axis=1) < reach + tolerance_m) & (
+        np.sum(m * edges.normal, axis=1) > SAME_FACE_COS
+    )
+    shown = there[0] & ~own
     return float(np.mean(there[1][shown])) if np.count_nonzero(shown) > 6 else 0.0
 
 

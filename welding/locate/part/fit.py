@@ -28,7 +28,7 @@ RIM_FLOOR = 0.10  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
 SIGMA_FLOOR_M, CREEP_M = 2e-5, 2e-5
-MOST_POINTS = 20_000
+MOST_POINTS, COARSE_POINTS = 15_000, 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,9 @@ def rim_rows(p: Floats, edges: SharpEdges, gate: float, band: float, pitch: floa
     """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them."""
     if len(edges.point) < 4 or not len(p):
         return None
-    away, k = cKDTree(edges.point).query(p, distance_upper_bound=math.hypot(gate, 0.002))
+    away, k = (
+        np.asarray(found) for found in cKDTree(edges.point).query(p, distance_upper_bound=math.hypot(gate, 0.002))
+    )
     near = np.isfinite(away)
     p, k = p[near], k[near]
     d = p - edges.point[k]
@@ -156,9 +158,8 @@ def coarse_fit(
     """A pose by the coarse points, its gate narrowing; None where they do not touch the part."""
     near = np.linalg.norm(scan.coarse - X.multiply(model.center), axis=1) < model.radius + 2.0 * gates[0]
     points, normals = scan.coarse[near], scan.coarse_normals[near]
-    if len(points) > 2500:
-        stride = len(points) / 2500
-        index = (np.arange(2500) * stride).astype(int)
+    if len(points) > COARSE_POINTS:
+        index = (np.arange(COARSE_POINTS) * (len(points) / COARSE_POINTS)).astype(int)
         points, normals = points[index], normals[index]
     for gate in gates:
         p, n = into(X, points), normals @ X.rotation().matrix()
@@ -197,22 +198,19 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
     assert surface is not None
     return Fit(
         X,
-        covariance(surface, rims, sigma, pitch, into(X, points[few]), model),
+        covariance(surface, rims, sigma, pitch),
         float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),
         len(surface.residual),
         0 if rims is None else len(rims.residual),
     )
 
 
-def covariance(
-    surface: Equations, rims: Equations | None, sigma: float, pitch: float, p: Floats, model: PartModel
-) -> Floats:
+def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: float) -> Floats:
     """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge, share.
 
     The points of a patch of PATCHES point distances are one cluster, those of an edge another (Liang and Zeger 1986); an edge
     has at least an error of RIM_FLOOR, and the surface one of CREEP_M in every patch.
     """
-    del p, model
     w = tukey(surface.residual, max(4.0 * sigma, 0.0004)) / (SURFACE_RATIO * sigma**2)
     A = np.zeros((7, 7))
     A[:6, :6] = (surface.rows * w[:, None]).T @ surface.rows

@@ -45,11 +45,10 @@ class PartModel:
         import open3d
 
         self.mesh = mesh
-        self._tensor: Any = open3d.core.Tensor
+        tensor: Any = open3d.core.Tensor
+        self._tensor = tensor
         self._scene = open3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.triangles.astype(np.uint32))
-        )
+        self._scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
         self.points, self.normals = mesh.sample(SAMPLES, np.random.default_rng(seed))
         self.center = 0.5 * mesh.bounds.sum(axis=0)
         self.radius = float(np.linalg.norm(mesh.vertices - self.center, axis=1).max())
@@ -125,7 +124,8 @@ class PartModel:
                     one = np.concatenate([tangent, mine, out / size, beyond, [float(k)]])
                     rows.append(np.hstack([at, np.broadcast_to(one, (count, 13))]))
         all_rows = np.concatenate(rows) if rows else np.zeros((0, 16))
-        return SharpEdges(*(all_rows[:, 3 * c : 3 * c + 3] for c in range(5)), all_rows[:, 15].astype(np.int64))
+        point, tangent, normal, outward, other = np.split(all_rows[:, :15], 5, axis=1)
+        return SharpEdges(point, tangent, normal, outward, other, all_rows[:, 15].astype(np.int64))
 
 
 def _grouped(normals: Floats, area: Floats) -> list[tuple[Floats, float]]:

@@ -30,6 +30,7 @@ Floats = npt.NDArray[np.float64]
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
 FINE_PLACES, FINE_RIVALS = 10, 5
+NEAR_HINT_DEG = 40.0
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
 
 
@@ -65,7 +66,22 @@ def register_part(
     """
     config = config or PartConfig()
     scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
-    model = PartModel(mesh, config.seed)
+    return register_prepared(
+        scan, PartModel(mesh, config.seed), X_BP_guess, X_BP_hint=X_BP_hint, matters_P=matters_P, config=config
+    )
+
+
+def register_prepared(
+    scan: PreparedScan,
+    model: PartModel,
+    X_BP_guess: RigidTransform | None = None,
+    *,
+    X_BP_hint: RigidTransform | None = None,
+    matters_P: Floats | None = None,
+    config: PartConfig | None = None,
+) -> PartRegistration:
+    """Register a prepared part to a prepared scan; see register_part."""
+    config = config or PartConfig()
     hint = X_BP_guess if X_BP_hint is None else X_BP_hint
     starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
     fits = _fine(scan, model, starts, FINE_PLACES)
@@ -79,7 +95,9 @@ def register_part(
     rivals = fits[1:]
     if X_BP_guess is None:
         others = turned_poses(model, best.X_BP)
-        rivals = rivals + _fine(scan, model, _screened(scan, model, others, best), FINE_RIVALS)
+        found = _fine(scan, model, _screened(scan, model, others, best, hint), FINE_RIVALS, None)
+        known = [f.X_BP for f in fits]
+        rivals = rivals + [f for f in found if not any(same_pose(f.X_BP, X, model) for X in known)]
         better = [r for r in rivals if _better(r, best, scan, model)]
         if better:
             rivals = [f for f in (best, *rivals) if f is not better[0]]
@@ -108,25 +126,32 @@ def _near_starts(scan: PreparedScan, model: PartModel, guess: RigidTransform) ->
     return [X for X in fits if X is not None]
 
 
-def _screened(scan: PreparedScan, model: PartModel, poses: list[RigidTransform], best: _Judged) -> list[RigidTransform]:
-    """The poses that agree roughly with the scan, best first."""
-    scored = []
+def _screened(
+    scan: PreparedScan, model: PartModel, poses: list[RigidTransform], best: _Judged, hint: RigidTransform | None
+) -> list[RigidTransform]:
+    """The poses that agree roughly with the scan: first the one nearest to the hint, then best first."""
+    scored: list[tuple[float, RigidTransform]] = []
     for X in poses:
         fitted = coarse_fit(scan, model, X, COARSE_GATES[2:])
-        if fitted is None or same_pose(fitted, best.X_BP, model):
+        if fitted is None or any(same_pose(fitted, X, model) for X in (best.X_BP, *(Y for _, Y in scored))):
             continue
         score = agreement(rays_near(scan, model, fitted)[::3], scan, model, fitted, COARSE_TOLERANCE_M).score
         if score > 0.5 * best.agreement.score:
             scored.append((score, fitted))
     scored.sort(key=lambda s: -s[0])
-    return [X for _, X in scored]
+    ranked = [X for _, X in scored]
+    if hint is not None:
+        ranked.sort(key=lambda X: _away(X, hint, model) > math.radians(NEAR_HINT_DEG))
+    return ranked
 
 
-def _fine(scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int) -> list[_Judged]:
-    """Fine fits of the best starts, different ones only, best first."""
+def _fine(
+    scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 3
+) -> list[_Judged]:
+    """Fine fits of the best starts, different ones only, best first; after more than `enough` a good one ends the search."""
     judged: list[_Judged] = []
     for X in starts[:most]:
-        if len(judged) > 3 and max(j.agreement.score for j in judged) > 0.8:
+        if enough is not None and len(judged) > enough and max(j.agreement.score for j in judged) > 0.8:
             break
         fit = fine_fit(scan, model, X)
         if fit is None or any(same_pose(fit.X_BP, j.X_BP, model) for j in judged):
@@ -158,6 +183,12 @@ def _check_near(X: RigidTransform, guess: RigidTransform, model: PartModel, conf
             f"The part fits the scan only {1e3 * shift:.0f} mm and {math.degrees(turn):.0f} deg from the guess: correct the guess, "
             "or search without one."
         )
+
+
+def _away(X: RigidTransform, hint: RigidTransform, model: PartModel) -> float:
+    """How far a pose is from the hint: its turn, rad, and its shift, in 0.3 m."""
+    shift = float(np.linalg.norm(hint.multiply(model.center) - X.multiply(model.center)))
+    return float(np.linalg.norm(_rotvec(hint.InvertAndCompose(X)))) + shift / 0.3
 
 
 def _rotvec(X: RigidTransform) -> Floats:
@@ -210,9 +241,7 @@ def _decided(
     harmful = [r for r in alike if not same_set(matters_P, best.X_BP.InvertAndCompose(r.X_BP))]
     if hint is not None and alike:
         family = [best, *alike]
-        off = [float(np.linalg.norm(_rotvec(hint.InvertAndCompose(f.X_BP)))) for f in family]
-        where = [float(np.linalg.norm(hint.multiply(model.center) - f.X_BP.multiply(model.center))) for f in family]
-        cost = np.array(off) + np.array(where) / 0.3
+        cost = np.array([_away(f.X_BP, hint, model) for f in family])
         order = np.argsort(cost)
         if cost[order[1]] - cost[order[0]] > math.radians(20.0):
             return family[int(order[0])], runner_up

@@ -51,7 +51,7 @@ def same_set(points_P: Floats | None, X_PP: RigidTransform) -> bool:
         return False
     there = np.asarray(points_P) @ X_PP.rotation().matrix().T + X_PP.translation()
     tree = cKDTree(points_P)
-    spacing = float(np.median(tree.query(points_P, k=2)[0][:, 1]))
+    spacing = float(np.median(np.asarray(tree.query(points_P, k=2)[0])[:, 1]))
     forth = np.asarray(tree.query(there)[0]).max()
     back = np.asarray(cKDTree(there).query(points_P)[0]).max()
     return bool(max(forth, back) < SAME_SET_M + 0.55 * spacing)

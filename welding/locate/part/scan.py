@@ -17,6 +17,7 @@ Floats = npt.NDArray[np.float64]
 
 FINE_POINTS, COARSE_CELL_M = 160_000, 0.004
 FLAT_COS, FLAT_SHARE = 0.985, 0.6
+PLANE_BAND_M, PLANE_TRIALS, MOST_PLANES = 0.0025, 150, 6
 EYE_ABOVE_M = 1.0  # assumed where the scanner's position is not given
 
 
@@ -77,23 +78,7 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(14))
     few = cloud.voxel_down_sample(COARSE_CELL_M)
     few.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(12))
-    open3d.utility.random.seed(seed)
-    found: list[Plane] = []
-    rest, all_few = few, len(few.points)
-    for _ in range(6):
-        if len(rest.points) < max(60, 0.004 * all_few):
-            break
-        model, inside = rest.segment_plane(0.0025, 3, 400)
-        if len(inside) < max(60, 0.004 * all_few):
-            break
-        on = np.asarray(rest.points)[inside]
-        along = np.abs(np.asarray(rest.normals)[inside] @ np.asarray(model[:3])) > FLAT_COS
-        rest = rest.select_by_index(inside, invert=True)
-        # A plane that cuts across several surfaces is none.
-        if np.count_nonzero(along) < FLAT_SHARE * len(inside):
-            continue
-        extent = float(np.linalg.norm(np.percentile(on, 98, axis=0) - np.percentile(on, 2, axis=0)))
-        found.append(Plane(np.asarray(model[:3]), -float(model[3]), extent))
+    found = _planes(np.asarray(few.points), np.asarray(few.normals), rng)
     middle = np.median(np.asarray(few.points), axis=0)
     if eye_B is None:
         up = found[0].normal * (1.0 if found[0].normal[2] >= 0.0 else -1.0) if found else np.array([0.0, 0.0, 1.0])
@@ -109,6 +94,40 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
     p, n = turned(cloud)
     q, m = turned(few)
     return PreparedScan(p, n, q, m, planes, eye, pitch)
+
+
+def _planes(points: Floats, normals: Floats, rng: np.random.Generator) -> list[Plane]:
+    """The largest planes among points (N,3) with normals (N,3), largest first.
+
+    Each trial takes a point with its normal; the best one's plane is fitted to its points, and these are taken away.
+    """
+    found: list[Plane] = []
+    least = max(60, round(0.004 * len(points)))
+    for _ in range(MOST_PLANES):
+        if len(points) < least:
+            break
+        trial = rng.choice(len(points), size=min(len(points), PLANE_TRIALS), replace=False)
+        sample = points[:: max(1, len(points) // 4000)]
+        n = normals[trial]
+        away = sample @ n.T - np.sum(points[trial] * n, axis=1)
+        best = trial[int(np.argmax(np.count_nonzero(np.abs(away) < PLANE_BAND_M, axis=0)))]
+        normal, middle = normals[best], points[best]
+        for _ in range(3):
+            inside = np.abs((points - middle) @ normal) < PLANE_BAND_M
+            if np.count_nonzero(inside) < 3:
+                break
+            middle = points[inside].mean(axis=0)
+            normal = np.linalg.svd(np.cov((points[inside] - middle).T))[0][:, 2]
+        inside = np.abs((points - middle) @ normal) < PLANE_BAND_M
+        if np.count_nonzero(inside) < least:
+            break
+        on, along = points[inside], np.abs(normals[inside] @ normal) > FLAT_COS
+        points, normals = points[~inside], normals[~inside]
+        # A plane that cuts across several surfaces is none.
+        if np.count_nonzero(along) >= FLAT_SHARE * len(on):
+            extent = float(np.linalg.norm(np.percentile(on, 98, axis=0) - np.percentile(on, 2, axis=0)))
+            found.append(Plane(np.asarray(normal), float(normal @ middle), extent))
+    return found
 
 
 def _pitch(points: Floats, rng: np.random.Generator) -> float:

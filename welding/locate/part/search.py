@@ -104,7 +104,7 @@ def _places_for(
     order = order[np.argsort(q[order, 2])]
     top[i[order, 1], i[order, 0]] = q[order, 2]  # the highest is written last
     body_seen = np.isfinite(top)
-    mask = body_seen.astype(np.float32) - (known & ~body_seen)
+    mask = body_seen.astype(np.float32) - (known & ~body_seen).astype(np.float32)
     scene_body, scene_seen = fft.rfft2(mask, s=full), fft.rfft2(body_seen.astype(np.float32), s=full)
     places: list[Place] = []
     points, normals = model.points - model.center, model.normals
@@ -121,8 +121,8 @@ def _places_for(
             ring = cv2.dilate(body.astype(np.uint8), _BOX[2 * RING_CELLS + 1]).astype(bool)
             ring &= ~cv2.dilate(body.astype(np.uint8), _BOX[3]).astype(bool)
             n = float(body.sum())
-            f_body = fft.rfft2(body.astype(np.float32) / n, s=full)
-            f_ring = fft.rfft2(ring.astype(np.float32) * (RING_SHARE / max(1, int(ring.sum()))), s=full)
+            f_body = fft.rfft2(body.astype(np.float32) / np.float32(n), s=full)
+            f_ring = fft.rfft2(ring.astype(np.float32) * np.float32(RING_SHARE / max(1, int(ring.sum()))), s=full)
             match = fft.irfft2(scene_body * np.conj(f_body) - scene_seen * np.conj(f_ring), s=full)
             match = match[: size[1] - 2 * reach, : size[0] - 2 * reach]
             rows, columns = np.nonzero(body)
