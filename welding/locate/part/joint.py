@@ -26,11 +26,11 @@ KNOT_M = 0.004
 REACH_M = 0.015  # of a wall from the root
 NEAR_ROOT_M = 0.0012  # points nearer to the root, and a point distance, may be of either wall
 ALONG_WALL_COS = math.cos(math.radians(25.0))
-PRIOR_M, PRIOR_TILT_RAD = 0.0005, math.radians(1.0)
+PRIOR_M, PRIOR_TILT_RAD, PRIOR_KNOTS = 0.0005, math.radians(1.0), 10  # shared by so many knots
 BEND_M, BEND_TILT_RAD = 2e-5, math.radians(0.1)  # second difference from knot to knot
 EDGE_SIGMA = 0.3  # of the middle between the outermost points of two edges, in point distances
 SIGMA_FLOOR_M = 3e-5
-KNOWN_SHARE = 0.5  # of the prior: a knot whose shift is known better was measured
+KNOWN_SHARE = 0.4  # of the deviation by the drawing alone: a knot that is known better was measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,23 +38,27 @@ class MeasuredJoint:
     """A seam as measured, in the base, and how far it lies from where the drawing has it.
 
     seam      the drawn seam with its root moved
-    shift_m   (N,) of the root, at each of the seam's points; share of the seam along which it was measured
-    sigma_m   of the root sideways, rms over what was measured; nan where nothing was
+    shift_m   (N,) of the root, at each of the seam's points
+    share     of the seam along which the root was measured in both directions of the cut; share_one: in at least one, for one
+              wall was seen. Across the other the drawing holds.
+    sigma_m   of the root sideways, rms over what was measured in both; nan where nothing was
     """
 
     seam: DrawnSeam
     shift_m: Floats
     share: float
+    share_one: float
     sigma_m: float
 
     @property
     def summary(self) -> str:
         """What was measured, in words."""
-        if self.share == 0.0:
+        if self.share_one == 0.0:
             return "the joint itself could not be measured in the scan"
         rms = float(np.sqrt(np.mean(np.square(self.shift_m))))
         return (
-            f"the joint was measured along {100 * self.share:.0f} % of the seam: {1e3 * rms:.2f} mm rms and "
+            f"the joint was measured along {100 * self.share:.0f} % of the seam, one wall of it along "
+            f"{100 * self.share_one:.0f} %: {1e3 * rms:.2f} mm rms and "
             f"{1e3 * float(self.shift_m.max()):.2f} mm at most off the drawing"
         )
 
@@ -68,13 +72,14 @@ def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartMo
     rows = [r for side in ("left", "right") if (r := _wall_rows(cut, model, seam, side, pitch_m)) is not None]
     if seam.joint == "butt" and (middle := _gap_rows(cut, seam, pitch_m)) is not None:
         rows.append(middle)
-    nothing = MeasuredJoint(seam, np.zeros(len(seam.points_P)), 0.0, math.nan)
+    nothing = MeasuredJoint(seam, np.zeros(len(seam.points_P)), 0.0, 0.0, math.nan)
     if not rows:
         return nothing
-    at, solved = _solved(rows, seam.length_m, pitch_m)
-    x, y, sigma = solved
-    known = sigma < KNOWN_SHARE * PRIOR_M
-    if not known.any():
+    at, x, y, spread, drawn = _solved(rows, seam.length_m, pitch_m)
+    values = np.sqrt(np.linalg.eigvalsh(spread))  # ascending
+    known, one = values[:, 1] < KNOWN_SHARE * drawn, values[:, 0] < KNOWN_SHARE * drawn
+    sigma = np.sqrt(spread[:, 0, 0])
+    if not one.any():
         return nothing
     s = seam.arc_length_m
     shift = np.column_stack([np.interp(s, at, x), np.interp(s, at, y)])
@@ -85,7 +90,8 @@ def measure_joint(points: Floats, normals: Floats, pitch_m: float, model: PartMo
         replace(seam, points_P=moved),
         np.linalg.norm(shift, axis=1),
         float(known.mean()),
-        float(np.sqrt(np.mean(np.square(sigma[known])) + SIGMA_FLOOR_M**2)),
+        float(one.mean()),
+        float(np.sqrt(np.mean(np.square(sigma[known])) + SIGMA_FLOOR_M**2)) if known.any() else math.nan,
     )
 
 
@@ -173,8 +179,10 @@ def _gap_rows(cut: _Cut, seam: DrawnSeam, pitch: float) -> Rows | None:
     return np.array(where), np.tile([1.0, 0.0, math.nan, math.nan], (len(where), 1)), np.array(middle)
 
 
-def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, tuple[Floats, Floats, Floats]]:
-    """Knots (K,) m along the seam with the shifts to the left and along the bisector (K,) m, and the former's deviation (K,)."""
+def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """Knots (K,) m along the seam with the shifts to the left and along the bisector (K,) m, their covariance (K,2,2), and the
+    deviation (K,) by the drawing alone.
+    """
     count = max(3, math.ceil(length / KNOT_M) + 1)
     at = np.linspace(0.0, length, count)
     s, J, r = (np.concatenate(part) for part in zip(*rows, strict=True))
@@ -188,7 +196,7 @@ def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, tupl
     A = sparse.csr_matrix(
         (np.hstack(value).ravel(), (np.repeat(n, 8), np.hstack(column).ravel())), shape=(len(s), 4 * count)
     )
-    prior = np.tile([PRIOR_M**-2, PRIOR_M**-2, PRIOR_TILT_RAD**-2, PRIOR_TILT_RAD**-2], count)
+    prior = np.tile([PRIOR_M**-2, PRIOR_M**-2, PRIOR_TILT_RAD**-2, PRIOR_TILT_RAD**-2], count) / PRIOR_KNOTS
     D = np.kron(np.diff(np.eye(count), 2, axis=0), np.eye(4))
     bend = np.tile([BEND_M**-2, BEND_M**-2, BEND_TILT_RAD**-2, BEND_TILT_RAD**-2], count - 2)
     fixed = np.diag(prior) + D.T @ (bend[:, None] * D)
@@ -200,5 +208,6 @@ def _solved(rows: list[Rows], length: float, pitch: float) -> tuple[Floats, tupl
         N = (A.T @ sparse.diags_array(w) @ A).toarray() + fixed
         xi = np.linalg.solve(N, A.T @ (w * r))
         off = r - A @ xi
-    variance = np.diag(np.linalg.inv(N))
-    return at, (xi[0::4], xi[1::4], np.sqrt(variance[0::4]))
+    k = 4 * np.arange(count)[:, None, None]
+    spread = np.linalg.inv(N)[k + np.array([[0], [1]]), k + np.array([[0, 1]])]
+    return at, xi[0::4], xi[1::4], spread, np.sqrt(np.diag(np.linalg.inv(fixed))[0::4])
