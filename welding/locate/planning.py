@@ -12,6 +12,7 @@ from weldcal.models.workpieces.part import Part, WeldPart
 from weldcal.models.workpieces.plate import Workpiece
 from weldcal.welding.locate.find_workpiece import find_workpiece
 from weldcal.welding.locate.groove.extract import extract_groove
+from weldcal.welding.locate.part.locating import locate_part
 from weldcal.welding.locate.planes import Floats
 from weldcal.welding.locate.registration import register_workpiece
 
@@ -24,7 +25,8 @@ class PlanningMethod:
     """Method and search of the seam plan.
 
     method   cad: the drawing registered to the scan; cloud: the groove found in the scan, no drawing
-    search   of the drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns apart)
+    search   of a plate's drawing: near the guess, or anywhere in the scan (the guess then only tells symmetric turns apart); a part
+             from a file is always searched anywhere
     start_B  (x, y, z) m: a cloud's seam starts at its end nearest to this; without it nearest to the robot's base
     """
 
@@ -66,21 +68,23 @@ def plan_part_root(
     method: PlanningMethod,
     eye_B: npt.ArrayLike | None,
 ) -> RootPlan:
-    """Plan the root of a drawn seam on a part from a file; see plan_root."""
+    """Plan the root of a drawn seam on a part from a file; the guess only decides between poses that look the same."""
     if method.method == "cloud":
         raise InputError(
             "planning.method: cloud finds grooves in plates; a part from a file is planned with method: cad."
         )
-    seam = part.seam.transformed(X_BP_guess)
+    found, joint = locate_part(points_B, part.mesh, part.seam, None, eye_B, X_BP_hint=X_BP_guess)
+    seam = joint.seam.transformed(found.X_BP)
+    sigma_m = float(np.sqrt(np.mean(found.sigma_at(part.seam_P) ** 2)))
     return RootPlan(
         root=seam.points_P,
         up=seam.up_P,
         half_angle_rad=part.half_angle_rad,
-        X_BP=X_BP_guess,
-        sigma_m=0.0,
-        rms_m=0.0,
-        confidence=1.0,
-        summary="the pose of the part is from the drawing; the scan was not used",
+        X_BP=found.X_BP,
+        sigma_m=joint.sigma_m if math.isfinite(joint.sigma_m) else sigma_m,
+        rms_m=found.rms_m,
+        confidence=found.confidence,
+        summary=f"{found.summary}; {joint.summary}",
     )
 
 

@@ -1,4 +1,4 @@
-"""Checks that the tool's body has room beside the part along the whole seam."""
+"""Checks that the tool has room at the part: its body along the whole seam, tip and torch beyond its ends."""
 
 import math
 from collections.abc import Sequence
@@ -55,6 +55,44 @@ def check_room(
                     f"The tool does not fit at {1e3 * s:.0f} mm of the seam: leaning to the joint's bisector its body would come within "
                     f"{1e3 * CLEARANCE_M:.0f} mm of the part ({1e3 * near:.1f} mm); use a longer finger or weld the joint from elsewhere."
                 )
+
+
+def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
+    """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its start.
+
+    The tip runs `chord_m` ahead of the torch, straight on where the seam ends; the torch comes from as far behind its start.
+
+    Raises:
+        NoRoom: with how much of the seam to cut off.
+    """
+    triangles = mesh.transformed(X_BP).vertices[mesh.triangles]
+    for name, s, sign, who in (("end", seam.length, 1.0, "tip"), ("start", 0.0, -1.0, "torch")):
+        frame = seam.frame(s)
+        free = _free_length(triangles, np.asarray(frame.position), sign * np.asarray(frame.tangent))
+        needed = chord_m + tip_radius_m
+        if free < needed:
+            raise NoRoom(
+                f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "
+                f"set {name}_mm of the seam {1e3 * (needed - free) + 1.0:.0f} mm larger, or weld it from elsewhere."
+            )
+
+
+def _free_length(triangles: NDArray[np.float64], origin: Array, direction: Array) -> float:
+    """Distance m from a point along a unit vector to the first of the triangles (M,3,3); infinite without one.
+
+    Source: Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
+    """
+    a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    p = np.cross(direction, ac)
+    det = np.sum(ab * p, axis=1)
+    safe = np.where(np.abs(det) > 1e-15, det, np.inf)
+    to = origin - a
+    u = np.sum(to * p, axis=1) / safe
+    q = np.cross(to, ab)
+    v = (q @ direction) / safe
+    t = np.sum(ac * q, axis=1) / safe
+    hit = np.isfinite(safe) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
+    return float(t[hit].min()) if hit.any() else math.inf
 
 
 def _above_tip(capsule: Capsule, X_FT: RigidTransform) -> tuple[Array, Array, float] | None:

@@ -27,7 +27,7 @@ from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam,
 from weldcal.welding.locate.planning import PlanningMethod, RootPlan
 from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.seam.feasibility import check_feasible
-from weldcal.welding.seam.room import check_room
+from weldcal.welding.seam.room import check_ends, check_room
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
@@ -67,6 +67,7 @@ class SeamPlanning:
         if X_BP is not None:
             tool = self.tool
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
+            check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
         q_start, q_above, q_retract = arm_waypoints(
             self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m

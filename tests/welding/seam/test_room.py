@@ -1,0 +1,54 @@
+"""The tool's room at a part: its body beside high walls, tip and torch beyond the seam's ends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform, RollPitchYaw
+
+from weldcal.models.mesh import TriMesh, extrude, merge
+from weldcal.models.tool import WeldingTool
+from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.room import NoRoom, check_ends, check_room
+
+TOOL = WeldingTool()
+X_BP = RigidTransform(RollPitchYaw(0.1, -0.2, 0.7), [0.6, 0.1, 0.05])
+
+
+def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> TriMesh:
+    corners = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+    return extrude(corners, low[2], high[2])
+
+
+PLATE = block((-0.1, -0.08, -0.01), (0.1, 0.08, 0.0))
+WEB = block((-0.1, 0.0, 0.0), (0.1, 0.01, 0.05))
+
+
+def seam(lean_deg: float = 45.0, low: float = -0.1, high: float = 0.1) -> SeamCurve:
+    """The tip's line along the corner of plate and web, in B."""
+    a = np.radians(lean_deg)
+    up = np.array([0.0, -np.sin(a), np.cos(a)])
+    points = np.linspace([low, 0.0, 0.0], [high, 0.0, 0.0], 60) + 0.0033 * up
+    return SeamCurve.from_points(points, up=up).transformed(X_BP)
+
+
+def test_a_tool_that_leans_between_the_walls_has_room() -> None:
+    part = merge(PLATE, WEB)
+    check_room(part, X_BP, seam(), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    check_ends(part, X_BP, seam(), TOOL.chord_m, TOOL.tip_radius_m)
+
+
+def test_a_body_that_would_touch_the_web_is_refused() -> None:
+    high = merge(PLATE, block((-0.1, 0.0, 0.0), (0.1, 0.01, 0.15)))
+    check_room(high, X_BP, seam(), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+    with pytest.raises(NoRoom, match="does not fit at 0 mm"):
+        check_room(high, X_BP, seam(20.0), TOOL.capsules(), TOOL.X_FT, TOOL.chord_m)
+
+
+@pytest.mark.parametrize(("x", "says"), [(0.09, "beyond its end.*tip.*end_mm"), (-0.095, "beyond its start.*start_mm")])
+def test_a_wall_across_an_end_is_refused_with_what_to_cut(x: float, says: str) -> None:
+    part = merge(PLATE, WEB, block((x, -0.05, 0.0), (x + 0.005, 0.0, 0.05)))
+    with pytest.raises(NoRoom, match=says):
+        check_ends(part, X_BP, seam(low=-0.08, high=0.08), TOOL.chord_m, TOOL.tip_radius_m)
+    # 62.5 mm are needed, and 10 mm are free.
+    check_ends(part, X_BP, seam(low=-0.026, high=0.026), TOOL.chord_m, TOOL.tip_radius_m)

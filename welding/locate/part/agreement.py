@@ -1,0 +1,132 @@
+"""Scores a pose by the scanner's rays: which meet the part where it is predicted, pass through it, or end before it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.math import RigidTransform
+from scipy.spatial import cKDTree
+
+from weldcal.welding.locate.part.fit import contour, into
+from weldcal.welding.locate.part.model import PartModel
+from weldcal.welding.locate.part.scan import PreparedScan
+
+Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+MOST_RAYS = 9000
+NOT_MEASURED_COS = 0.22
+VISIBLE_SAMPLES = 2500
+BEYOND_M = 0.004
+SAME_FACE_COS = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Shares of the rays that are predicted to meet the part.
+
+    met: they do; passed: they see through it; hidden: something before it is seen; seen: share of the part's visible surface
+    with a scan point near; goes_on: share of the edges that should end a seen face beyond which the scan shows that face go on;
+    verdict (N,) of all rays: 1 met, -1 passed, 0 else.
+    """
+
+    met: float
+    passed: float
+    hidden: float
+    seen: float
+    n_met: int
+    goes_on: float
+    verdict: npt.NDArray[np.int8]
+
+    @property
+    def score(self) -> float:
+        """Met less twice the passed share and what goes on, times the square root of what is seen."""
+        return max(0.0, self.met - 2.0 * self.passed - self.goes_on) * math.sqrt(self.seen)
+
+
+def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
+    """The scan's points (N,3) whose rays may meet the part at X_BP or near it."""
+    middle = X_BP.multiply(model.center) - scan.eye
+    far = float(np.linalg.norm(middle))
+    d = scan.points - scan.eye
+    along = np.clip(d @ middle / far / np.linalg.norm(d, axis=1), -1.0, 1.0)
+    near = scan.points[np.arccos(along) < np.arcsin(min(1.0, (model.radius + reach_m) / far))]
+    stride = max(1.0, len(near) / MOST_RAYS)
+    return np.asarray(near[(np.arange(int(len(near) / stride)) * stride).astype(int)])
+
+
+def agreement(
+    points: Floats, scan: PreparedScan, model: PartModel, X_BP: RigidTransform, tolerance_m: float
+) -> Agreement:
+    """Compare the rays of these points (N,3) with the part at X_BP."""
+    eye = into(X_BP, scan.eye[None])[0]
+    d = into(X_BP, points) - eye
+    far = np.linalg.norm(d, axis=1)
+    hit, normal = model.ranges(eye, d / far[:, None])
+    cosine = np.abs(np.sum(d * normal, axis=1)) / far
+    # Along a slanted surface the same error of the pose is a larger error of the range.
+    slack = tolerance_m / np.maximum(cosine, 0.3)
+    meets = np.isfinite(hit) & (cosine > NOT_MEASURED_COS)
+    behind = far - hit
+    met = meets & (np.abs(behind) < slack)
+    passed = meets & (behind > slack)
+    hidden = meets & (behind < -slack)
+    total = max(1, int(meets.sum()))
+    verdict = met.astype(np.int8) - passed.astype(np.int8)
+    # Which of the visible surface the scan shows: rays back to samples of the part.
+    s, n = model.points[::12][:VISIBLE_SAMPLES], model.normals[::12][:VISIBLE_SAMPLES]
+    v = s - eye
+    away = np.linalg.norm(v, axis=1)
+    visible = -np.sum(v * n, axis=1) / away > 0.3
+    s, v, away = s[visible], v[visible] / away[visible, None], away[visible]
+    first, _ = model.ranges(eye, v)
+    s = s[np.abs(first - away) < 0.001]
+    seen = 0.0
+    if len(s) and met.any():
+        spacing = 2.0 * scan.pitch_m * max(1.0, (len(scan.points) / max(1, len(points))) ** 0.5)
+        near, _ = cKDTree(into(X_BP, points[met])).query(s, distance_upper_bound=max(0.005, 2.0 * spacing))
+        seen = float(np.mean(np.isfinite(near)))
+    return Agreement(
+        float(met.sum() / total),
+        float(passed.sum() / total),
+        float(hidden.sum() / total),
+        seen,
+        int(met.sum()),
+        _goes_on(scan, model, X_BP, eye, tolerance_m),
+        verdict,
+    )
+
+
+def _goes_on(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, eye: Floats, tolerance_m: float) -> float:
+    """Share of the edges that end a face with scan points on it, beyond which the scan has points in the same face."""
+    edges = contour(model, eye)
+    if len(edges.point) < 8:
+        return 0.0
+    away = max(BEYOND_M, 2.5 * scan.pitch_m, 1.5 * tolerance_m)
+    reach = max(0.0015, 1.5 * scan.pitch_m)
+    there = [
+        _on_face(scan, X_BP, edges.point + side * away * edges.outward, edges.normal, reach, 0.8 * tolerance_m)
+        for side in (-1.0, 1.0)
+    ]
+    # Across a gap of the part's own the same face begins again.
+    beyond = edges.point + away * edges.outward
+    q, m = model.closest(beyond)
+    own = (np.linalg.norm(beyond - q, axis=1) < reach + tolerance_m) & (
+        np.sum(m * edges.normal, axis=1) > SAME_FACE_COS
+    )
+    shown = there[0] & ~own
+    return float(np.mean(there[1][shown])) if np.count_nonzero(shown) > 6 else 0.0
+
+
+def _on_face(scan: PreparedScan, X_BP: RigidTransform, p: Floats, n: Floats, reach: float, band: float) -> Mask:
+    """Whether a scan point lies near each point p (N,3) of P and in the plane through it with normal n (N,3)."""
+    R = X_BP.rotation().matrix()
+    at = p @ R.T + X_BP.translation()
+    _, k = scan.tree.query(at, k=3, distance_upper_bound=reach + band)
+    found = k < len(scan.points)
+    d = scan.points[np.where(found, k, 0)] - at[:, None]
+    height = np.abs(np.einsum("ijk,ik->ij", d, n @ R.T))
+    return np.asarray((found & (height < band)).any(axis=1))

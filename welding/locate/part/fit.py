@@ -1,0 +1,252 @@
+"""Fits a part's pose to a scan: points to the surface, and the rims of the seen faces to the part's sharp edges.
+
+A flat face does not fix the pose along itself. What does is where it ends: at an edge beyond which the part faces away from
+the scanner, the outermost points of the face lie a share of a point distance inside the edge. That share is estimated too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from weldcal.welding.locate.part.model import PartModel, SharpEdges
+from weldcal.welding.locate.part.scan import PreparedScan
+
+Floats = npt.NDArray[np.float64]
+
+SAME_SIDE_COS = math.cos(math.radians(38.0))
+HIDDEN_COS = math.cos(math.radians(77.0))  # a face seen at a larger angle is not measured
+INSET, INSET_SIGMA = 0.35, 0.2  # of the outermost points of a face, in point distances
+RIM_SIGMA = 0.40  # of one of them, in point distances
+RIM_FLOOR = 0.10  # error common to the points of one edge, in point distances
+SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
+PATCHES = 14.0  # size of a patch whose points share their error, in point distances
+SIGMA_FLOOR_M, CREEP_M = 2e-5, 2e-5
+MOST_POINTS, COARSE_POINTS = 15_000, 1200
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """Linearised equations in P: rows (M,6) of rotation and translation, and residuals (M,) m, with weights and clusters (M,)."""
+
+    rows: Floats
+    residual: Floats
+    weight: Floats
+    cluster: npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A pose with its covariance (6,6), of the motion in P; rms_m of the surface; n_points on it; n_rims points on edges."""
+
+    X_BP: RigidTransform
+    covariance: Floats
+    rms_m: float
+    n_points: int
+    n_rims: int
+
+
+def moved(X: RigidTransform, xi: Floats) -> RigidTransform:
+    """X times the small motion xi (6,) in P, rotation then translation."""
+    return X @ RigidTransform(RotationMatrix(Rotation.from_rotvec(xi[:3]).as_matrix()), xi[3:])
+
+
+def into(X_BP: RigidTransform, p_B: Floats) -> Floats:
+    """Points (N,3) of the base in P."""
+    return np.asarray((p_B - X_BP.translation()) @ X_BP.rotation().matrix())
+
+
+def surface_rows(p: Floats, n: Floats, model: PartModel, gate: float, same: float = SAME_SIDE_COS) -> Equations:
+    """Point-to-plane equations of the points p (N,3) in P with normals n (N,3) that lie within `gate` of the surface."""
+    near = np.linalg.norm(p - model.center, axis=1) < model.radius + gate
+    p, n = p[near], n[near]
+    q, m = model.closest(p) if len(p) else (p, n)
+    away = np.linalg.norm(p - q, axis=1)
+    keep = (away < gate) & (np.sum(n * m, axis=1) > same)
+    p, q, m = p[keep], q[keep], m[keep]
+    r = np.sum((p - q) * m, axis=1)
+    return Equations(-np.hstack([np.cross(p, m), m]), r, np.ones(len(r)), np.zeros(len(r), dtype=np.int64))
+
+
+def contour(model: PartModel, eye: Floats) -> SharpEdges:
+    """The samples of sharp edges that, seen from the eye (3,) in P, end a face the scanner measures and hide nothing of it."""
+    e = model.edges
+    if not len(e.point):
+        return e
+    view = eye - e.point
+    view = view / np.linalg.norm(view, axis=1, keepdims=True)
+    at = np.sum(view * e.normal, axis=1)
+    index = np.flatnonzero((at > 0.45) & (np.sum(view * e.other, axis=1) < HIDDEN_COS))
+    inner = e.point[index] - 0.0015 * e.outward[index]
+    d = inner - eye
+    far = np.linalg.norm(d, axis=1)
+    hit, _ = model.ranges(eye, d / far[:, None])
+    index = index[np.abs(hit - far) < 0.0008]
+    # A sample needs depth behind it: just beyond the edge the part must not continue at nearly the same depth.
+    d = e.point[index] + 0.0015 * e.outward[index] - eye
+    far = np.linalg.norm(d, axis=1)
+    hit, _ = model.ranges(eye, d / far[:, None])
+    index = index[hit > far + 0.0025]
+    return SharpEdges(
+        e.point[index], e.tangent[index], e.normal[index], e.outward[index], e.other[index], e.chain[index]
+    )
+
+
+def rim_rows(p: Floats, edges: SharpEdges, gate: float, band: float, pitch: float) -> Equations | None:
+    """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them."""
+    if len(edges.point) < 4 or not len(p):
+        return None
+    away, k = (
+        np.asarray(found) for found in cKDTree(edges.point).query(p, distance_upper_bound=math.hypot(gate, 0.002))
+    )
+    near = np.isfinite(away)
+    p, k = p[near], k[near]
+    d = p - edges.point[k]
+    out, height = np.sum(d * edges.outward[k], axis=1), np.sum(d * edges.normal[k], axis=1)
+    on = (np.abs(height) < band) & (np.abs(np.sum(d * edges.tangent[k], axis=1)) < max(0.0018, 1.2 * pitch))
+    k, out = k[on], out[on]
+    n = len(edges.point)
+    count = np.bincount(k, minlength=n)
+    last = np.full(n, -np.inf)
+    np.maximum.at(last, k, out)
+    # The face must be there within, and must end within the gate.
+    good = np.flatnonzero((count >= 3) & (last > -gate + 2.0 * pitch) & (last < gate - 1.5 * pitch))
+    if len(good) < 4:
+        return None
+    m, at = edges.outward[good], edges.point[good]
+    r = last[good] + INSET * pitch
+    return Equations(-np.hstack([np.cross(at, m), m]), r, np.ones(len(r)), edges.chain[good])
+
+
+def tukey(r: Floats, c: float) -> Floats:
+    """Tukey's weights."""
+    return np.asarray(np.square(np.maximum(1.0 - np.square(r / c), 0.0)))
+
+
+def step(surface: Equations, rims: Equations | None, c: float, sigma: float, pitch: float) -> Floats | None:
+    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it; None where too few points are near."""
+    if len(surface.residual) < 30:
+        return None
+    w = tukey(surface.residual, c) / (SURFACE_RATIO * sigma**2)
+    A = np.zeros((7, 7))
+    b = np.zeros(7)
+    A[:6, :6] = (surface.rows * w[:, None]).T @ surface.rows
+    b[:6] = (surface.rows * w[:, None]).T @ -surface.residual
+    if rims is not None:
+        J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
+        v = (
+            tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual)))))
+            / (RIM_SIGMA * pitch) ** 2
+        )
+        A += (J * v[:, None]).T @ J
+        b += (J * v[:, None]).T @ -rims.residual
+    A[6, 6] += 1.0 / (INSET_SIGMA * pitch) ** 2
+    # Directions that nothing fixes stay where they are.
+    A[:6, :6] += np.diag([1.0 / math.radians(8.0) ** 2] * 3 + [1.0 / 0.02**2] * 3)
+    return np.asarray(np.linalg.solve(A, b)[:6])
+
+
+def coarse_fit(
+    scan: PreparedScan, model: PartModel, X: RigidTransform, gates: tuple[float, ...]
+) -> RigidTransform | None:
+    """A pose by the coarse points, its gate narrowing; None where they do not touch the part."""
+    near = np.linalg.norm(scan.coarse - X.multiply(model.center), axis=1) < model.radius + 2.0 * gates[0]
+    points, normals = scan.coarse[near], scan.coarse_normals[near]
+    if len(points) > COARSE_POINTS:
+        index = (np.arange(COARSE_POINTS) * (len(points) / COARSE_POINTS)).astype(int)
+        points, normals = points[index], normals[index]
+    for gate in gates:
+        p, n = into(X, points), normals @ X.rotation().matrix()
+        xi = step(surface_rows(p, n, model, gate, 0.7), None, gate, 0.5 * gate, scan.pitch_m)
+        if xi is None:
+            return None
+        X = moved(X, xi)
+    return X
+
+
+def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: float = 0.008) -> Fit | None:
+    """The pose by surface and rims from one good to `gate`, with its covariance; None where too few points are near."""
+    pitch = scan.pitch_m
+    near = np.linalg.norm(scan.points - X.multiply(model.center), axis=1) < model.radius + 0.02
+    points, normals = scan.points[near], scan.normals[near]
+    stride = max(1.0, len(points) / MOST_POINTS)
+    few = (np.arange(int(len(points) / stride)) * stride).astype(int)
+    sigma = 0.5e-3
+    gates = (gate, gate, 0.5 * gate, 0.004, 0.003, 0.002, 0.002, 0.002)
+    edges, surface, rims = None, None, None
+    for k, g in enumerate(gates):
+        g = max(g, 3.5 * pitch if k < 4 else 2.5 * pitch)
+        p, n = into(X, points), normals @ X.rotation().matrix()
+        surface = surface_rows(p[few], n[few], model, min(g, max(0.001, 8.0 * sigma)) if k > 3 else g)
+        if len(surface.residual) < 30:
+            return None
+        sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(surface.residual))))
+        if k in (0, 2, 4):
+            edges = contour(model, into(X, scan.eye[None])[0])
+        assert edges is not None
+        rims = rim_rows(p, edges, g, max(4.0 * sigma, 0.0004), pitch)
+        xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch)
+        if xi is None:
+            return None
+        X = moved(X, xi)
+    assert surface is not None
+    return Fit(
+        X,
+        covariance(surface, rims, sigma, pitch),
+        float(np.sqrt(np.mean(np.square(surface.residual[np.abs(surface.residual) < max(4.0 * sigma, 0.0004)])))),
+        len(surface.residual),
+        0 if rims is None else len(rims.residual),
+    )
+
+
+def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: float) -> Floats:
+    """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge, share.
+
+    The points of a patch of PATCHES point distances are one cluster, those of an edge another (Liang and Zeger 1986); an edge
+    has at least an error of RIM_FLOOR, and the surface one of CREEP_M in every patch.
+    """
+    w = tukey(surface.residual, max(4.0 * sigma, 0.0004)) / (SURFACE_RATIO * sigma**2)
+    A = np.zeros((7, 7))
+    A[:6, :6] = (surface.rows * w[:, None]).T @ surface.rows
+    A[6, 6] = 1.0 / (INSET_SIGMA * pitch) ** 2
+    G = np.hstack([surface.rows, np.zeros((len(w), 1))]) * w[:, None]
+    # Where a point acts: its foot on the normal's line, told apart by place and by direction.
+    normal = -surface.rows[:, 3:]
+    place = np.cross(normal, -surface.rows[:, :3])
+    key = np.hstack([np.floor(place / (PATCHES * pitch)), np.round(2.0 * normal)]).astype(np.int64)
+    _, patch = np.unique(key, axis=0, return_inverse=True)
+    patch = patch.ravel()
+    score = np.zeros((int(patch.max()) + 1, 7))
+    lean = np.zeros_like(score)
+    np.add.at(score, patch, G * surface.residual[:, None])
+    np.add.at(lean, patch, G)
+    middle = score.T @ score + CREEP_M**2 * (lean.T @ lean) + np.diag([0.0] * 6 + [A[6, 6]])
+    if rims is not None:
+        J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
+        v = (
+            tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual)))))
+            / (RIM_SIGMA * pitch) ** 2
+        )
+        H = J * v[:, None]
+        A += H.T @ J
+        r = np.minimum(np.abs(rims.residual), 2.0 * pitch)
+        middle += (H * np.square(np.maximum(r, 0.15 * pitch))[:, None]).T @ H
+        for chain in np.unique(rims.cluster):
+            total = H[rims.cluster == chain].sum(axis=0)
+            middle += np.outer(total, total) * (RIM_FLOOR * pitch) ** 2
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-9))
+    inverse = np.linalg.pinv(A / np.outer(scale, scale) + 1e-9 * np.eye(7)) / np.outer(scale, scale)
+    free = np.zeros((7, 7))
+    values, vectors = np.linalg.eigh(A[:6, :6] / np.outer(scale[:6], scale[:6]))
+    for value, vector in zip(values, vectors.T, strict=True):
+        if value < 1e-4:  # nothing fixes this direction: it is as unknown as the search's step
+            direction = vector / scale[:6]
+            size = math.hypot(float(np.linalg.norm(direction[:3])) / 0.1, float(np.linalg.norm(direction[3:])) / 0.02)
+            free[:6, :6] += np.outer(direction, direction) / max(size, 1e-12) ** 2
+    return np.asarray((inverse @ middle @ inverse + free)[:6, :6])

@@ -1,0 +1,154 @@
+"""The part as the search and the fit use it: ray caster, surface samples, resting directions and sharp edges."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull
+
+from weldcal.models.mesh import TriMesh
+
+Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+SAMPLES = 30_000
+EDGE_STEP_M = 0.003
+SHARP_COS = math.cos(math.radians(35.0))
+MOST_DIRECTIONS = 14
+
+
+@dataclass(frozen=True, eq=False)
+class SharpEdges:
+    """Samples of the convex edges, one row for each face beside an edge: m and unit vectors.
+
+    point (N,3), tangent (N,3), normal (N,3) of the face, outward (N,3) in the face and away from it, other (N,3) the normal of
+    the face beyond the edge, chain (N,) the number of the straight edge.
+    """
+
+    point: Floats
+    tangent: Floats
+    normal: Floats
+    outward: Floats
+    other: Floats
+    chain: npt.NDArray[np.int64]
+
+
+class PartModel:
+    """A mesh in frame P, m, prepared for registration."""
+
+    def __init__(self, mesh: TriMesh, seed: int = 0) -> None:
+        import open3d
+
+        self.mesh = mesh
+        tensor: Any = open3d.core.Tensor
+        self._tensor = tensor
+        self._scene = open3d.t.geometry.RaycastingScene()
+        self._scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
+        self.points, self.normals = mesh.sample(SAMPLES, np.random.default_rng(seed))
+        self.center = 0.5 * mesh.bounds.sum(axis=0)
+        self.radius = float(np.linalg.norm(mesh.vertices - self.center, axis=1).max())
+
+    def closest(self, p: Floats) -> tuple[Floats, Floats]:
+        """The nearest surface points (N,3) to points (N,3), and the normals (N,3) there."""
+        found = self._scene.compute_closest_points(self._tensor(p.astype(np.float32)))
+        return (
+            found["points"].numpy().astype(np.float64),
+            self.mesh.normals[found["primitive_ids"].numpy().astype(np.int64)],
+        )
+
+    def ranges(self, eye: Floats, directions: Floats) -> tuple[Floats, Floats]:
+        """Distances (N,) m from the eye (3,) along unit directions (N,3), inf where the part is missed, and the normals there."""
+        rays = np.hstack([np.broadcast_to(eye, directions.shape), directions]).astype(np.float32)
+        hit = self._scene.cast_rays(self._tensor(rays))
+        index = hit["primitive_ids"].numpy().astype(np.int64)
+        index[index >= len(self.mesh.triangles)] = 0
+        return hit["t_hit"].numpy().astype(np.float64), self.mesh.normals[index]
+
+    @cached_property
+    def directions(self) -> list[Floats]:
+        """Directions (3,) of P that may point up: the part rests on a face of its hull, or a large flat face lies up."""
+        found: list[tuple[float, Floats]] = []
+        hull = ConvexHull(self.mesh.vertices)
+        corners = self.mesh.vertices[hull.simplices]
+        area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        gravity = self.points.mean(axis=0)
+        for normal, size in _grouped(hull.equations[:, :3], area):
+            face = corners[hull.equations[:, :3] @ normal > 0.999].reshape(-1, 3)
+            if size < 0.01 * area.sum() or not _above(face, normal, gravity):
+                continue
+            found.append((size, -normal))
+        size = np.linalg.norm(self.mesh.area_vectors, axis=1)
+        found += [(0.5 * a, n) for n, a in _grouped(self.mesh.normals, size) if a > 0.06 * size.sum()]
+        found.sort(key=lambda f: -f[0])
+        kept: list[Floats] = []
+        for _, d in found:
+            if len(kept) < MOST_DIRECTIONS and not any(d @ k > math.cos(math.radians(6.0)) for k in kept):
+                kept.append(d)
+        return kept
+
+    @cached_property
+    def edges(self) -> SharpEdges:
+        """The convex sharp edges."""
+        t, n = self.mesh.triangles, self.mesh.normals
+        v, key = np.unique(np.round(self.mesh.vertices / 1e-7).astype(np.int64), axis=0, return_inverse=True)
+        del v
+        key = key.ravel()
+        pair = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+        face = np.tile(np.arange(len(t)), 3)
+        third = np.concatenate([t[:, 2], t[:, 0], t[:, 1]])
+        name = np.sort(key[pair], axis=1) @ np.array([len(key), 1])
+        order = np.argsort(name, kind="stable")
+        same = np.flatnonzero(name[order][1:] == name[order][:-1])
+        i, j = order[same], order[same + 1]
+        p0, p1 = self.mesh.vertices[pair[i, 0]], self.mesh.vertices[pair[i, 1]]
+        na, nb = n[face[i]], n[face[j]]
+        # Convex: the other triangle's far corner lies below this triangle's plane.
+        below = np.sum((self.mesh.vertices[third[j]] - p0) * na, axis=1)
+        length = np.linalg.norm(p1 - p0, axis=1)
+        keep = (np.sum(na * nb, axis=1) < SHARP_COS) & (below < -1e-7) & (length > 1e-6)
+        rows = []
+        for k in np.flatnonzero(keep):
+            count = max(1, round(float(length[k]) / EDGE_STEP_M))
+            s = (np.arange(count) + 0.5) / count
+            at = p0[k] + s[:, None] * (p1[k] - p0[k])
+            tangent = (p1[k] - p0[k]) / length[k]
+            for mine, beyond in ((na[k], nb[k]), (nb[k], na[k])):
+                out = beyond - (beyond @ mine) * mine
+                out -= (out @ tangent) * tangent
+                if (size := float(np.linalg.norm(out))) > 1e-6:
+                    one = np.concatenate([tangent, mine, out / size, beyond, [float(k)]])
+                    rows.append(np.hstack([at, np.broadcast_to(one, (count, 13))]))
+        all_rows = np.concatenate(rows) if rows else np.zeros((0, 16))
+        point, tangent, normal, outward, other = np.split(all_rows[:, :15], 5, axis=1)
+        return SharpEdges(point, tangent, normal, outward, other, all_rows[:, 15].astype(np.int64))
+
+
+def _grouped(normals: Floats, area: Floats) -> list[tuple[Floats, float]]:
+    """Directions shared by the largest areas, with the areas, largest first."""
+    rest, out = area.copy(), []
+    for _ in range(24):
+        k = int(np.argmax(rest))
+        if rest[k] <= 0.0:
+            break
+        same = (normals @ normals[k] > math.cos(math.radians(4.0))) & (rest > 0.0)
+        out.append((np.asarray(normals[k]), float(rest[same].sum())))
+        rest[same] = 0.0
+    return sorted(out, key=lambda o: -o[1])
+
+
+def _above(face: Floats, normal: Floats, point: Floats) -> bool:
+    """Whether a point lies above the polygon of a hull face's corners (N,3): the part can rest on it."""
+    x = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    x /= np.linalg.norm(x)
+    flat = np.column_stack([face @ x, face @ np.cross(normal, x)])
+    at = np.array([point @ x, point @ np.cross(normal, x)])
+    try:
+        outline = ConvexHull(flat)
+    except Exception:
+        return False
+    return bool((outline.equations[:, :2] @ at + outline.equations[:, 2] < 0.0).all())

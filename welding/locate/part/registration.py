@@ -1,0 +1,292 @@
+"""Registers any part to one scan: rough poses, fine fits, comparison by the scanner's rays, and the decision."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydrake.math import RigidTransform
+
+from weldcal.models.mesh import TriMesh
+from weldcal.welding.locate.part.agreement import Agreement, agreement, rays_near
+from weldcal.welding.locate.part.fit import Fit, coarse_fit, fine_fit
+from weldcal.welding.locate.part.model import PartModel
+from weldcal.welding.locate.part.result import AmbiguousPart, PartConfig, PartNotFound, PartRegistration
+from weldcal.welding.locate.part.rivals import (
+    describe_turn,
+    free_directions,
+    harmless,
+    same_pose,
+    same_set,
+    turned_poses,
+)
+from weldcal.welding.locate.part.scan import PreparedScan, finite_points, prepare
+from weldcal.welding.locate.part.search import rough_places
+
+Floats = npt.NDArray[np.float64]
+
+COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
+COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
+FINE_PLACES, FINE_RIVALS = 10, 5
+NEAR_HINT_DEG = 40.0
+ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
+
+
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    fit: Fit
+    agreement: Agreement
+
+    @property
+    def X_BP(self) -> RigidTransform:
+        return self.fit.X_BP
+
+
+def register_part(
+    points_B: npt.NDArray[np.floating],
+    mesh: TriMesh,
+    X_BP_guess: RigidTransform | None = None,
+    eye_B: npt.ArrayLike | None = None,
+    *,
+    X_BP_hint: RigidTransform | None = None,
+    matters_P: Floats | None = None,
+    config: PartConfig | None = None,
+) -> PartRegistration:
+    """Register a part to a scan (N,3) or (H,W,3), m in base, NaN where unmeasured.
+
+    mesh: the part in its frame P, m. X_BP_guess: search only near it (config.reach_m, reach_rad). eye_B (3,): the scanner's position.
+    X_BP_hint: decides between poses that look the same, and is not used else. matters_P (N,3), the seam: a direction that is free
+    but leaves these points, as a set, where they are is no reason to refuse.
+
+    Raises:
+        PartNotFound: too few points of it are seen, or it does not fit. AmbiguousPart: it has free directions, which the
+        text names, or looks the same elsewhere. InputError: the scan has another shape.
+    """
+    config = config or PartConfig()
+    scan = prepare(finite_points(points_B), eye_B, config.min_points, config.seed)
+    return register_prepared(
+        scan, PartModel(mesh, config.seed), X_BP_guess, X_BP_hint=X_BP_hint, matters_P=matters_P, config=config
+    )
+
+
+def register_prepared(
+    scan: PreparedScan,
+    model: PartModel,
+    X_BP_guess: RigidTransform | None = None,
+    *,
+    X_BP_hint: RigidTransform | None = None,
+    matters_P: Floats | None = None,
+    config: PartConfig | None = None,
+) -> PartRegistration:
+    """Register a prepared part to a prepared scan; see register_part."""
+    config = config or PartConfig()
+    hint = X_BP_guess if X_BP_hint is None else X_BP_hint
+    starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
+    fits = _fine(scan, model, starts, FINE_PLACES)
+    if not fits:
+        raise PartNotFound(
+            "The scan shows nothing that fits the part: move it into view, or check the file and its unit."
+        )
+    best = fits[0]
+    if X_BP_guess is not None:
+        _check_near(best.X_BP, X_BP_guess, model, config)
+    rivals = fits[1:]
+    if X_BP_guess is None:
+        others = turned_poses(model, best.X_BP)
+        found = _fine(scan, model, _screened(scan, model, others, best, hint), FINE_RIVALS, None)
+        known = [f.X_BP for f in fits]
+        rivals = rivals + [f for f in found if not any(same_pose(f.X_BP, X, model) for X in known)]
+        better = [r for r in rivals if _better(r, best, scan, model)]
+        if better:
+            rivals = [f for f in (best, *rivals) if f is not better[0]]
+            best = better[0]
+    _check_fit(best, config)
+    best, runner_up = _decided(best, rivals, scan, model, hint, matters_P, config)
+    _check_known(best, model, matters_P, config)
+    return _result(best, runner_up, model, matters_P)
+
+
+def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
+    """Poses from the search, fitted to the coarse points, best first."""
+    scored: list[tuple[float, RigidTransform]] = []
+    for place in rough_places(scan, model, config):
+        X = coarse_fit(scan, model, place.X_BP, COARSE_GATES)
+        if X is None or any(same_pose(X, Y, model) for _, Y in scored):
+            continue
+        scored.append((agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X))
+    scored.sort(key=lambda s: -s[0])
+    return [X for _, X in scored]
+
+
+def _near_starts(scan: PreparedScan, model: PartModel, guess: RigidTransform) -> list[RigidTransform]:
+    """The guess, fitted to the coarse points from a wide and from a narrow gate."""
+    fits = [coarse_fit(scan, model, guess, gates) for gates in ((0.025, 0.022, *COARSE_GATES), COARSE_GATES[2:])]
+    return [X for X in fits if X is not None]
+
+
+def _screened(
+    scan: PreparedScan, model: PartModel, poses: list[RigidTransform], best: _Judged, hint: RigidTransform | None
+) -> list[RigidTransform]:
+    """The poses that agree roughly with the scan: first the one nearest to the hint, then best first."""
+    scored: list[tuple[float, RigidTransform]] = []
+    for X in poses:
+        fitted = coarse_fit(scan, model, X, COARSE_GATES[2:])
+        if fitted is None or any(same_pose(fitted, X, model) for X in (best.X_BP, *(Y for _, Y in scored))):
+            continue
+        score = agreement(rays_near(scan, model, fitted)[::3], scan, model, fitted, COARSE_TOLERANCE_M).score
+        if score > 0.5 * best.agreement.score:
+            scored.append((score, fitted))
+    scored.sort(key=lambda s: -s[0])
+    ranked = [X for _, X in scored]
+    if hint is not None:
+        ranked.sort(key=lambda X: _away(X, hint, model) > math.radians(NEAR_HINT_DEG))
+    return ranked
+
+
+def _fine(
+    scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 3
+) -> list[_Judged]:
+    """Fine fits of the best starts, different ones only, best first; after more than `enough` a good one ends the search."""
+    judged: list[_Judged] = []
+    for X in starts[:most]:
+        if enough is not None and len(judged) > enough and max(j.agreement.score for j in judged) > 0.8:
+            break
+        fit = fine_fit(scan, model, X)
+        if fit is None or any(same_pose(fit.X_BP, j.X_BP, model) for j in judged):
+            continue
+        rays = rays_near(scan, model, fit.X_BP)
+        judged.append(_Judged(fit, agreement(rays, scan, model, fit.X_BP, TOLERANCE_M)))
+    judged.sort(key=lambda j: -j.agreement.score)
+    return judged
+
+
+def _evidence(a: _Judged, b: _Judged, scan: PreparedScan, model: PartModel) -> tuple[int, int, int]:
+    """Numbers of rays that speak for a and for b where the two differ, and of those that meet a."""
+    rays = np.unique(np.vstack([rays_near(scan, model, a.X_BP), rays_near(scan, model, b.X_BP)]), axis=0)
+    va, vb = (agreement(rays, scan, model, x.X_BP, TOLERANCE_M).verdict.astype(int) for x in (a, b))
+    return int(np.sum(va > vb)), int(np.sum(vb > va)), int(np.sum(va == 1))
+
+
+def _better(rival: _Judged, best: _Judged, scan: PreparedScan, model: PartModel) -> bool:
+    more, less, met = _evidence(rival, best, scan, model)
+    return more > less + max(30, 0.01 * met)
+
+
+def _check_near(X: RigidTransform, guess: RigidTransform, model: PartModel, config: PartConfig) -> None:
+    E = guess.InvertAndCompose(X)
+    turn = float(np.linalg.norm(_rotvec(E)))
+    shift = float(np.linalg.norm(E.multiply(model.center) - model.center))
+    if turn > config.reach_rad or shift > config.reach_m:
+        raise PartNotFound(
+            f"The part fits the scan only {1e3 * shift:.0f} mm and {math.degrees(turn):.0f} deg from the guess: correct the guess, "
+            "or search without one."
+        )
+
+
+def _away(X: RigidTransform, hint: RigidTransform, model: PartModel) -> float:
+    """How far a pose is from the hint: its turn, rad, and its shift, in 0.3 m."""
+    shift = float(np.linalg.norm(hint.multiply(model.center) - X.multiply(model.center)))
+    return float(np.linalg.norm(_rotvec(hint.InvertAndCompose(X)))) + shift / 0.3
+
+
+def _rotvec(X: RigidTransform) -> Floats:
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(X.rotation().matrix()).as_rotvec())
+
+
+def _check_fit(best: _Judged, config: PartConfig) -> None:
+    """Raise PartNotFound where the best pose does not agree with the scan."""
+    a = best.agreement
+    if a.n_met < config.min_points or a.seen < config.min_seen:
+        raise PartNotFound(
+            f"The scan shows only {100 * a.seen:.0f} % of the part's visible surface ({a.n_met} points): clear the view or scan from elsewhere."
+        )
+    if a.goes_on > config.max_goes_on:
+        raise PartNotFound(
+            f"The part does not fit the scan: at {100 * a.goes_on:.0f} % of its edges the face does not end; check which part this is and the file's unit."
+        )
+    if a.met < config.min_agreement * (1.0 - a.hidden) or a.passed > config.max_violation:
+        raise PartNotFound(
+            f"The part does not fit the scan: of the rays that should meet it {100 * a.met:.0f} % do and {100 * a.passed:.0f} % pass "
+            "through it; check which part this is, the file's unit and the calibration."
+        )
+
+
+def _decided(
+    best: _Judged,
+    rivals: list[_Judged],
+    scan: PreparedScan,
+    model: PartModel,
+    hint: RigidTransform | None,
+    matters_P: Floats | None,
+    config: PartConfig,
+) -> tuple[_Judged, float]:
+    """The pose among those that look the same, and how good the best other one is; raise AmbiguousPart where nothing decides."""
+    alike: list[_Judged] = []
+    runner_up = 0.0
+    for rival in rivals:
+        if rival.agreement.passed > 2.0 * config.max_violation:
+            continue
+        for_best, for_rival, met = _evidence(best, rival, scan, model)
+        share = for_rival / max(1, for_best)
+        runner_up = max(runner_up, min(1.0, rival.agreement.score / max(best.agreement.score, 1e-9)))
+        apart = float(np.linalg.norm(best.X_BP.multiply(model.center) - rival.X_BP.multiply(model.center)))
+        if apart > 0.5 * model.radius and rival.agreement.score < ELSEWHERE * best.agreement.score:
+            continue
+        if for_best - for_rival < max(30, 0.008 * met) or share > config.rival:
+            alike.append(rival)
+    harmful = [r for r in alike if not same_set(matters_P, best.X_BP.InvertAndCompose(r.X_BP))]
+    if hint is not None and alike:
+        family = [best, *alike]
+        cost = np.array([_away(f.X_BP, hint, model) for f in family])
+        order = np.argsort(cost)
+        if cost[order[1]] - cost[order[0]] > math.radians(20.0):
+            return family[int(order[0])], runner_up
+    if harmful:
+        motion = best.X_BP.InvertAndCompose(harmful[0].X_BP)
+        near = float(np.linalg.norm(motion.multiply(model.center) - model.center)) < 0.5 * model.radius
+        if near:
+            raise AmbiguousPart(
+                f"The part's pose is ambiguous: {describe_turn(motion)}; give a guess of its pose, or scan it from where its sides differ."
+            )
+        a, b = (1e3 * x.X_BP.multiply(model.center) for x in (best, harmful[0]))
+        raise AmbiguousPart(
+            f"Two places in the scan look equally like the part: near ({a[0]:.0f}, {a[1]:.0f}, {a[2]:.0f}) and "
+            f"({b[0]:.0f}, {b[1]:.0f}, {b[2]:.0f}) mm; cover or remove one, or give a guess of where the part is."
+        )
+    return best, runner_up
+
+
+def _check_known(best: _Judged, model: PartModel, matters_P: Floats | None, config: PartConfig) -> None:
+    """Raise AmbiguousPart where the scan leaves a direction free that matters."""
+    free = free_directions(model, best.X_BP, best.fit.covariance, config.max_sigma_m)
+    harmful = [f.name for f in free if not harmless(f, matters_P)]
+    if harmful:
+        raise AmbiguousPart(
+            f"The part was found, but the scan does not fix its pose: it is {' and '.join(harmful)}; scan it so that more of its sides or "
+            "ends are seen, or give its pose."
+        )
+
+
+def _result(best: _Judged, runner_up: float, model: PartModel, matters_P: Floats | None) -> PartRegistration:
+    a = best.agreement
+    confidence = float(
+        np.clip((a.met / max(1e-9, 1.0 - a.hidden) - a.passed) * (1.0 - max(0.0, runner_up - 0.7)), 0.0, 1.0)
+    )
+    found = PartRegistration(
+        best.X_BP, best.fit.covariance, best.fit.rms_m, a.met, a.passed, a.seen, confidence, runner_up, ""
+    )
+    at = model.points[::300] if matters_P is None else np.asarray(matters_P)
+    sigma = float(np.sqrt(np.mean(np.square(found.sigma_at(at)))))
+    word = "high" if confidence > 0.85 else "fair" if confidence > 0.65 else "low"
+    what = "the part" if matters_P is None else "the drawn seam"
+    summary = (
+        f"{word} confidence {confidence:.2f}: {100 * a.met:.0f} % of the rays that should meet the part do, {100 * a.passed:.0f} % pass through it, "
+        f"{100 * a.seen:.0f} % of its visible surface is seen; {what} is known to {1e3 * sigma:.2f} mm"
+    )
+    return PartRegistration(
+        best.X_BP, best.fit.covariance, best.fit.rms_m, a.met, a.passed, a.seen, confidence, runner_up, summary
+    )

@@ -1,0 +1,155 @@
+"""Finds rough poses of a part in a scan by its silhouettes from above and its heights.
+
+The part is turned into every direction in which it can rest and every angle about the vertical. Its silhouette is correlated with
+the cells in which the scan shows something above the ground; at the best shifts the heights are compared, up to a common lift.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from pydrake.math import RigidTransform, RotationMatrix
+from scipy import fft
+
+from weldcal.welding.locate.part.model import PartModel
+from weldcal.welding.locate.part.result import PartConfig
+from weldcal.welding.locate.part.scan import Plane, PreparedScan
+
+Floats = npt.NDArray[np.float64]
+
+MOST_CELLS = 150  # along a side of the scene's map
+GROUND_M = 0.0025  # points within are on the ground, the largest plane
+SAME_HEIGHT_M = 0.007
+RING_CELLS, RING_SHARE = 3, 0.5
+PEAKS, MOST_PLACES = 3, 24
+GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
+_BOX = {n: np.ones((n, n), np.uint8) for n in (3, 2 * RING_CELLS + 1)}
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A rough pose and its score, 1 for a perfect match."""
+
+    score: float
+    X_BP: RigidTransform
+
+
+def frame_with_z(z: Floats) -> Floats:
+    """A rotation (3,3) whose third column is z."""
+    x = np.cross(np.array([0.0, 1.0, 0.0]) if abs(z[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Place]:
+    """Rough poses of the part in the scan, best first, at most MOST_PLACES."""
+    if scan.planes:
+        first = scan.planes[0]
+        ups = [first.normal]
+        for plane in scan.planes[1:]:
+            cosines = [float(plane.normal @ u) for u in ups]
+            if (
+                len(ups) < 3
+                and max(cosines) < math.cos(math.radians(7.0))
+                and cosines[0] > math.cos(math.radians(50.0))
+            ):
+                ups.append(plane.normal)
+        ground = first if first.extent_m > GROUND_EXTENT * model.radius else None
+    else:
+        ups, ground = [np.array([0.0, 0.0, 1.0])], None
+    places: list[Place] = []
+    for k, up in enumerate(ups):
+        places += _places_for(scan, model, config, up, config.turn_step_rad * (1.0 if k == 0 else 1.5), ground)
+    places.sort(key=lambda place: -place.score)
+    kept: list[Place] = []
+    for place in places:
+        if len(kept) == MOST_PLACES:
+            break
+        if not any(_near(place.X_BP, other.X_BP, model) for other in kept):
+            kept.append(place)
+    return kept
+
+
+def _near(A: RigidTransform, B: RigidTransform, model: PartModel) -> bool:
+    turn = math.acos(
+        max(-1.0, min(1.0, 0.5 * (float(np.trace(A.rotation().matrix().T @ B.rotation().matrix())) - 1.0)))
+    )
+    away = float(np.linalg.norm(A.multiply(model.center) - B.multiply(model.center)))
+    return turn < math.radians(9.0) and away < 0.009
+
+
+def _places_for(
+    scan: PreparedScan, model: PartModel, config: PartConfig, up: Floats, step: float, ground: Plane | None
+) -> list[Place]:
+    """Places with one direction of the base up."""
+    R_BU = frame_with_z(up)
+    q = scan.coarse @ R_BU
+    low, high = np.percentile(q[:, :2], 0.5, axis=0), np.percentile(q[:, :2], 99.5, axis=0)
+    cell = max(config.cell_m, float((high - low).max()) / MOST_CELLS)
+    reach = math.ceil(1.02 * model.radius / cell) + RING_CELLS + 1
+    corner = low - reach * cell
+    size = np.ceil((high - low) / cell).astype(int) + 2 * reach + 1
+    full = [fft.next_fast_len(int(size[1]), real=True), fft.next_fast_len(int(size[0]), real=True)]
+    i = ((q[:, :2] - corner) / cell).astype(np.int64)
+    inside = ((q[:, :2] > low) & (q[:, :2] < high)).all(axis=1)
+    above = np.full(len(q), True) if ground is None else scan.coarse @ ground.normal - ground.level > GROUND_M
+    top = np.full((size[1], size[0]), np.nan, dtype=np.float32)
+    known = np.zeros(top.shape, dtype=bool)
+    known[i[inside, 1], i[inside, 0]] = True
+    order = np.flatnonzero(inside & above)
+    order = order[np.argsort(q[order, 2])]
+    top[i[order, 1], i[order, 0]] = q[order, 2]  # the highest is written last
+    body_seen = np.isfinite(top)
+    mask = body_seen.astype(np.float32) - (known & ~body_seen).astype(np.float32)
+    scene_body, scene_seen = fft.rfft2(mask, s=full), fft.rfft2(body_seen.astype(np.float32), s=full)
+    places: list[Place] = []
+    points, normals = model.points - model.center, model.normals
+    for direction in model.directions:
+        R_UP = frame_with_z(direction).T  # turns `direction` into z
+        p = (points @ R_UP.T)[normals @ R_UP.T[:, 2] > 0.05]
+        p = p[np.argsort(p[:, 2])]
+        for turn in np.arange(0.0, 2.0 * math.pi, step):
+            c, s = math.cos(turn), math.sin(turn)
+            j = np.floor(p[:, :2] @ np.array([[c, s], [-s, c]]) / cell + 0.5).astype(np.int64) + reach
+            shape = np.full((2 * reach + 1, 2 * reach + 1), np.nan, dtype=np.float32)
+            shape[j[:, 1], j[:, 0]] = p[:, 2]
+            body = np.isfinite(shape)
+            ring = cv2.dilate(body.astype(np.uint8), _BOX[2 * RING_CELLS + 1]).astype(bool)
+            ring &= ~cv2.dilate(body.astype(np.uint8), _BOX[3]).astype(bool)
+            n = float(body.sum())
+            f_body = fft.rfft2(body.astype(np.float32) / np.float32(n), s=full)
+            f_ring = fft.rfft2(ring.astype(np.float32) * np.float32(RING_SHARE / max(1, int(ring.sum()))), s=full)
+            match = fft.irfft2(scene_body * np.conj(f_body) - scene_seen * np.conj(f_ring), s=full)
+            match = match[: size[1] - 2 * reach, : size[0] - 2 * reach]
+            rows, columns = np.nonzero(body)
+            heights = shape[rows, columns]
+            best = 0.0
+            for _ in range(PEAKS):
+                _, value, _, (column, row) = cv2.minMaxLoc(match)
+                if value < max(0.1, 0.5 * best):
+                    break
+                best = max(best, value)
+                cv2.circle(match, (column, row), 3, -1.0, -1)
+                difference = top[row + rows, column + columns] - heights
+                difference = difference[np.isfinite(difference)]
+                if len(difference) < 0.2 * n:
+                    continue
+                lift = float(np.median(difference))
+                same = np.abs(difference - lift) < SAME_HEIGHT_M
+                score = float(value) - float(len(difference) - np.count_nonzero(same)) / n
+                middle = corner + (np.array([column, row]) + reach + 0.5) * cell
+                R = R_BU @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ R_UP
+                lift = float(np.mean(difference[same])) if same.any() else lift
+                origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
+                places.append(Place(score, RigidTransform(RotationMatrix(_orthogonal(R)), origin)))
+    places.sort(key=lambda place: -place.score)
+    return places[:400]
+
+
+def _orthogonal(R: Floats) -> Floats:
+    u, _, v = np.linalg.svd(R)
+    return np.asarray(u @ v)
