@@ -91,7 +91,10 @@ def _free_length(triangles: NDArray[np.float64], origin: Array, direction: Array
     q = np.cross(to, ab)
     v = (q @ direction) / safe
     t = np.sum(ac * q, axis=1) / safe
-    hit = np.isfinite(safe) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
+    # A wall that is met at a slant, as that of a curved groove, leads the tip on.
+    normal = np.cross(ab, ac)
+    across = np.abs(normal @ direction) > ACROSS_COS * np.linalg.norm(normal, axis=1)
+    hit = across & np.isfinite(safe) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
     return float(t[hit].min()) if hit.any() else math.inf
 
 

@@ -67,6 +67,41 @@ def standing(
     return RigidTransform(R, [at[0], at[1], lift_m - float(turned[:, 2].min()) + 0.0003])
 
 
+def lying(mesh: TriMesh, rng: np.random.Generator, spread_m: float) -> RigidTransform:
+    """X_BP of a part on one of its sides or upside down."""
+    over = RotationMatrix.MakeXRotation(0.5 * math.pi * int(rng.integers(1, 4)))
+    if rng.uniform() < 0.5:
+        over = RotationMatrix.MakeYRotation(0.5 * math.pi * int(rng.integers(1, 4)))
+    X = RigidTransform(over, np.zeros(3))
+    return standing(mesh.transformed(X), rng, 0.0, 0.0, spread_m) @ X
+
+
+def vice(mesh_B: TriMesh) -> list[TriMesh]:
+    """Two jaws along the part's longer sides that hide its lower third, and the vice's bed beyond its ends."""
+    low, high = mesh_B.bounds
+    middle, size = 0.5 * (low + high), high - low
+    long = int(size[1] > size[0])
+    height = max(0.004, low[2] + 0.3 * size[2])
+    found = []
+    for side in (-1.0, 1.0):
+        jaw = box(1.1 * size[long], 0.03, height) if long == 0 else box(0.03, 1.1 * size[long], height)
+        at = [middle[0], middle[1], 0.0]
+        at[1 - long] += side * (0.5 * size[1 - long] + 0.0155)
+        found.append(jaw.transformed(RigidTransform(at)))
+    return found
+
+
+def without_spots(cloud_B: Floats, mesh_B: TriMesh, rng: np.random.Generator, count: int) -> Floats:
+    """The scan without round spots on the part, as a shiny face leaves them: each has a radius of 10 to 30 mm."""
+    left = cloud_B.copy()
+    low, high = mesh_B.bounds
+    on = cloud_B[((cloud_B > low - 0.002) & (cloud_B < high + 0.002)).all(axis=-1)]
+    for _ in range(count if len(on) else 0):
+        middle = on[rng.integers(len(on))]
+        left[np.linalg.norm(cloud_B - middle, axis=-1) < rng.uniform(0.01, 0.03)] = np.nan
+    return left
+
+
 def clutter(mesh_B: TriMesh, rng: np.random.Generator, count: int) -> list[TriMesh]:
     """Boxes, pipes and a fixture's clamps beside the part, none through it: each drawn anew until it is clear of its bounds."""
     low, high = mesh_B.bounds
@@ -122,11 +157,25 @@ def scan_scene(
     tilt_rad: float = math.radians(4.0),
     slant_rad: float = 0.35,
     spread_m: float = 0.05,
+    spots: int = 0,
+    on_side: bool = False,
+    in_vice: bool = False,
+    twice: bool = False,
 ) -> PartScene:
-    """A part among clutter under a scanner that hangs roughly above it; everything random follows from the seed."""
+    """A part among clutter under a scanner that hangs roughly above it; everything random follows from the seed.
+
+    spots: round holes in the scan of the part; twice: an equal part lies beside it.
+    """
     rng = np.random.default_rng([seed, 1801])
     on_blocks = rng.uniform() < 0.3
     X = standing(mesh, rng, tilt_rad, rng.uniform(0.01, 0.04) if on_blocks else 0.0, spread_m)
+    if on_side:
+        X = lying(mesh, rng, spread_m)
+    elif in_vice:
+        X = standing(mesh, np.random.default_rng([seed, 1802]), 0.0, 0.0, spread_m)
+        X = RigidTransform(RotationMatrix.MakeZRotation(0.5 * math.pi * int(rng.integers(4))), X.translation())
+        middle = 0.5 * np.sum(mesh.transformed(X).bounds, axis=0) - MIDDLE
+        X = RigidTransform(X.rotation(), X.translation() - [middle[0], middle[1], 0.0])
     mesh_B = mesh.transformed(X)
     around, slant = rng.uniform(-math.pi, math.pi), slant_rad * math.sqrt(rng.uniform())
     target = MIDDLE + np.array([0.0, 0.0, 0.02])
@@ -136,8 +185,12 @@ def scan_scene(
     )
     X_BC = looking_at(eye, target)
     X_BC = RigidTransform(X_BC.rotation() @ RotationMatrix.MakeZRotation(rng.uniform(-0.5, 0.5)), eye)
-    others = clutter(mesh_B, rng, objects) + clamps(mesh_B, rng, fingers)
-    return PartScene(cast([mesh_B, table(), *others], X_BC, scanner, seed), eye, X)
+    others = clutter(mesh_B, rng, objects) + clamps(mesh_B, rng, fingers) + (vice(mesh_B) if in_vice else [])
+    if twice:
+        wide = mesh_B.bounds[1, 0] - mesh_B.bounds[0, 0] + 0.02
+        others.append(mesh_B.transformed(RigidTransform([-wide if MIDDLE[0] < X.translation()[0] else wide, 0.0, 0.0])))
+    cloud = cast([mesh_B, table(), *others], X_BC, scanner, seed)
+    return PartScene(without_spots(cloud, mesh_B, rng, spots) if spots else cloud, eye, X)
 
 
 def block() -> TriMesh:

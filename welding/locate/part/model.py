@@ -50,6 +50,8 @@ class PartModel:
         self._scene = open3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.triangles.astype(np.uint32)))
         self.points, self.normals = mesh.sample(SAMPLES, np.random.default_rng(seed))
+        corners, area = mesh.vertices[mesh.triangles], np.linalg.norm(mesh.area_vectors, axis=1)
+        self.gravity = np.average(corners.mean(axis=1), axis=0, weights=area)
         self.center = 0.5 * mesh.bounds.sum(axis=0)
         self.radius = float(np.linalg.norm(mesh.vertices - self.center, axis=1).max())
 
@@ -76,7 +78,7 @@ class PartModel:
         hull = ConvexHull(self.mesh.vertices)
         corners = self.mesh.vertices[hull.simplices]
         area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        gravity = self.points.mean(axis=0)
+        gravity = self.gravity
         for normal, size in _grouped(hull.equations[:, :3], area):
             face = corners[hull.equations[:, :3] @ normal > 0.999].reshape(-1, 3)
             if size < 0.01 * area.sum() or not _above(face, normal, gravity):
@@ -89,7 +91,8 @@ class PartModel:
         for _, d in found:
             if len(kept) < MOST_DIRECTIONS and not any(d @ k > math.cos(math.radians(6.0)) for k in kept):
                 kept.append(d)
-        return kept
+        # A part without a flat side may lie in any way; its frame's axes are as good as others.
+        return kept or [sign * axis for axis in np.eye(3) for sign in (1.0, -1.0)]
 
     @cached_property
     def edges(self) -> SharpEdges:

@@ -31,6 +31,7 @@ COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
 FINE_PLACES, FINE_RIVALS = 10, 5
 NEAR_HINT_DEG = 40.0
+LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
 
 
@@ -82,6 +83,7 @@ def register_prepared(
 ) -> PartRegistration:
     """Register a prepared part to a prepared scan; see register_part."""
     config = config or PartConfig()
+    _check_size(scan, model)
     hint = X_BP_guess if X_BP_hint is None else X_BP_hint
     starts = _near_starts(scan, model, X_BP_guess) if X_BP_guess is not None else _starts(scan, model, config)
     fits = _fine(scan, model, starts, FINE_PLACES)
@@ -103,9 +105,20 @@ def register_prepared(
             rivals = [f for f in (best, *rivals) if f is not better[0]]
             best = better[0]
     _check_fit(best, config)
-    best, runner_up = _decided(best, rivals, scan, model, hint, matters_P, config)
     _check_known(best, model, matters_P, config)
+    best, runner_up = _decided(best, rivals, scan, model, hint, matters_P, config)
     return _result(best, runner_up, model, matters_P)
+
+
+def _check_size(scan: PreparedScan, model: PartModel) -> None:
+    """Raise PartNotFound where the part is far too large or too small to be seen in the scan."""
+    seen = float(np.linalg.norm(np.percentile(scan.coarse, 98, axis=0) - np.percentile(scan.coarse, 2, axis=0)))
+    size = 2.0 * model.radius
+    if size > LARGEST * seen or size < SMALLEST * scan.pitch_m:
+        raise PartNotFound(
+            f"The part is {size:.3g} m across, and the scan shows {seen:.3g} m with {1e3 * scan.pitch_m:.2g} mm between its points: "
+            "check the unit of the part's file."
+        )
 
 
 def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
@@ -207,6 +220,11 @@ def _check_fit(best: _Judged, config: PartConfig) -> None:
     if a.goes_on > config.max_goes_on:
         raise PartNotFound(
             f"The part does not fit the scan: at {100 * a.goes_on:.0f} % of its edges the face does not end; check which part this is and the file's unit."
+        )
+    if a.met < config.min_met:
+        raise PartNotFound(
+            f"The part does not fit the scan: only {100 * a.met:.0f} % of the rays that should meet it do, for something stands before it: "
+            "clear the view, or check which part this is."
         )
     if a.met < config.min_agreement * (1.0 - a.hidden) or a.passed > config.max_violation:
         raise PartNotFound(

@@ -27,7 +27,8 @@ class PartConfig:
     """Limits of the search and of the decision.
 
     min_points      fewest scan points on the part
-    min_agreement   smallest share of the predicted rays that meet the part where it is predicted
+    min_agreement   smallest share that meet the part where it is predicted, of the rays that nothing keeps from it
+    min_met         the same of all rays predicted to meet it
     max_violation   largest share that pass through it
     max_goes_on     largest share of the edges that should end a seen face beyond which it goes on
     min_seen        smallest share of the part's visible surface that the scan shows
@@ -40,6 +41,7 @@ class PartConfig:
 
     min_points: int = 250
     min_agreement: float = 0.72
+    min_met: float = 0.5
     max_violation: float = 0.13
     max_goes_on: float = 0.35
     min_seen: float = 0.35

@@ -30,7 +30,7 @@ class FreeDirection:
 
 def turned_poses(model: PartModel, X_BP: RigidTransform) -> list[RigidTransform]:
     """The pose turned about the part's own axes (its frame's and its principal ones) through its middle."""
-    middle = model.points.mean(axis=0)
+    middle = model.gravity
     _, axes = np.linalg.eigh(np.cov(model.points.T))
     candidates = [*np.eye(3), *axes.T]
     chosen: list[Floats] = []
