@@ -15,6 +15,7 @@ from weldcal.welding.seam.curve import SeamCurve
 
 CLEARANCE_M = 0.001
 NEAR_TIP_M = 0.030  # finger and wire are in the joint by design: only what lies farther from the tip is checked
+ACROSS_COS = 0.5  # a wall within 60 degrees of square to the way stops the tool
 SAMPLES = 20_000
 STEP_M = 0.02
 

@@ -190,7 +190,7 @@ def run_registration_study(
 
 def _summed(rows: list[dict[str, object]]) -> dict[str, object]:
     def of(some: list[dict[str, object]], key: str) -> Floats:
-        return np.array([float(row[key]) for row in some if isinstance(row.get(key), float)])
+        return np.array([value for row in some if isinstance(value := row.get(key), float)])
 
     kinds = {
         "clutter": [row for row in rows if row["kind"] in SCENES],
