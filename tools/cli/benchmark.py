@@ -143,6 +143,18 @@ def seeds(
     return run_seeds(scenario, call.farm(folder), range(call.seed, call.seed + runs))
 
 
+@command("benchmark fleet", options=FARM)
+def fleet(
+    call: Call,
+    cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 25,
+    datasets: Annotated[int, option("--datasets", "N", "Datasets of each.", min=1)] = 8,
+) -> Mapping[str, object]:
+    """Write made cells, some of which move, drift or break, and count what `weldcal fleet` says of them."""
+    from weldcal.tools.studies.fleet.study import run_fleet_study
+
+    return run_fleet_study(call.farm(call.folder("benchmark", "fleet")), cells, datasets, call.seed)
+
+
 @command("benchmark arms", options=FARM)
 def arms(
     call: Call,
@@ -253,6 +265,7 @@ COMMANDS = (
     profiler,
     cell,
     seeds,
+    fleet,
     arms,
     fuzz_files,
     robot_faults,
