@@ -155,6 +155,18 @@ def fleet(
     return run_fleet_study(call.farm(call.folder("benchmark", "fleet")), cells, datasets, call.seed)
 
 
+@command("benchmark replay", options=FARM)
+def replays(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20,
+) -> Outcome:
+    """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for bit."""
+    from weldcal.tools.studies.replay.study import run_replays
+
+    summary, table = run_replays(call.farm(call.folder("benchmark", "replay")), runs, call.seed)
+    return Outcome(summary, text=table)
+
+
 @command("benchmark arms", options=FARM)
 def arms(
     call: Call,
@@ -266,6 +278,7 @@ COMMANDS = (
     cell,
     seeds,
     fleet,
+    replays,
     arms,
     fuzz_files,
     robot_faults,
