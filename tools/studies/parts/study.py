@@ -135,7 +135,7 @@ def _scanned(mesh: TriMesh, rng: np.random.Generator) -> TriMesh:
     import open3d
 
     fine: Any = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(mesh.vertices), open3d.utility.Vector3iVector(mesh.triangles)
+        open3d.utility.Vector3dVector(mesh.vertices.copy()), open3d.utility.Vector3iVector(mesh.triangles.copy())
     )
     fine.merge_close_vertices(1e-7)
     while len(fine.triangles) < MESH_TRIANGLES:
