@@ -86,6 +86,6 @@ def test_a_wall_that_bends_away_is_no_obstacle() -> None:
 
 
 def test_the_end_of_a_low_wall_that_the_tip_has_climbed_is_no_obstacle() -> None:
-    """30 mm before its end the bent rail is left through its end face: that face is met from within."""
-    rail = ring(0.2, 0.26, 0.0, 0.006, (-0.6, 0.42))
+    """The bent rail is left through its end face 50 mm further on: that face is met from within."""
+    rail = ring(0.2, 0.26, 0.0, 0.006, (-0.6, 0.52))
     check_ends(rail, RigidTransform(), along_ring(0.2, -1.0, (-0.5, 0.27)), TOOL.chord_m, TOOL.tip_radius_m)
