@@ -27,10 +27,10 @@ RIM_SIGMA = 0.40  # of one of them, in point distances
 RIM_GATE, STILL_M = 4.5, 2e-5  # in point distances; a step smaller than this is the last with one gate
 LEAST_OWN, BEHIND_M = 0.15, 0.002  # share of the rims with something behind them; how far behind
 SHARED_M = 0.08
-RIM_FLOOR = 0.10  # error common to the points of one edge, in point distances
+RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
-SIGMA_FLOOR_M, CREEP_M = 2e-5, 2e-5
+SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
 MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 
@@ -256,28 +256,33 @@ def _acts_at(equations: Equations) -> Floats:
     return np.cross(equations.rows[:, 3:], equations.rows[:, :3])
 
 
+def _patches(equations: Equations, size: float) -> npt.NDArray[np.int64]:
+    """Numbers (N,) of the patches that equations belong to, told apart by place and by direction."""
+    key = np.hstack([np.floor(_acts_at(equations) / size), np.round(-2.0 * equations.rows[:, 3:])]).astype(np.int64)
+    return np.asarray(np.unique(key, axis=0, return_inverse=True)[1]).ravel()
+
+
 def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: float) -> Floats:
     """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge, share.
 
-    The points of a patch of PATCHES point distances are one cluster, those of an edge another (Liang and Zeger 1986); an edge
-    has at least an error of RIM_FLOOR, and the surface one of CREEP_M in every patch.
+    The points of a patch of PATCHES point distances are one cluster, those of a piece of an edge another (Liang and Zeger 1986).
+    Added are errors that a patch or a side has in common: CREEP_M in a patch, SLOW_M in one of SHARED_M, RIM_FLOOR on a side.
     """
     w = tukey(surface.residual, max(4.0 * sigma, 0.0004)) / (SURFACE_RATIO * sigma**2)
     A = np.zeros((7, 7))
     A[:6, :6] = (surface.rows * w[:, None]).T @ surface.rows
     A[6, 6] = 1.0 / (INSET_SIGMA * pitch) ** 2
     G = np.hstack([surface.rows, np.zeros((len(w), 1))]) * w[:, None]
-    # Patches are told apart by place and by direction.
-    key = np.hstack([np.floor(_acts_at(surface) / (PATCHES * pitch)), np.round(-2.0 * surface.rows[:, 3:])]).astype(
-        np.int64
-    )
-    _, patch = np.unique(key, axis=0, return_inverse=True)
-    patch = patch.ravel()
+    patch = _patches(surface, PATCHES * pitch)
     score = np.zeros((int(patch.max()) + 1, 7))
-    lean = np.zeros_like(score)
     np.add.at(score, patch, G * surface.residual[:, None])
-    np.add.at(lean, patch, G)
-    middle = score.T @ score + CREEP_M**2 * (lean.T @ lean) + np.diag([0.0] * 6 + [A[6, 6]])
+    middle = score.T @ score + np.diag([0.0] * 6 + [A[6, 6]])
+    # Errors of the surface and the scanner that the residuals do not show, for the pose follows them.
+    for size, error in ((PATCHES * pitch, CREEP_M), (SHARED_M, SLOW_M)):
+        patch = _patches(surface, size)
+        lean = np.zeros((int(patch.max()) + 1, 7))
+        np.add.at(lean, patch, G)
+        middle += error**2 * (lean.T @ lean)
     if rims is not None:
         J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
         v = (
