@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import typer
 
 from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outcome, command, option
@@ -31,7 +30,7 @@ def verify(
     The exit code is 1 where the verdict is "do not use".
     """
     from weldcal.tools.commands.verify import verify_dataset
-    from weldcal.tools.outcomes.calibration import DO_NOT, interval_rows
+    from weldcal.tools.outcomes.calibration import DO_NOT
     from weldcal.tools.outcomes.poses import pose_rows
 
     report = verify_dataset(
@@ -48,6 +47,6 @@ def verify(
     return Outcome(
         summary,
         values={"verdict": verdict.verdict, "because": verdict.reason, **summary},
-        rows=interval_rows("error", np.array([p.error_mm for p in report.poses])) | pose_rows(report.result.X_BC),
+        rows=report.interval_rows | pose_rows(report.result.X_BC),
         problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )

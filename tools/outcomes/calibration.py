@@ -199,6 +199,11 @@ class VerifyReport:
         return error_summary(np.array([p.error_mm for p in self.poses]))
 
     @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: median and 95 % of the errors, each with its bootstrap interval."""
+        return interval_rows("error", np.array([p.error_mm for p in self.poses]))
+
+    @property
     def tilt_deg(self) -> dict[str, float | None]:
         """Median and 95th percentile of the tilt, deg; None where no normal was seen."""
         found = error_summary(np.array([p.tilt_deg for p in self.poses], dtype=float))
