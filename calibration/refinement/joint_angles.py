@@ -45,7 +45,7 @@ def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: 
     turn = log_rotation(np.swapaxes(reached[:, :3, :3], 1, 2) @ stated[:, :3, :3])
     if off_m > _SAME_M or float(np.linalg.norm(turn, axis=1).max()) > _SAME_RAD:
         raise InputError(
-            f"The joint angles lead a nominal {arm.name} up to {1e3 * off_m:.2f} mm from the stated poses: check the robot, radians and a "
-            "TCP, or use poses computed with the nominal kinematics."
+            f"The joint angles lead this {arm.name} up to {1e3 * off_m:.2f} mm from the stated poses. A real controller computes with the "
+            "factory calibration of its arm: give that file (--kinematics). Else check the robot's name, radians, and that the TCP is zero."
         )
     return q

@@ -1,7 +1,7 @@
 """Decides on errors of the arm by nested held-out errors, and writes the kinematics that follow from them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.common.yaml import yaml_dump
@@ -10,16 +10,21 @@ from pydrake.math import RollPitchYaw, RotationMatrix
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
-from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
 from weldcal.calibration.eye_on_base.observations import corrected_observation
-from weldcal.calibration.eye_on_base.scanner_fit import CorrectionEstimate, correction_of, from_holes
+from weldcal.calibration.eye_on_base.scanner_fit import from_holes
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, pose
 from weldcal.calibration.planning.observability import turn_deg
-from weldcal.calibration.refinement.kinematics_fit import KINDS, ArmErrors, KinematicsFit, arm_errors, fit_kinematics
-from weldcal.calibration.refinement.local_choice import GAIN
+from weldcal.calibration.refinement.kinematics_fit import (
+    KINDS,
+    FactoryPrior,
+    KinematicsFit,
+    arm_errors,
+    fit_kinematics,
+)
+from weldcal.calibration.refinement.local_choice import GAIN, calibrate_plain
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arms.kinematics import LINKS
 from weldcal.models.arrays import Array
@@ -29,10 +34,13 @@ LEAST = 12
 """Poses from which on errors of an arm are sought."""
 LEAST_TURN_DEG = 20.0
 """Turn between poses from which on they show in more than one orientation."""
+WRONG_FILE = 8.0
+"""Times a factory's errors: the prior of an arm whose kinematics are those of another robot, or nominal."""
 _FOLDS = 10
 _MIXED = (
     1.5  # growth of a standard deviation by the scanner's factors at which an error counts as not separable from them
 )
+_NAMED = 6  # errors in a sentence; the JSON object has all
 _SHOWN = 0.8  # of the prior: below it the poses have said something
 
 
@@ -57,12 +65,16 @@ def choose_kinematics(
     patterns: Mapping[str, HolePattern],
     estimate: CalibrationEstimate,
     *,
+    correct_scanner: bool = True,
     seed: int = 0,
 ) -> KinematicsChoice:
     """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and decide on them.
 
     In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if the mean falls by
-    5 %. Raises TooFewPoses below twelve, InputError for poses of one orientation or an unknown ``kind``.
+    5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The prior
+    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
+
+    Raises TooFewPoses below twelve, InputError for poses of one orientation or an unknown ``kind``.
     """
     if kind not in KINDS:
         raise InputError(f"There is no refinement '{kind}' of an arm; choose one of {', '.join(KINDS)}.")
@@ -77,26 +89,40 @@ def choose_kinematics(
             f"The orientation varies by {turned:.1f} degrees only: errors of the arm (--refine {kind}) cannot be told from the scanner's; turn "
             f"and tilt the flange by {LEAST_TURN_DEG:.0f} degrees and more, or use --refine local."
         )
-    sought = arm_errors(arm, kind)
-    fit = _fit(observations, q, sought, estimate, patterns)
-    plain, refined, tilt = np.full((3, n), np.nan)
+    factory = arm_errors(arm, kind)
+    none = replace(factory, which=factory.which[:0], scale=factory.scale[:0], names=())
+    candidates = [none, factory, arm_errors(arm, kind, FactoryPrior().times(WRONG_FILE))]
+    plain = np.full(n, np.nan)
+    new_m, new_tilt = np.full((2, len(candidates), n), np.nan)
     place = np.random.default_rng(seed).permutation(n)
     for f in range(_FOLDS):
         test = np.sort(place[f::_FOLDS])
         rest = np.setdiff1d(np.arange(n), test)
         train, new = [observations[i] for i in rest], [observations[i] for i in test]
         try:
-            X, c = calibrate_by_choice(train, patterns, seed=seed)
+            X, c = calibrate_plain(train, patterns, correct_scanner, seed)
         except InputError:
             continue
         plain[test] = position_errors(X, [corrected_observation(c, o) for o in new])
-        without = fit_kinematics(train, q[rest], sought, X, _shape(c), holes=from_holes(train, patterns))
-        seen = without.applied(new, q[test])
-        refined[test], tilt[test] = position_errors(without.X_BC, seen), tilt_errors(without.X_BC, seen)
+        for k, sought in enumerate(candidates):
+            holes = from_holes(train, patterns)
+            without = fit_kinematics(train, q[rest], sought, X, c, holes=holes, fixed_scanner=not correct_scanner)
+            seen = without.applied(new, q[test])
+            new_m[k, test], new_tilt[k, test] = position_errors(without.X_BC, seen), tilt_errors(without.X_BC, seen)
     known = np.isfinite(plain)
-    before, after = (1e3 * float(np.mean(e[known])) if known.any() else float("nan") for e in (plain, refined))
-    accepted = bool(after < GAIN * before)
-    said = f"mean held-out error {before:.3f} mm without, {after:.3f} mm with them"
+    before, *means = (1e3 * float(np.mean(e[known])) if known.any() else float("nan") for e in (plain, *new_m))
+    large = means[2] < GAIN * means[1]
+    used = 2 if large else 1
+    refined, tilt, after = new_m[used], new_tilt[used], means[used]
+    holes = from_holes(observations, patterns)
+    start = estimate.scanner or ScannerCorrection()
+    fit = fit_kinematics(
+        observations, q, candidates[used], estimate.X_BC, start, holes=holes, fixed_scanner=not correct_scanner
+    )
+    # the same fit without errors of the arm: what the scanner's part of it gains is not theirs
+    scanner = means[0]
+    accepted = bool(after < GAIN * min(before, scanner))
+    said = f"mean held-out error {before:.3f} mm without, {after:.3f} mm with them ({scanner:.3f} mm with the scanner's part alone)"
     if not accepted:
         return KinematicsChoice(
             fit,
@@ -106,8 +132,13 @@ def choose_kinematics(
             False,
             f"Errors of the arm ({kind}) do not help: {said}. The plain calibration is used.",
         )
-    mixed = _mixed(observations, q, fit)
+    mixed = _mixed(observations, q, fit) if correct_scanner else []
     why = f" Not separable from the scanner's distortion: {', '.join(mixed)}." if mixed else ""
+    if large:
+        why += (
+            f" They are larger than a factory calibration leaves (a prior {WRONG_FILE:.0f} times as wide predicts the held-out poses better): the "
+            "kinematics are probably those of another robot."
+        )
     sentence = f"Errors of the arm are applied ({_told(fit)}): {said}.{why} X_BC belongs to the arm with the kinematics of the file written beside it."
     return KinematicsChoice(fit, plain, refined, tilt, True, sentence)
 
@@ -154,21 +185,6 @@ def kinematics_text(fit: KinematicsFit, note: str) -> str:
     return f"# {note}\n{yaml_dump({'kinematics': links})}"
 
 
-def _shape(correction: ScannerCorrection) -> ScannerCorrection:
-    return correction_of(correction.values - np.eye(len(correction.values))[0], correction.field_m)
-
-
-def _fit(
-    observations: Sequence[Observation],
-    q: Array,
-    sought: ArmErrors,
-    estimate: CalibrationEstimate,
-    patterns: Mapping[str, HolePattern],
-) -> KinematicsFit:
-    holes: CorrectionEstimate | None = from_holes(observations, patterns)
-    return fit_kinematics(observations, q, sought, estimate.X_BC, estimate.scanner or ScannerCorrection(), holes=holes)
-
-
 def _mixed(observations: Sequence[Observation], q: Array, fit: KinematicsFit) -> list[str]:
     """Errors that would be known much better if the scanner were known."""
     sure = fit_kinematics(observations, q, fit.errors, fit.X_BC, fit.correction, fixed_scanner=True)
@@ -183,12 +199,18 @@ def _mixed(observations: Sequence[Observation], q: Array, fit: KinematicsFit) ->
 
 
 def _told(fit: KinematicsFit) -> str:
-    rows = zip(fit.errors.names, fit.values, fit.sigma, fit.errors.scale, strict=True)
+    """The errors that differ from zero by two sigma, the surest first."""
+    rows = sorted(
+        zip(fit.errors.names, fit.values, fit.sigma, strict=True), key=lambda row: -abs(float(row[1] / row[2]))
+    )
     found = [
         f"{name} {1e3 * v:+.2f} +- {1e3 * s:.2f} mm"
         if "shift" in name
         else f"{name} {np.degrees(v):+.3f} +- {np.degrees(s):.3f} deg"
-        for name, v, s, prior in rows
-        if s < _SHOWN * prior
+        for name, v, s in rows
+        if abs(v) > 2.0 * s
     ]
-    return ", ".join(found) or "none better than its prior"
+    return (
+        ", ".join(found[:_NAMED]) + (f" and {len(found) - _NAMED} more" if len(found) > _NAMED else "")
+        or "none beyond two sigma"
+    )

@@ -22,6 +22,8 @@ _ITERATIONS = 5
 _STEP = 1e-3  # of the prior, for differences
 _USUAL_SCANNER = np.array([2e-3, 1.5e-2, 1.5e-2])  # as in the correction from few poses
 _BEND_PRIOR = 0.05  # 1/m^2 and 1/m^3: a tenth of a per cent at the edge of the field
+_FACE_M = 0.03  # a face is seen that far around its centre
+_LEAST_ORDER = 2  # the arm's errors must not stand in for bends that a plain calibration does without
 _FLOOR_M, _FLOOR_RAD = 1e-6, 1e-6
 _PARTS = ("turn x", "turn y", "offset", "shift x", "shift y", "shift z")
 
@@ -33,6 +35,10 @@ class FactoryPrior:
     offset_rad: float = float(np.radians(0.035))
     turn_rad: float = float(np.radians(0.02))
     length_m: float = 1.2e-4
+
+    def times(self, factor: float) -> FactoryPrior:
+        """The same, wider by this factor."""
+        return FactoryPrior(factor * self.offset_rad, factor * self.turn_rad, factor * self.length_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +56,13 @@ class ArmErrors:
         out[self.which] = u * self.scale
         return out.reshape(-1, 6)
 
-    def moved(self, q: Array, X_BR: Array, u: Array) -> Array:
-        """Stated poses (n, 4, 4) at joint angles q (n, joints) as the arm with these errors reaches them."""
-        plain = flange_poses(self.arm, q, np.zeros((self.arm.n, 6)))
-        return np.asarray(flange_poses(self.arm, q, self.errors(u)) @ inverse(plain) @ X_BR)
+    def after(self, q: Array, X_BR: Array) -> Array:
+        """What stated poses (n, 4, 4) add to those of the arm without errors at joint angles q (n, joints)."""
+        return np.asarray(inverse(flange_poses(self.arm, q, np.zeros((self.arm.n, 6)))) @ X_BR)
+
+    def moved(self, q: Array, after: Array, u: Array) -> Array:
+        """Poses (n, 4, 4) that the arm with these errors reaches at joint angles q (n, joints)."""
+        return np.asarray(flange_poses(self.arm, q, self.errors(u)) @ after)
 
 
 def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmErrors:
@@ -97,8 +106,8 @@ class KinematicsFit:
 
     def applied(self, observations: Sequence[Observation], q: Array) -> list[Observation]:
         """Observations with corrected centres and normals and with the poses that the corrected arm reaches."""
-        data = _arrays(observations)
-        poses = self.errors.moved(q, data.X, self.u)
+        data = _arrays(observations, self.errors, q)
+        poses = self.errors.moved(q, data.after, self.u)
         c, m = _corrected(self.correction, data)
         return [
             replace(
@@ -113,12 +122,12 @@ class KinematicsFit:
     def sensitivity(self, observations: Sequence[Observation], q: Array) -> Array:
         """Derivatives (n, 6, 6 + K + k) of each scan's position (m) and normal (rad) by everything that is estimated."""
         n = len(observations)
-        J = _jacobian(self, _arrays(observations), q)
+        J = _jacobian(self, _arrays(observations, self.errors, q), q)
         return np.concatenate([J[: 3 * n].reshape(n, 3, -1), J[3 * n :].reshape(n, 3, -1)], axis=1)
 
     def predicted(self, observations: Sequence[Observation], q: Array) -> Array:
         """Covariance (n, 3, 3) m^2 of the position error at new poses: of everything estimated, and of the scan itself."""
-        data = _arrays(observations)
+        data = _arrays(observations, self.errors, q)
         J = self.sensitivity(observations, q)[:, :3]
         R = self.X_BC.rotation().matrix()
         own = R @ data.own @ R.T + self.sigma_position_m**2 * np.eye(3)
@@ -127,7 +136,7 @@ class KinematicsFit:
 
 @dataclass(frozen=True)
 class _Data:
-    X: Array
+    after: Array
     c: Array
     m: Array
     has: NDArray[np.bool_]
@@ -150,10 +159,11 @@ def fit_kinematics(
     Gauss-Newton with derivatives by differences; maximum a posteriori (arm: ``errors``' prior; scanner: what scanners usually are off). The
     scatters of positions and normals follow from the residuals (Helmert).
     """
-    data = _arrays(observations)
-    order, k = correction.order, len(errors.which)
-    terms = TERMS[order]
-    start = correction.values - np.eye(terms)[0]
+    data = _arrays(observations, errors, q)
+    k, terms = len(errors.which), TERMS[correction.order if fixed_scanner else max(correction.order, _LEAST_ORDER)]
+    start = np.zeros(terms)
+    start[: len(correction.values)] = correction.values - np.eye(len(correction.values))[0]
+    correction = correction_of(start, correction.field_m or _field(data))
     mean, information = _scanner_prior(terms, holes, fixed_scanner, start)
     prior = np.zeros((6 + terms + k,) * 2)
     prior[6 : 6 + terms, 6 : 6 + terms] = information
@@ -162,7 +172,7 @@ def fit_kinematics(
     n, seen = len(data.c), int(data.has.sum())
     A = np.eye(6 + terms + k)
     for _ in range(_ITERATIONS):
-        J, e = _jacobian(found, data, q), _residuals(found, data, q)
+        J, e = _jacobian(found, data, q), _residuals(found, data, errors.moved(q, data.after, found.u))
         vague = np.sqrt(1.0 + np.trace(data.own, axis1=1, axis2=2) / 3.0 / found.sigma_position_m**2)
         w = np.concatenate(
             [np.repeat(1.0 / (found.sigma_position_m * vague), 3), np.full(3 * n, 1.0 / found.sigma_normal_rad)]
@@ -189,6 +199,12 @@ def fit_kinematics(
     return found
 
 
+def _field(data: _Data) -> tuple[float, float, float, float]:
+    """Smallest and largest x, then y, of the faces (m): where bends hold."""
+    x, y = data.c[:, 0], data.c[:, 1]
+    return float(x.min()) - _FACE_M, float(x.max()) + _FACE_M, float(y.min()) - _FACE_M, float(y.max()) + _FACE_M
+
+
 def _scanner_prior(terms: int, holes: CorrectionEstimate | None, fixed: bool, start: Array) -> tuple[Array, Array]:
     """Mean (K,) and information (K, K) of the factors' change before the robot is asked."""
     sigma = np.concatenate([_USUAL_SCANNER, np.full(max(terms - 3, 0), _BEND_PRIOR)])[:terms]
@@ -202,10 +218,10 @@ def _scanner_prior(terms: int, holes: CorrectionEstimate | None, fixed: bool, st
     return np.asarray(np.linalg.solve(information, pull), dtype=np.float64), information
 
 
-def _arrays(observations: Sequence[Observation]) -> _Data:
+def _arrays(observations: Sequence[Observation], errors: ArmErrors, q: Array) -> _Data:
     zero = np.zeros(3)
     return _Data(
-        np.array([o.X_BR.GetAsMatrix4() for o in observations]),
+        errors.after(q, np.array([o.X_BR.GetAsMatrix4() for o in observations])),
         np.array([o.p_CR for o in observations], dtype=float),
         np.array([zero if o.n_C is None else o.n_C for o in observations], dtype=float),
         np.array([o.n_C is not None for o in observations]),
@@ -218,10 +234,9 @@ def _corrected(correction: ScannerCorrection, data: _Data) -> tuple[Array, Array
     return correction.points(data.c), correction.normals(data.c, safe)
 
 
-def _residuals(f: KinematicsFit, data: _Data, q: Array) -> Array:
-    """Positions (3 n) m, then what the seen normals lie beside the stated ones (3 n) rad, in the base."""
+def _residuals(f: KinematicsFit, data: _Data, X: Array) -> Array:
+    """Positions (3 n) m, then what the seen normals lie beside those of the reached poses X (n, 4, 4) (3 n) rad, in the base."""
     c, m = _corrected(f.correction, data)
-    X = f.errors.moved(q, data.X, f.u)
     R = f.X_BC.rotation().matrix()
     e_p = c @ R.T + f.X_BC.translation() - X[:, :3, 3]
     e_n = np.where(data.has[:, None], np.cross(X[:, :3, 2], m @ R.T), 0.0)
@@ -244,7 +259,8 @@ def _jacobian(f: KinematicsFit, data: _Data, q: Array) -> Array:
     J = np.zeros((6 * n, 6 + terms + k))
     c, m = _corrected(f.correction, data)
     R = f.X_BC.rotation().matrix()
-    normal = f.errors.moved(q, data.X, f.u)[:, :3, 2]
+    poses = f.errors.moved(q, data.after, f.u)
+    normal = poses[:, :3, 2]
     J[: 3 * n, :3] = -skew(c @ R.T).reshape(-1, 3)
     J[: 3 * n, 3:6] = np.tile(np.eye(3), (n, 1))
     turned = -skew(normal) @ skew(m @ R.T)
@@ -252,5 +268,8 @@ def _jacobian(f: KinematicsFit, data: _Data, q: Array) -> Array:
     for j in range(6, 6 + terms + k):
         step = np.zeros(6 + terms + k)
         step[j] = 1e-5 if j < 6 + terms else _STEP
-        J[:, j] = (_residuals(_moved(f, step), data, q) - _residuals(_moved(f, -step), data, q)) / (2.0 * step[j])
+        ends = [_moved(f, s) for s in (step, -step)]
+        reached = [poses, poses] if j < 6 + terms else [f.errors.moved(q, data.after, e.u) for e in ends]
+        plus, minus = (_residuals(e, data, X) for e, X in zip(ends, reached, strict=True))
+        J[:, j] = (plus - minus) / (2.0 * step[j])
     return J

@@ -70,11 +70,7 @@ def choose_local(
         held = set(test.tolist())
         rest = [o for i, o in enumerate(observations) if i not in held]
         try:
-            X, c = (
-                calibrate_by_choice(rest, patterns, seed=seed)
-                if correct_scanner
-                else (_rigid(rest, seed), ScannerCorrection())
-            )
+            X, c = calibrate_plain(rest, patterns, correct_scanner, seed)
             without = fit_field([o.X_BR for o in rest], held_out_residuals(rest, patterns, X, c, seed))
         except InputError:
             continue
@@ -95,6 +91,15 @@ def choose_local(
             "falls to zero and the stated region grows. X_BC and its exports are those of the plain calibration."
         )
     return LocalChoice(field, plain, tilt, local, squares, accepted, said)
+
+
+def calibrate_plain(
+    observations: Sequence[Observation], patterns: Mapping[str, HolePattern], correct_scanner: bool, seed: int
+) -> tuple[RigidTransform, ScannerCorrection]:
+    """X_BC and correction that `calibrate` finds without a refinement, choices included."""
+    if correct_scanner:
+        return calibrate_by_choice(observations, patterns, seed=seed)
+    return _rigid(observations, seed), ScannerCorrection()
 
 
 def held_out_residuals(

@@ -206,7 +206,22 @@ def held_out(
     return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress)))
 
 
-COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect, held_out)
+@command("benchmark flange-arm")
+def arm(
+    call: Call,
+    worlds: Annotated[int, option("--worlds", "N", "Number of simulated cells.", min=1)] = 40,
+    kind: Annotated[
+        str, option("--kind", "KIND", "links: all errors of the arm; joints: zeros of the joints only.")
+    ] = "links",
+) -> Outcome:
+    """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge both on new scans."""
+    from weldcal.tools.studies.flange.tables import arm_table
+    from weldcal.tools.studies.flange.wrong_arm import run_wrong_arm
+
+    return _figures(call, arm_table(run_wrong_arm(worlds, call.seed, kind, call.progress)))
+
+
+COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect, held_out, arm)
 
 
 def _figures(call: Call, table: "Table") -> Outcome:

@@ -48,6 +48,14 @@ def calibrate(
             "Of a dataset: local (a field of what the calibration leaves), joints or links (errors of the arm; needs its joint angles).",
         ),
     ] = None,
+    kinematics: Annotated[
+        Path | None,
+        option(
+            "--kinematics",
+            "FILE",
+            "With --refine joints or links: the arm's factory calibration, which the controller uses.",
+        ),
+    ] = None,
     axis_turn: Annotated[
         float | None,
         option(
@@ -89,6 +97,7 @@ def calibrate(
             axis_turn_deg=axis_turn,
             poses=poses,
             refine=refine,
+            kinematics=kinematics,
         )
         algorithm1 = report.algorithm1
         rows = {} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence}

@@ -47,6 +47,7 @@ def calibrate_dataset(
     axis_turn_deg: float | None = None,
     poses: str | None = None,
     refine: str | None = None,
+    kinematics: Path | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
@@ -54,7 +55,8 @@ def calibrate_dataset(
     ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole pattern about the
     flange axis; with it, one to three scans that show the holes are enough. ``poses`` ("FROM:TO", ids, either may be left
     out) takes the scans from one id to another, in the order of the dataset. ``refine``: "local" adds a field of what the calibration
-    leaves, "joints" or "links" errors of the arm, each applied where nested held-out errors fall. A cloud that cannot be used is refused and
+    leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
+    errors fall. A cloud that cannot be used is refused and
     reported, as long as enough remain. Nothing is written unless the calibration succeeded.
 
     Raises:
@@ -94,7 +96,14 @@ def calibrate_dataset(
         refined = refine_calibration(
             refine,
             Refinable(
-                data, observations, seen.patterns, estimate, tuple(corrected), scanner, robot or data.header.robot
+                data,
+                observations,
+                seen.patterns,
+                estimate,
+                tuple(corrected),
+                scanner,
+                robot or data.header.robot,
+                kinematics,
             ),
             correct_scanner=correct_scanner and not few,
             seed=seed,
@@ -160,6 +169,7 @@ def calibrate_dataset(
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
+        arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
     )

@@ -1,6 +1,7 @@
 """The refinements of `weldcal calibrate --refine`: chooses by nested held-out errors and says what was chosen."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from weldcal.calibration.refinement.joint_angles import require_joint_angles
 from weldcal.calibration.refinement.kinematics_choice import choose_kinematics, kinematics_text, with_kinematics
 from weldcal.calibration.refinement.local_choice import choose_local, with_field
 from weldcal.calibration.refinement.local_field import LocalField
+from weldcal.calibration.refinement.stated_arm import arm_document
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arms.kinematics import known_arms
 from weldcal.models.errors import InputError
@@ -26,7 +28,7 @@ KINEMATICS_FILE = "kinematics.yaml"
 @dataclass(frozen=True, eq=False)
 class Refinable:
     """A plain calibration: its data, observations as seen and as corrected, their hole patterns, the estimate, the verdict on the scanner
-    and the name of the robot."""
+    and the name of the robot, with the file of its kinematics where it has one."""
 
     data: Dataset
     observations: list[Observation]
@@ -35,6 +37,7 @@ class Refinable:
     corrected: tuple[Observation, ...]
     scanner: SelfCalibration | None
     robot: str
+    kinematics: Path | None = None
 
     @property
     def inliers(self) -> list[Observation]:
@@ -45,7 +48,7 @@ class Refinable:
 @dataclass(frozen=True, eq=False)
 class Refined:
     """What became of it: estimate and observations; the field, or the text of the kinematics file and the scanner correction that goes with
-    it, where one was accepted; the sentence that says so or why not; ``numbers`` for the JSON object."""
+    it and the document of the errors, where one was accepted; the sentence that says so or why not; ``numbers`` for the JSON object."""
 
     estimate: CalibrationEstimate
     observations: tuple[Observation, ...]
@@ -54,6 +57,7 @@ class Refined:
     field: LocalField | None = None
     kinematics: str = ""
     correction: ScannerCorrection | None = None
+    arm: dict[str, Any] | None = None
     numbers: dict[str, Any] | None = None
 
     def document(self, kind: str) -> dict[str, Any]:
@@ -67,7 +71,7 @@ def refine_calibration(kind: str, plain: Refinable, *, correct_scanner: bool, se
     Raises TooFewPoses and other InputErrors where the data cannot be refined in this way.
     """
     if kind != "local":
-        return _arm(kind, plain, seed)
+        return _arm(kind, plain, correct_scanner, seed)
     accepted = None if plain.scanner is None else plain.scanner.accepted
     correction = accepted or ScannerCorrection()
     choice = choose_local(
@@ -79,19 +83,26 @@ def refine_calibration(kind: str, plain: Refinable, *, correct_scanner: bool, se
     )
 
 
-def _arm(kind: str, plain: Refinable, seed: int) -> Refined:
+def _arm(kind: str, plain: Refinable, correct_scanner: bool, seed: int) -> Refined:
     if plain.robot not in known_arms():
         raise InputError(
             f"Errors of the arm (--refine {kind}) are written as Universal Robots' kinematics: name one of {', '.join(known_arms())} with "
             "--robot, or use --refine local."
         )
-    arm = load_chain(plain.robot)
+    arm = load_chain(plain.robot, plain.kinematics)
     ids = [o.id for o in plain.observations]
     given = {p.id: p.X_BR for p in plain.data.pairs} or plain.data.poses
     stated = np.array([given[id].GetAsMatrix4() for id in ids])
     q = require_joint_angles(plain.data, ids, arm, stated)
     choice = choose_kinematics(
-        plain.inliers, q[plain.estimate.inliers], arm, kind, plain.patterns, plain.estimate, seed=seed
+        plain.inliers,
+        q[plain.estimate.inliers],
+        arm,
+        kind,
+        plain.patterns,
+        plain.estimate,
+        correct_scanner=correct_scanner,
+        seed=seed,
     )
     found = choice.fit
     numbers = {
@@ -109,5 +120,12 @@ def _arm(kind: str, plain: Refinable, seed: int) -> Refined:
     estimate, moved = with_kinematics(plain.estimate, choice, plain.observations, q)
     text = kinematics_text(found, f"{plain.robot}, refined by weldcal calibrate --refine {kind}")
     return Refined(
-        estimate, tuple(moved), choice.sentence, True, kinematics=text, correction=found.correction, numbers=numbers
+        estimate,
+        tuple(moved),
+        choice.sentence,
+        True,
+        kinematics=text,
+        correction=found.correction if correct_scanner else None,
+        arm=arm_document(found),
+        numbers=numbers,
     )

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.stats import f as fisher
 
-from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.scanner_fit import from_motion
+from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
+from weldcal.calibration.eye_on_base.scanner_fit import from_holes
+from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.joints import flange_poses
@@ -19,6 +19,7 @@ from weldcal.calibration.refinement.kinematics_fit import (
     arm_errors,
     fit_kinematics,
 )
+from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import Chain, load_chain
 from weldcal.models.arrays import Array
 from weldcal.systems.runner import Progress, no_progress
@@ -26,6 +27,7 @@ from weldcal.systems.runner import Progress, no_progress
 SCANS, NEW = 20, 25
 _CENTRE_M, _NORMAL_RAD = 2e-5, float(np.radians(0.01))  # of a scan's fit, and of the arm's repeatability, per axis
 _REPEAT_M = 2e-5
+_REACH_M, _RATIO = 0.025, 3e-4  # radius of the hole circle, and how well a scan measures its size
 _MIDDLE = np.radians([20.0, -80.0, 105.0, -115.0, -90.0, 30.0])
 _SPREAD_RAD = np.array([0.5, 0.4, 0.5, 0.8, 0.8, 1.5])
 _CANDIDATES = 250
@@ -33,21 +35,24 @@ _CANDIDATES = 250
 
 @dataclass(frozen=True)
 class Station:
-    """One world: stated observations at joint angles q, and the errors (n, 6) of the arm that no estimate is given."""
+    """One world: stated observations at joint angles q with their hole circles, and the errors (n, 6) of the arm that no estimate is given."""
 
     observations: list[Observation]
     q: Array
     new: list[Observation]
     new_q: Array
     errors: Array
+    patterns: dict[str, HolePattern]
 
 
-def station(seed: int, scans: int = SCANS, new: int = NEW, *, planned: bool = True, links: bool = True) -> Station:
+def station(
+    seed: int, scans: int = SCANS, new: int = NEW, *, planned: bool = True, links: bool = True, size: float = 1.0
+) -> Station:
     """A UR10e with offsets of 0.02 to 0.05 degrees and axes off by 0.1 to 0.3 mm and 0.02 degrees, and a scanner 0.65 m from its flange with
     a scale error of 0.1 %, a gradient of 0.05 % per 100 mm and a radial distortion that the correction's polynomial has only in part.
 
-    ``planned``: the scans are those of 250 candidates that tell most about the arm (greedy, D-optimal); the new ones are random.
-    Without ``links`` only the joints' zeros are wrong.
+    ``planned``: the scans are those of 250 candidates that tell most (informative_poses); the new ones are random.
+    Without ``links`` only the joints' zeros are wrong; ``size`` multiplies the errors.
     """
     rng, arm = np.random.default_rng(seed), load_chain("ur10e")
     errors = np.zeros((arm.n, 6))
@@ -57,21 +62,18 @@ def station(seed: int, scans: int = SCANS, new: int = NEW, *, planned: bool = Tr
     errors[:, 3:] = rng.uniform(1e-4, 3e-4, (arm.n, 3)) / np.sqrt(3.0) * sign[:, 3:]
     if not links:
         errors[:, [0, 1, 3, 4, 5]] = 0.0
+    errors *= size
     flange = flange_poses(arm, _MIDDLE[None], np.zeros((arm.n, 6)))[0]
     X_BC = flange @ pose(
         exp_rotation(np.array([np.pi, 0.0, 0.0])) @ exp_rotation(0.2 * rng.normal(size=3)), np.array([0.0, 0.0, 0.65])
     )
     q = _visible(arm, X_BC, rng, _CANDIDATES + new)
-    chosen = _planned(arm, X_BC, q[:_CANDIDATES], scans) if planned else np.arange(scans)
+    guess = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BC[:3, :3]), X_BC[:3, 3])
+    chosen = informative_poses(arm, guess, q[:_CANDIDATES], scans) if planned else np.arange(scans)
     bend = (1e-3 * rng.normal(), 5e-3 * rng.normal(size=2), 3e-3 * rng.normal())
     one, other = q[chosen], q[_CANDIDATES:]
-    return Station(
-        _seen(arm, one, errors, X_BC, bend, rng, "p"),
-        one,
-        _seen(arm, other, errors, X_BC, bend, rng, "n"),
-        other,
-        errors,
-    )
+    seen, patterns = _seen(arm, one, errors, X_BC, bend, rng, "p")
+    return Station(seen, one, _seen(arm, other, errors, X_BC, bend, rng, "n")[0], other, errors, patterns)
 
 
 def _visible(arm: Chain, X_BC: Array, rng: np.random.Generator, n: int) -> Array:
@@ -87,34 +89,6 @@ def _visible(arm: Chain, X_BC: Array, rng: np.random.Generator, n: int) -> Array
     return np.array(out[:n])
 
 
-def _planned(arm: Chain, X_BC: Array, q: Array, n: int) -> NDArray[np.int64]:
-    """Indices (n,) of the candidates that fix camera, scanner and arm best."""
-    plain = _observations(arm, q, X_BC)
-    every = arm_errors(arm, "links")
-    X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X_BC[:3, :3]), X_BC[:3, 3])
-    fit = KinematicsFit(X, ScannerCorrection(), np.zeros(len(every.which)), np.eye(1), 1e-4, 1e-3, 1.0, every)
-    J = fit.sensitivity(plain, q)
-    J[:, :3] /= 1e-4
-    J[:, 3:] /= 1e-3
-    terms = J.shape[2] - 6 - len(every.which)
-    A = np.diag(np.concatenate([np.full(6, 1e-2), np.full(terms, 1e2), np.ones(len(every.which))]))
-    chosen: list[int] = []
-    for _ in range(n):
-        V = np.linalg.inv(A)
-        gain = np.linalg.slogdet(np.eye(6) + J @ V @ np.swapaxes(J, 1, 2))[1]
-        gain[chosen] = -np.inf
-        best = int(np.argmax(gain))
-        chosen.append(best)
-        A = A + J[best].T @ J[best]
-    return np.array(chosen)
-
-
-def _observations(arm: Chain, q: Array, X_BC: Array) -> list[Observation]:
-    stated = flange_poses(arm, q, np.zeros((arm.n, 6)))
-    X = inverse(X_BC) @ stated
-    return [_observation(str(i), stated[i], X[i, :3, 3], X[i, :3, 2]) for i in range(len(q))]
-
-
 def _observation(id: str, stated: Array, p: Array, z: Array) -> Observation:
     X = RigidTransform(RotationMatrix.ProjectToRotationMatrix(stated[:3, :3]), stated[:3, 3])
     return Observation(id, X, p, z / np.linalg.norm(z), _CENTRE_M**2 * np.eye(3), _NORMAL_RAD)
@@ -128,18 +102,22 @@ def _seen(
     bend: tuple[float, Array, float],
     rng: np.random.Generator,
     name: str,
-) -> list[Observation]:
-    """What the wrong scanner sees of the wrong arm, beside the poses that the controller states."""
+) -> tuple[list[Observation], dict[str, HolePattern]]:
+    """What the wrong scanner sees of the wrong arm, and of its hole circles, beside the poses that the controller states."""
     stated, real = flange_poses(arm, q, np.zeros((arm.n, 6))), flange_poses(arm, q, errors)
-    out = []
+    out, patterns = [], {}
     for i, X in enumerate(inverse(X_BC) @ real):
         p = X[:3, 3] + _REPEAT_M * rng.normal(size=3)
         # the face is where the scanner puts the ends of two of its diameters
-        a, b = (_distorted(p + 0.03 * X[:3, k], bend) - _distorted(p - 0.03 * X[:3, k], bend) for k in (0, 1))
+        a, b = (_distorted(p + _REACH_M * X[:3, k], bend) - _distorted(p - _REACH_M * X[:3, k], bend) for k in (0, 1))
+        ratio = float(np.linalg.norm(a) + np.linalg.norm(b)) / (4.0 * _REACH_M) + _RATIO * rng.normal()
         z = np.cross(a, b)
         z = exp_rotation(_NORMAL_RAD * rng.normal(size=3)) @ (z / np.linalg.norm(z))
-        out.append(_observation(f"{name}{i}", stated[i], _distorted(p, bend) + _CENTRE_M * rng.normal(size=3), z))
-    return out
+        c = _distorted(p, bend) + _CENTRE_M * rng.normal(size=3)
+        out.append(_observation(f"{name}{i}", stated[i], c, z))
+        X_CR = RigidTransform(RotationMatrix.ProjectToRotationMatrix(X[:3, :3]), c)
+        patterns[out[-1].id] = HolePattern(np.zeros((4, 3)), np.zeros(4), c, X_CR, ratio, 0.0)
+    return out, patterns
 
 
 def _distorted(p: Array, bend: tuple[float, Array, float]) -> Array:
@@ -160,15 +138,13 @@ class Found:
 
 
 def study_station(world: Station, kind: str = "links", prior: FactoryPrior | None = None) -> Found:
-    """Calibrate one world plain (scanner corrected by motion) and refined, and judge both on its new scans."""
+    """Calibrate one world plain, with the choice of the scanner's correction, and refined, and judge both on its new scans."""
     arm = load_chain("ur10e")
     sought: ArmErrors = arm_errors(arm, kind, prior)
-    plain = from_motion(world.observations, {}, order=2, usual=True)
-    assert plain.X_BC is not None
-    nothing = KinematicsFit(
-        plain.X_BC, plain.correction, np.zeros(len(sought.which)), np.eye(1), 1e-4, 1e-3, 1.0, sought
-    )
-    fit = fit_kinematics(world.observations, world.q, sought, plain.X_BC, plain.correction)
+    X_BC, correction = calibrate_by_choice(world.observations, world.patterns)
+    nothing = KinematicsFit(X_BC, correction, np.zeros(len(sought.which)), np.eye(1), 1e-4, 1e-3, 1.0, sought)
+    holes = from_holes(world.observations, world.patterns)
+    fit = fit_kinematics(world.observations, world.q, sought, X_BC, correction, holes=holes)
     before, after = (
         np.array([f.X_BC @ o.p_CR - o.p_BR for o in f.applied(world.new, world.new_q)]) for f in (nothing, fit)
     )
