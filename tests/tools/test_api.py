@@ -14,6 +14,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 import weldcal
 from tests.places import ROOT
 from weldcal.models.errors import InputError
+from weldcal.tools.commands import new
 from weldcal.tools.commands.new import write_example
 
 BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/python.md").read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -22,7 +23,10 @@ CELL = "extends: calibrate_only\njob: {maximum_time_s: 3.0}\nscanner: {width: 41
 
 @pytest.fixture(scope="module")
 def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_example(tmp_path_factory.mktemp("example") / "my_scans", 1)
+    fewer = f"{new.SMALL}\ncalibration: {{minimum_scans: 4, maximum_scans: 5, required_error_mm: 5.0}}"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(new, "SMALL", fewer)
+        return write_example(tmp_path_factory.mktemp("example") / "my_scans", 1)
 
 
 @pytest.fixture
