@@ -198,12 +198,15 @@ def held_out(
     call: Call,
     dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least sixteen scans.")],
     draws: Annotated[int, option("--draws", "N", "Number of random halves.", min=1)] = 20,
+    local: Annotated[
+        bool, switch("--local", "Calibrate from two thirds with --refine local, and judge it on the others.")
+    ] = False,
 ) -> Outcome:
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
     from weldcal.tools.studies.flange.held_out import study_halves
     from weldcal.tools.studies.flange.tables import halves_table
 
-    return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress)))
+    return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress, local=local)))
 
 
 @command("benchmark flange-arm")
