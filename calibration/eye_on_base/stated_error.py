@@ -17,13 +17,19 @@ _LEAST_FREE = 3.0
 
 
 def stated_median_limit(
-    result: CalibrationResult, observations: Sequence[Observation], correction: ScannerCorrection | None
+    result: CalibrationResult,
+    observations: Sequence[Observation],
+    correction: ScannerCorrection | None,
+    scatter_m: Array | None = None,
+    shared: tuple[Array, Array] | None = None,
 ) -> float | None:
     """Limit (mm) that the median error at these new observations (n) exceeds by chance in FALSE_ALARM of verifications.
 
     The median of n errors has no closed form where all share the calibration's own error, so it is drawn: one error of pose
     and scanner correction from their joint covariance for all scans, and for each scan the spread of robot and scanner and the
     noise of its fit. The spread was estimated from few residuals, so its square is drawn as well (scaled inverse chi-square). A
+    calibration with a local field states the spread (n,) m per axis that this leaves at each scan: ``scatter_m``; one with errors of the
+    arm what these contribute: ``shared``, derivatives (n, 3, p) of the positions and the covariance (p, p) in place of the result's. A
     calibration states its held-out errors besides: their 95 % percentile counts where it is larger. None where it states no
     error at all. Deterministic.
     """
@@ -37,6 +43,8 @@ def stated_median_limit(
         joint = None  # of another correction
     J = np.array([_sensitivity(result, o, correction if joint is not None else None) for o in observations])
     whole = result.covariance if joint is None else joint
+    if shared is not None:
+        J, whole = shared
     values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     used = sum(p.used for p in result.poses)
@@ -48,8 +56,9 @@ def stated_median_limit(
     for first in range(0, _DRAWS, 1000):
         k, n = slice(first, first + 1000), len(observations)
         shared = np.einsum("nij,kj->kni", J, rng.standard_normal((1000, root.shape[1])) @ root.T)
-        sigma = 1e-3 * result.sigma_position_mm * np.sqrt(free / rng.chisquare(free, 1000))
-        scatter = sigma[:, None, None] * rng.standard_normal((1000, n, 3))
+        own_sigma = 1e-3 * result.sigma_position_mm * np.ones(n) if scatter_m is None else scatter_m
+        sigma = own_sigma * np.sqrt(free / rng.chisquare(free, 1000))[:, None]
+        scatter = sigma[:, :, None] * rng.standard_normal((1000, n, 3))
         noise = np.einsum("nij,knj->kni", fits, rng.standard_normal((1000, n, 3)))
         medians[k] = np.median(np.linalg.norm(shared + scatter + noise, axis=2), axis=1)
     limit = 1e3 * float(np.quantile(medians, 1.0 - FALSE_ALARM))

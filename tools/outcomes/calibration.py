@@ -9,7 +9,7 @@ import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.nested import mean_interval
+from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence
@@ -81,12 +81,18 @@ class CalibrationReport:
     advice: tuple[str, ...] = ()
     patterns: dict[str, HolePattern] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    refinement: dict[str, Any] | None = None
 
     @property
     def work_point(self) -> WorkPoint:
         """The expected error at the middle of the flange centres that were used."""
         used = [o.p_BR for o, keep in zip(self.observations, self.estimate.inliers, strict=True) if keep]
         return work_point_error(self.estimate, np.mean(used, axis=0))
+
+    @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: the held-out figures, each with its bootstrap interval."""
+        return interval_rows("held-out error", 1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
 
     @property
     def held_out_interval_mm(self) -> tuple[float, float] | None:
@@ -118,6 +124,7 @@ class CalibrationReport:
             "notes": list(self.notes),
             "work_point": self.work_point.document(),
             "features": feature_residuals(self.fits, self.patterns),
+            **({} if self.refinement is None else {"refinement": self.refinement}),
             "algorithm1": None
             if a is None
             else {
@@ -129,6 +136,17 @@ class CalibrationReport:
                 "unseen": list(a.unseen),
             },
         }
+
+
+def interval_rows(what: str, errors_mm: Array) -> dict[str, str]:
+    """Median and 95 % of errors (n,) mm, each beside the interval of as many new ones; {} for fewer than four."""
+    rows = {}
+    for name, share in (("median", 0.5), ("95 %", 0.95)):
+        interval = bootstrap_interval(errors_mm, share)
+        if interval is not None:
+            reported = float(np.nanquantile(errors_mm, share))
+            rows[f"{what}, {name}"] = f"{reported:.3f} mm (bootstrap 95 %: {interval[0]:.3f} to {interval[1]:.3f})"
+    return rows
 
 
 @dataclass(frozen=True)
@@ -179,6 +197,11 @@ class VerifyReport:
     def position_error_mm(self) -> dict[str, float]:
         """Median, mean, 95th percentile and largest position error, mm."""
         return error_summary(np.array([p.error_mm for p in self.poses]))
+
+    @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: median and 95 % of the errors, each with its bootstrap interval."""
+        return interval_rows("error", np.array([p.error_mm for p in self.poses]))
 
     @property
     def tilt_deg(self) -> dict[str, float | None]:
