@@ -32,6 +32,3 @@ html_copy_source = False
 html_show_sphinx = False
 pygments_style = "tango"
 pygments_dark_style = "native"
-
-# Pages that are still being written are named in the navigation by a pattern.
-suppress_warnings = ["toc.empty_glob"]
