@@ -15,7 +15,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.documents.blocks import Block, blocks_of
+from tests.documents.blocks import Block, blocks_of, is_command
 from tests.documents.command_lines import EMULATED, ROBOT, CommandLine, process
 from tests.documents.props import lay_out, needs_data
 from tests.documents.yaml_blocks import check_yaml
@@ -55,7 +55,7 @@ class Page:
     def execute(self, block: Block) -> Iterator[Executed]:
         """Execute a block; a listing that nothing reads is left out."""
         if block.kind == "shell":
-            made = tuple(name for line in block.commands() for name in CommandLine(line).makes)
+            made = tuple(name for line in filter(is_command, block.commands()) for name in CommandLine(line).makes)
             for line in block.commands():
                 yield self._timed(block, line, lambda line=line: self._command(CommandLine(line), made))
         elif block.kind in ("yaml", "toml"):
@@ -72,7 +72,7 @@ class Page:
         return Executed(block.page, block.line, text, how, time.monotonic() - start, said)
 
     def _command(self, line: CommandLine, made: tuple[str, ...]) -> str:
-        if line.elsewhere:
+        if line.elsewhere or not is_command(line.text):
             return ELSEWHERE
         if self.skip(line.name) or (needs_data(line.name) and not SHARED_DATA.exists()):
             return LEFT_OUT

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import typer.main
 from typer.testing import CliRunner
 
 import weldcal
-from tests.documents.blocks import Block, all_blocks, blocks_of
+from tests.documents.blocks import DOCUMENTS, FENCE, Block, all_blocks, blocks_of, is_command
 from tests.documents.command_lines import SHORT, CommandLine
 from tests.documents.execution import FAILED, WRITTEN, Page, entry_points_of
 from tests.documents.props import PROPS, lay_out, named_in, needs_data
@@ -22,7 +23,9 @@ from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
 
 BLOCKS = all_blocks()
-LINES = [CommandLine(line) for block in BLOCKS if block.kind == "shell" for line in block.commands()]
+LINES = [
+    CommandLine(line) for block in BLOCKS if block.kind == "shell" for line in block.commands() if is_command(line)
+]
 # One of each: the same command on another page, or with another --out, is the same.
 ONCE = {line.name.partition(" --out ")[0]: line for line in LINES if line.cheap}
 SNIPPETS = [block for block in BLOCKS if block.kind == "yaml"]
@@ -113,8 +116,28 @@ def test_each_other_block_is_a_listing() -> None:
     assert len(others) == LISTINGS, [named(block) for block in others]
 
 
-def test_each_line_of_a_block_of_shell_runs_weldcal() -> None:
-    assert [line.text for line in LINES if not line.text.startswith(("weldcal ", "./tools/run "))] == []
+def test_each_line_of_a_block_of_shell_runs_weldcal_or_installs_an_extra_of_it() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    known = {f"pip install 'weldcal[{extra}]'" for extra in extras}
+    others = [line for block in BLOCKS if block.kind == "shell" for line in block.commands() if not is_command(line)]
+    assert [line for line in others if line not in known] == []
+
+
+def test_the_sentences_that_the_page_of_failures_quotes_are_those_of_the_program() -> None:
+    page = (ROOT / "docs/how_to/when_it_fails.md").read_text()
+    table = page.partition("## A command refuses")[2].partition("Exit code 1")[0]
+    quoted = [
+        text for row in re.findall(r"^\| (\".+?) \|", table, re.MULTILINE) for text in re.findall(r'"([^"]+)"', row)
+    ]
+    folders = ("models", "calibration", "welding", "systems", "tools")
+    sources = "\n".join(file.read_text() for folder in folders for file in (ROOT / folder).rglob("*.py"))
+    assert len(quoted) > 6
+    assert [text for text in quoted if text not in sources] == []
+
+
+def test_no_command_stands_in_a_block_that_is_not_found() -> None:
+    hidden = re.compile(r"^(?: {4}|\t)\$? ?(?:weldcal|\./tools/run) ", re.MULTILINE)
+    assert [page.name for page in DOCUMENTS if hidden.search(FENCE.sub("", page.read_text()))] == []
 
 
 def test_every_short_form_is_of_a_line_and_can_be_typed() -> None:
