@@ -18,7 +18,7 @@ from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces.part import WeldPart
+from weldcal.models.workpieces.part import WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
@@ -115,11 +115,14 @@ class SeamPlanner(BackgroundSystem):
         if X_BC is None:
             status: CalibrationStatus = self._status.Eval(context)
             X_BC, correction = status.X_BC, status.correction
-        return self.plan(scan, X_BC, correction)
+        planning = dc.replace(self._planning, workpiece=numbered(self._planning.workpiece, job.seam))
+        return self.plan(planning, scan, X_BC, correction)
 
-    def plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+    def plan(
+        self, planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
+    ) -> Answer[PlannedSeam]:
         """Start the plan from this scan."""
-        return self.background.ask(plan_seam, self._planning, scan, X_BC, correction)
+        return self.background.ask(plan_seam, planning, scan, X_BC, correction)
 
 
 def plan_seam(
@@ -281,9 +284,11 @@ class DrawnSeamPlanner(SeamPlanner):
         - planned_seam
     """
 
-    def plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+    def plan(
+        self, planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
+    ) -> Answer[PlannedSeam]:
         """Start the plan; of the scan only its number is used."""
-        return self.background.ask(plan_drawn_seam, self._planning, scan.sequence)
+        return self.background.ask(plan_drawn_seam, planning, scan.sequence)
 
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:
