@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
@@ -32,6 +32,7 @@ from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
+CLEAR_OF_PART_M = 0.002
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -73,6 +74,8 @@ class SeamPlanning:
             self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m
         )
         check_weld_path(self, seam, q_start, q_above, q_retract)
+        if X_BP is not None:
+            check_moves(self, X_BP, q_above, q_retract)
         return q_start, q_above, q_retract
 
 
@@ -196,6 +199,24 @@ def check_weld_path(
             raise SeamObstructed(
                 f"The arm or its tool would come too close to '{name}' on its way along the seam: move it or the workpiece, or "
                 "correct surroundings in the scenario."
+            )
+
+
+def check_moves(
+    planning: SeamPlanning, X_BP: RigidTransform, q_above: NDArray[np.float64], q_retract: NDArray[np.float64]
+) -> None:
+    """Check that the moves to the seam and from it, to other seams too, keep clear of the part.
+
+    Raises:
+        SeamObstructed: the arm or its tool would touch it.
+    """
+    part = Surroundings((Obstacle("part", planning.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
+    bodies = arm_bodies(planning.arm, planning.tool.capsules())
+    for way, a, b in (("to the seam", planning.q_near, q_above), ("from the seam", q_retract, planning.q_near)):
+        if part.touched_on_path(planning.arm, bodies, a, b):
+            raise SeamObstructed(
+                f"The arm or its tool would touch the part on its way {way}: set welding.clearance_mm larger than "
+                f"{1e3 * planning.clearance_m:.0f}, choose another home_deg, or turn the part."
             )
 
 
