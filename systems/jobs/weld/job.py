@@ -7,6 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, OutputPort
 
 from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.models.workpieces.part import seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
@@ -81,6 +82,7 @@ class WeldJob(AddedJob):
     welding: WeldingPorts
     ports: JobPorts
     maximum_time_s: float
+    seams: int = 1
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
         """The calibrator's status in a context of the whole Diagram."""
@@ -102,17 +104,20 @@ class WeldJob(AddedJob):
 
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
-        phase = self.command(root).phase
+        command = self.command(root)
+        phase, seams = command.phase, self.seams
         share = SHARES.get(phase, 0.05)
         if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
         if phase == "weld":
-            begun = next((t for name, t, _ in phases if name == "weld"), root.get_time())
+            begun = next((t for name, t, _ in reversed(phases) if name == "weld"), root.get_time())
             seam_mm = self.scenario.welding.seam_length_mm
             length = WHOLE_SEAM_M if seam_mm is None else seam_mm * 1e-3
             expected = (length + 0.06) / self.servo_config.weld_speed_m_s + 5.0
             share += 0.58 * min(float(root.get_time() - begun) / expected, 1.0)
+        if seams > 1 and share > SHARES["park"]:
+            share = SHARES["park"] + (1.0 - SHARES["park"]) * (command.seam + share) / seams
         return phase.replace("_", " "), share
 
 
@@ -187,7 +192,8 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         }
         ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results)
         return WeldJob(
-            scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports, times.maximum_time_s
+            *(scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports),
+            *(times.maximum_time_s, times.seams),
         )
 
 
@@ -235,7 +241,8 @@ def _add_welding(
     )
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
-    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config))
+    others = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
+    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, others))
     wiring.connect(
         servo,
         planned_seam=planner.GetOutputPort("planned_seam"),

@@ -1,6 +1,7 @@
 """WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip deformation."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -37,6 +38,7 @@ class ServoReport(Message):
     state: WeldingState | None = None
     time: float = np.nan  # of the tick, on the robot's clock
     X_BT: RigidTransform | None = None  # measured at that tick
+    plan: int = 0  # sequence of the plan that is followed
 
 
 class WeldingVelocityServo(LeafSystem):
@@ -63,9 +65,11 @@ class WeldingVelocityServo(LeafSystem):
     `arc_established` (1; unconnected: always) is 0 the tool stands.
     """
 
-    def __init__(self, arm: ArmModel, tool: WeldingTool, config: ServoConfig) -> None:
+    def __init__(
+        self, arm: ArmModel, tool: WeldingTool, config: ServoConfig, others: Sequence[ServoConfig] = ()
+    ) -> None:
         super().__init__()
-        self._arm, self._tool, self._config = arm, tool, config
+        self._arm, self._tool, self._configs = arm, tool, (config, *others)
         self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
         self._deformation = self.DeclareAbstractInputPort("deformation", AbstractValue.Make(Deformation()))
         self._q = self.DeclareVectorInputPort("position_measured", 6)
@@ -85,7 +89,10 @@ class WeldingVelocityServo(LeafSystem):
         old: ServoReport = context.get_abstract_state(self._state).get_value()
         planned: PlannedSeam = self._seam.Eval(context)
         if job.mode != "weld" or planned.seam is None:
-            if old.phase not in ("IDLE", Phase.DONE, Phase.FAULT):
+            if old.phase == Phase.DONE and planned.sequence > old.plan and planned.seam is not None:
+                # The next seam is planned: what is reported of the last one would end it at once.
+                state.get_mutable_abstract_state(self._state).set_value(ServoReport())
+            elif old.phase not in ("IDLE", Phase.DONE, Phase.FAULT):
                 report = dc.replace(old, phase="IDLE", torch_on=False, command=None)
                 state.get_mutable_abstract_state(self._state).set_value(report)
             return
@@ -93,9 +100,17 @@ class WeldingVelocityServo(LeafSystem):
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()
-        memory, command = welding_step(memory, sample, planned.seam, self._config)
+        config = self._configs[min(job.seam, len(self._configs) - 1)]
+        memory, command = welding_step(memory, sample, planned.seam, config)
         report = ServoReport(
-            str(command.phase), command.torch_on, command.reason, command, memory, sample.time, sample.X_BT
+            str(command.phase),
+            command.torch_on,
+            command.reason,
+            command,
+            memory,
+            sample.time,
+            sample.X_BT,
+            planned.sequence,
         )
         state.get_mutable_abstract_state(self._state).set_value(report)
 
