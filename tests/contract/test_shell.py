@@ -250,6 +250,23 @@ def test_test_runs_pytest_in_the_project(machine: Machine) -> None:
     assert "browser" not in finished.stderr
 
 
+def test_docs_adds_the_developers_tools_and_builds_the_site_from_any_folder(machine: Machine) -> None:
+    finished = machine.run("docs")
+    assert finished.returncode == 0, finished.stderr
+    assert machine.locks() == ["requirements.lock", "requirements-dev.lock"]
+    said = finished.stdout.splitlines()
+    assert said[0] == f"in {machine.project}"
+    assert said[-2:] == ["<docs>", "<build/docs>"]
+    assert {"<sphinx>", "<--fail-on-warning>"} <= set(said)
+    assert f"{machine.project}/build/docs/index.html" in finished.stderr
+
+
+def test_docs_check_executes_the_blocks_and_builds_nothing(machine: Machine) -> None:
+    said = machine.run("docs", "--check", "arms").stdout.splitlines()
+    assert said[-4:] == ["<-m>", "<tests.documents>", "<--check>", "<arms>"]
+    assert "<sphinx>" not in said
+
+
 def test_all_tests_run_side_by_side_in_one_run(machine: Machine) -> None:
     said = machine.run("test").stdout.splitlines()
     assert said.count("<pytest>") == 1

@@ -1,8 +1,7 @@
-"""The examples of docs/python.md run, and an example of a dataset is one that they can use."""
+"""The functions of `import weldcal`; the examples of docs/python.md run in tests/documents."""
 
 from __future__ import annotations
 
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,55 +11,27 @@ import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 
 import weldcal
-from tests.places import ROOT
+from tests.documents.scans import write_scans
 from weldcal.models.errors import InputError
-from weldcal.tools.commands import new
 from weldcal.tools.commands.new import write_example
 
-BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs/python.md").read_text(encoding="utf-8"), flags=re.DOTALL)
-CELL = "extends: calibrate_only\njob: {maximum_time_s: 3.0}\nscanner: {width: 412, height: 308}\n"  # held after 3 s
 
-
-@pytest.fixture(scope="module")
-def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    fewer = f"{new.SMALL}\ncalibration: {{minimum_scans: 4, maximum_scans: 5, required_error_mm: 5.0}}"
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(new, "SMALL", fewer)
-        return write_example(tmp_path_factory.mktemp("example") / "my_scans", 1)
-
-
-@pytest.fixture
-def place(example: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with everything that the examples name."""
-    (tmp_path / "my_scans").symlink_to(example)
-    (tmp_path / "other_scans").symlink_to(example)
-    (tmp_path / "my_cell.yaml").write_text(CELL)
+def test_pairs_of_poses_give_the_camera() -> None:
     rng = np.random.default_rng(0)
     X, Y = (RigidTransform(RollPitchYaw(rng.uniform(-1.0, 1.0, 3)), rng.uniform(-0.5, 0.5, 3)) for _ in "XY")
     robot = [RigidTransform(RollPitchYaw(rng.uniform(-0.6, 0.6, 3)), rng.uniform(-0.5, 0.5, 3)) for _ in range(12)]
-    camera = [(F @ X).InvertAndCompose(Y).GetAsMatrix4() for F in robot]
-    np.savez(tmp_path / "pairs.npz", A=[F.GetAsMatrix4() for F in robot], B=camera, X=X.GetAsMatrix4())
+    camera = np.array([(F @ X).InvertAndCompose(Y).GetAsMatrix4() for F in robot])
+    found = weldcal.hand_eye(np.array([F.GetAsMatrix4() for F in robot]), camera).poses["X"]
+    assert found.GetAsMatrix4() == pytest.approx(X.GetAsMatrix4(), abs=1e-6)
+
+
+def test_nothing_is_kept_where_no_folder_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def test_every_example_runs_and_has_at_most_eight_lines(place: Path) -> None:
-    known: dict[str, object] = {}
-    for block in BLOCKS:
-        assert len(block.splitlines()) <= 8, block
-        exec(compile(block, "docs/python.md", "exec"), known)
-    X = weldcal.hand_eye(*(np.load("pairs.npz")[k] for k in "AB")).poses["X"]
-    assert X.GetAsMatrix4() == pytest.approx(np.load("pairs.npz")["X"], abs=1e-6)
-    assert (place / "my_result" / "calibration.yaml").exists()
-    assert (place / "my_run" / "recording.html").exists()
-    assert known["summary"]["state"] == "held"  # type: ignore[index]
-
-
-def test_nothing_is_kept_where_no_folder_is_given(place: Path) -> None:
-    before = sorted(place.iterdir())
+    write_scans(tmp_path / "my_scans", 8, 0)
+    before = sorted(tmp_path.rglob("*"))
     found = weldcal.calibrate("my_scans", correct_scanner=False)
     assert found.estimate.inliers.sum() >= 4
-    assert sorted(place.iterdir()) == before
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_importing_weldcal_loads_nothing_else_and_shows_its_functions() -> None:

@@ -64,6 +64,22 @@ def part_welds(
     return Outcome(summary)
 
 
+@command("benchmark part-registration")
+def part_registration(
+    call: Call,
+    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
+    scenes: Annotated[int, option("--scenes", "N", "Scenes with clutter, without a guess.", min=0)] = 40,
+    plans: Annotated[int, option("--plans", "N", "Plans of each part's seam, seeds from --seed on.", min=0)] = 3,
+    refusals: Annotated[int, option("--refusals", "N", "Scenes of each subject that must be refused.", min=0)] = 3,
+) -> Outcome:
+    """Register twelve parts from STEP files in simulated scans, plan their seams, and compare both with the truth."""
+    from weldcal.tools.studies.parts.study import run_registration_study
+
+    folder = call.folder("benchmark", "part-registration")
+    first, second, third = (range(call.seed, call.seed + count) for count in (scenes, plans, refusals))
+    return Outcome(run_registration_study(folder, first, second, third, part, call.progress))
+
+
 @command("benchmark hand-eye")
 def hand_eye(
     call: Call,
@@ -153,6 +169,18 @@ def fleet(
     from weldcal.tools.studies.fleet.study import run_fleet_study
 
     return run_fleet_study(call.farm(call.folder("benchmark", "fleet")), cells, datasets, call.seed)
+
+
+@command("benchmark replay", options=FARM)
+def replays(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20,
+) -> Outcome:
+    """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for bit."""
+    from weldcal.tools.studies.replay.study import run_replays
+
+    summary, table = run_replays(call.farm(call.folder("benchmark", "replay")), runs, call.seed)
+    return Outcome(summary, text=table)
 
 
 @command("benchmark arms", options=FARM)
@@ -259,6 +287,7 @@ COMMANDS = (
     tablet,
     seam_planning,
     part_welds,
+    part_registration,
     hand_eye,
     hand_eye_cells,
     mountings,
@@ -266,6 +295,7 @@ COMMANDS = (
     cell,
     seeds,
     fleet,
+    replays,
     arms,
     fuzz_files,
     robot_faults,

@@ -1,0 +1,34 @@
+"""Sphinx configuration of the documentation; `./tools/run docs` builds it into build/docs."""
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent / "_extensions"))
+
+project = "weldcal"
+author = "The weldcal developers"
+project_copyright = author
+language = "en"
+
+# command_reference writes the reference of all commands from the program itself.
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "command_reference"]
+source_suffix = {".md": "markdown"}
+exclude_patterns = ["_extensions"]
+
+# Links to headings, as GitHub makes them.
+myst_heading_anchors = 4
+
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+# The reference shows `weldcal.calibrate`, not the module that holds it.
+add_module_names = True
+
+# The search index is part of the pages: no server and no network is needed.
+html_theme = "furo"
+html_title = "weldcal"
+html_copy_source = False
+html_show_sphinx = False
+pygments_style = "tango"
+pygments_dark_style = "native"

@@ -1,0 +1,111 @@
+"""How a command line of a page is executed: at once, with the long ones, in a short form, as a server, or elsewhere."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from dataclasses import dataclass
+
+ROBOT, EMULATED = "192.168.56.101", "127.30.0.9"  # the robot of the pages, and the emulated one in its place
+
+# Commands that take less than some seconds and start no simulation, by their first words.
+CHEAP = (
+    *("robots", "schema", "part", "tool check", "print-board", "verify", "profiler edge", "profiler sphere"),
+    *(
+        "tablet calibrate",
+        "profiler seam",
+        "profiler compensate",
+        "hand-eye ax-xb",
+        "hand-eye ax-yb",
+        "hand-eye axb-ycz",
+    ),
+)
+# They run until they are interrupted.
+SERVERS = ("emulate-cell", "emulate-ur", "tablet serve")
+# Executed by another command than a check of these pages.
+ELSEWHERE = {
+    "test": "the test suite itself",
+    "docs": "the build of these pages itself",
+}
+# What is long is shortened: a pattern of the line, and its short form. The long form runs with `--full`.
+SHORT = (
+    (r"demo( s_groove| straight_groove)?$", r"demo --scenario short.yaml"),
+    (r"demo --scenario (straight_groove|s_groove|my_cell/cell\.yaml)", r"demo --scenario short.yaml"),
+    (r"demo (--robot|--record|--seed)", r"demo --scenario short.yaml \1"),
+    (r"(benchmark hand-eye) --data \S+", r"\1 --quick"),
+    (r"(benchmark mountings) --runs 3", r"\1 --runs 1 --scenario eye_on_base"),
+    (r"benchmark robot-faults$", "benchmark robot-faults --sequences 1 --seconds 5"),
+    (r"benchmark robot$", "benchmark robot --minutes 0.2"),
+    (r"(benchmark flange-live) --seeds 12 --redraws 200", r"\1 --seeds 1 --redraws 5 --scans 4"),
+    (r"(benchmark flange-honesty) --runs 500", r"\1 --runs 10"),
+    (r"benchmark seam-planning --runs 5", "benchmark seam-planning --runs 1 --preset phoxi_m --no-troubles"),
+    (r"reproduce flange (\S+)", r"reproduce flange \1 --quick"),
+    (r"reproduce profiler$", "reproduce profiler --quick"),
+    (r"reproduce profiler-seeds$", "reproduce profiler-seeds --seeds 2"),
+    (r"reproduce tablet$", "reproduce tablet --trials 4"),
+)
+
+
+@dataclass(frozen=True)
+class CommandLine:
+    """A line of a page that runs weldcal."""
+
+    text: str
+
+    @property
+    def words(self) -> list[str]:
+        """Its words after `weldcal` or `./tools/run`."""
+        return shlex.split(self.text, comments=True)[1:]
+
+    @property
+    def name(self) -> str:
+        """The line without the program's name: the same for `weldcal` and `./tools/run`."""
+        return shlex.join(self.words)
+
+    def begins(self, *names: str) -> bool:
+        """Whether the command is one of these."""
+        return any(self.words[: len(name.split())] == name.split() for name in names)
+
+    @property
+    def elsewhere(self) -> str:
+        """By what else it is executed; empty: by a check of the pages."""
+        return ELSEWHERE.get(self.words[0], "")
+
+    @property
+    def server(self) -> bool:
+        """Whether it runs until it is interrupted."""
+        return self.begins(*SERVERS)
+
+    @property
+    def cheap(self) -> bool:
+        """Whether the tests execute it as it is written."""
+        if self.begins("new"):
+            return "--dataset" not in self.words
+        if self.begins("calibrate"):
+            return "--scenario" not in self.words
+        return self.begins(*CHEAP) and not self.elsewhere
+
+    @property
+    def makes(self) -> tuple[str, ...]:
+        """The files and folders that the line makes, as it names them."""
+        if self.begins("new"):
+            return (self.words[1],)
+        return tuple(self.words[k + 1] for k, word in enumerate(self.words[:-1]) if word == "--out")
+
+    def short(self) -> str:
+        """Its short form, or the line itself."""
+        for pattern, replacement in SHORT:
+            if re.search(pattern, self.name):
+                return re.sub(pattern, replacement, self.name, count=1)
+        return self.name
+
+    def arguments(self, *, full: bool) -> list[str]:
+        """The words to run, in the short form or in full, with the emulated robot in place of the real one."""
+        words = self.words if full else shlex.split(self.short())
+        return [word.replace(ROBOT, EMULATED) for word in words]
+
+
+def process(arguments: list[str]) -> list[str]:
+    """The command of a process of its own."""
+    return [sys.executable, "-P", "-m", "weldcal.tools", *arguments]
