@@ -1,19 +1,26 @@
 """The error that a calibration states for scans it did not use: the limit for the median of some of them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 
 FALSE_ALARM = 0.01  # of verifications of a good calibration that exceed the limit
 _DRAWS = 6_000  # the limit's own error is then 1 to 2 %
 _SEED = 1
 _LEAST_FREE = 3.0
+USUAL_FIELD_M = 1.5e-4
+"""Spread per axis of what an arm leaves of a calibration from place to place."""
+USUAL_TURN_RAD = float(np.radians(10.0))
+"""Angle over which that is alike."""
 
 
 def stated_median_limit(
@@ -63,6 +70,34 @@ def stated_median_limit(
         medians[k] = np.median(np.linalg.norm(shared + scatter + noise, axis=2), axis=1)
     limit = 1e3 * float(np.quantile(medians, 1.0 - FALSE_ALARM))
     return limit if floor is None else max(limit, floor)
+
+
+def orientations_of(observations: Sequence[Observation]) -> dict[str, Any]:
+    """Mean orientation of the flange in the base and the largest angle (deg) from it, for CalibrationResult.orientations."""
+    turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
+    mean = turned.mean()
+    x, y, z, w = (float(v) for v in mean.as_quat())
+    return {"wxyz": [w, x, y, z], "spread_deg": float(np.degrees((mean.inv() * turned).magnitude().max()))}
+
+
+def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observation]) -> Array | None:
+    """Spread (n,) m per axis of new scans, grown where the flange is turned beyond the orientations of the calibration.
+
+    What an arm leaves at one orientation says nothing of it at another: there its usual size is added, with the covariance over angles that
+    a local field has before any scan (0.15 mm per axis, 10 degrees). None where the result does not hold its orientations. Raises
+    InputError where they cannot be read.
+    """
+    if result.orientations is None:
+        return None
+    try:
+        w, x, y, z = (float(v) for v in result.orientations["wxyz"])
+        mean, spread = Rotation.from_quat([x, y, z, w]), np.radians(float(result.orientations["spread_deg"]))
+    except (KeyError, TypeError, ValueError) as problem:
+        raise InputError("The orientations in the result cannot be read; run 'weldcal calibrate' again.") from problem
+    turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
+    beyond = np.maximum((mean.inv() * turned).magnitude() - spread, 0.0)
+    unknown = USUAL_FIELD_M**2 * (1.0 - np.exp(-0.5 * (beyond / USUAL_TURN_RAD) ** 2))
+    return np.asarray(np.sqrt((1e-3 * result.sigma_position_mm) ** 2 + unknown))
 
 
 def _sensitivity(result: CalibrationResult, o: Observation, correction: ScannerCorrection | None) -> Array:

@@ -20,8 +20,10 @@ _SAME_M, _SAME_RAD = (
 
 
 def joint_angles(data: Dataset, ids: Sequence[str], joints: int) -> Array | None:
-    """Joint angles (n, joints) rad at the poses of these ids; None where the dataset has none. Raises DatasetError for bad numbers."""
+    """Joint angles (n, joints) rad at the poses of these ids; None where poses.csv and pairs.csv have none. Raises DatasetError for bad numbers."""
     path = data.folder / ("pairs.csv" if data.pairs else "poses.csv")
+    if not path.is_file():
+        return None  # another form of poses
     names = tuple(f"q{i + 1}" for i in range(joints))
     rows = {row["id"]: row for row in table_rows(path, ("id",))}
     if not all(rows.get(id, {}).get(name) for id in ids for name in names):
@@ -38,7 +40,7 @@ def require_joint_angles(data: Dataset, ids: Sequence[str], arm: Chain, stated: 
     q = joint_angles(data, ids, arm.n)
     if q is None:
         raise DatasetError(
-            f"The table of poses in '{data.folder.name}' has no joint angles: add the columns q1 to q{arm.n} (radians), or omit --refine."
+            f"poses.csv or pairs.csv in '{data.folder.name}' has no joint angles: add the columns q1 to q{arm.n} (radians), or omit --refine."
         )
     reached = flange_poses(arm, q, np.zeros((arm.n, 6)))
     off_m = float(np.linalg.norm(stated[:, :3, 3] - reached[:, :3, 3], axis=1).max())

@@ -23,6 +23,7 @@ from weldcal.calibration.refinement.kinematics_fit import (
     KinematicsFit,
     arm_errors,
     fit_kinematics,
+    unsought,
 )
 from weldcal.calibration.refinement.local_choice import GAIN, calibrate_plain
 from weldcal.models.arms.chain import Chain
@@ -117,7 +118,14 @@ def choose_kinematics(
     holes = from_holes(observations, patterns)
     start = estimate.scanner or ScannerCorrection()
     fit = fit_kinematics(
-        observations, q, candidates[used], estimate.X_BC, start, holes=holes, fixed_scanner=not correct_scanner
+        observations,
+        q,
+        candidates[used],
+        estimate.X_BC,
+        start,
+        holes=holes,
+        fixed_scanner=not correct_scanner,
+        considered=unsought(arm, kind),
     )
     # the same fit without errors of the arm: what the scanner's part of it gains is not theirs
     scanner = means[0]
@@ -187,6 +195,7 @@ def kinematics_text(fit: KinematicsFit, note: str) -> str:
 
 def _mixed(observations: Sequence[Observation], q: Array, fit: KinematicsFit) -> list[str]:
     """Errors that would be known much better if the scanner were known."""
+    fit = replace(fit, sigma_considered=None)
     sure = fit_kinematics(observations, q, fit.errors, fit.X_BC, fit.correction, fixed_scanner=True)
     # at the same scatter: only what the scanner leaves open counts
     better = sure.sigma * fit.sigma_position_m / sure.sigma_position_m

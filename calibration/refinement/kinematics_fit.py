@@ -65,6 +65,15 @@ class ArmErrors:
         return np.asarray(flange_poses(self.arm, q, self.errors(u)) @ after)
 
 
+def unsought(arm: Chain, kind: str) -> ArmErrors | None:
+    """The errors of the links that ``kind`` does not seek; None where it seeks all."""
+    if kind == "links":
+        return None
+    every, sought = arm_errors(arm, "links"), set(arm_errors(arm, kind).which.tolist())
+    left = np.array([i for i, w in enumerate(every.which.tolist()) if w not in sought])
+    return ArmErrors(arm, every.which[left], every.scale[left], tuple(every.names[i] for i in left))
+
+
 def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmErrors:
     """Joint offsets (``kind`` "joints") or all errors of the links ("links") that a scanner beside the arm can tell from its own pose.
 
@@ -82,7 +91,8 @@ def arm_errors(arm: Chain, kind: str, prior: FactoryPrior | None = None) -> ArmE
 @dataclass(frozen=True, eq=False)
 class KinematicsFit:
     """Camera pose, correction and errors u (k,) in units of their prior; ``covariance`` (6 + K + k,) of all: rotation on the base side about
-    the camera's origin, its displacement, factors, u. The sigmas are the scatter per axis, ``redundancy`` the spare numbers of positions."""
+    the camera's origin, its displacement, factors, u. The sigmas are the scatter per axis, ``redundancy`` the spare numbers of positions.
+    ``sigma_considered`` (k,): standard deviations of u where other errors of the arm were considered."""
 
     X_BC: RigidTransform
     correction: ScannerCorrection
@@ -92,6 +102,7 @@ class KinematicsFit:
     sigma_normal_rad: float
     redundancy: float
     errors: ArmErrors
+    sigma_considered: Array | None = None
 
     @property
     def values(self) -> Array:
@@ -100,7 +111,9 @@ class KinematicsFit:
 
     @property
     def sigma(self) -> Array:
-        """Their standard deviations (k,)."""
+        """Their standard deviations (k,), with what errors that were not sought may add."""
+        if self.sigma_considered is not None:
+            return self.sigma_considered * self.errors.scale
         k = len(self.u)
         return np.asarray(np.sqrt(np.diag(self.covariance)[-k:]) * self.errors.scale)
 
@@ -152,12 +165,14 @@ def fit_kinematics(
     *,
     holes: CorrectionEstimate | None = None,
     fixed_scanner: bool = False,
+    considered: ArmErrors | None = None,
 ) -> KinematicsFit:
     """Fit everything to observations (n) at joint angles q (n, joints), from a plain calibration; ``holes`` is what the hole circles say of
     the scanner. ``fixed_scanner`` holds the correction.
 
     Gauss-Newton with derivatives by differences; maximum a posteriori (arm: ``errors``' prior; scanner: what scanners usually are off). The
-    scatters of positions and normals follow from the residuals (Helmert).
+    scatters of positions and normals follow from the residuals (Helmert). ``considered``: errors that the arm may have besides, with their
+    prior; they are not fitted, but widen the standard deviations of those that are (consider covariance, Schmidt 1966).
     """
     data = _arrays(observations, errors, q)
     k, terms = len(errors.which), TERMS[correction.order if fixed_scanner else max(correction.order, _LEAST_ORDER)]
@@ -196,7 +211,19 @@ def fit_kinematics(
             sigma_position_m=max(found.sigma_position_m * grow_p, _FLOOR_M),
             sigma_normal_rad=max(found.sigma_normal_rad * grow_n, _FLOOR_RAD),
         )
-    return found
+    if considered is None or not k:
+        return found
+    # at the errors found: what one standard deviation of each other error does to the estimate
+    other = replace(found, errors=considered, u=np.zeros(len(considered.which)))
+    moved = replace(
+        data,
+        after=inverse(flange_poses(errors.arm, q, np.zeros((errors.arm.n, 6))))
+        @ found.errors.moved(q, data.after, found.u),
+    )
+    Jc = _jacobian(other, moved, q)[:, 6 + terms :] * w[:, None]
+    gain = found.covariance @ Jw.T @ Jc
+    square = np.diag(found.covariance) + (gain**2).sum(axis=1)
+    return replace(found, sigma_considered=np.sqrt(square[-k:]))
 
 
 def _field(data: _Data) -> tuple[float, float, float, float]:

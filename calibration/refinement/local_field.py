@@ -12,13 +12,16 @@ from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.optimize import minimize
 
+from weldcal.calibration.eye_on_base.stated_error import USUAL_FIELD_M, USUAL_TURN_RAD
 from weldcal.calibration.flange.observation import Observation
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
 LEAST = 10
 """Poses from which on a field is estimated."""
-_USUAL = np.array([0.2, np.radians(10.0), 1.5e-4, 1e-4])  # length m, turn rad, spread of the field m, of single scans m
+_USUAL = np.array(
+    [0.2, USUAL_TURN_RAD, USUAL_FIELD_M, 1e-4]
+)  # length m, turn rad, spread of the field m, of single scans m
 _USUAL_FACTOR = np.array(
     [2.0, 1.5, 2.7, 2.7]
 )  # by which these differ from cell to cell (one standard deviation of the logarithm)

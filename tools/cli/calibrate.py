@@ -108,11 +108,12 @@ def calibrate(
             rows |= report.interval_rows
             rows["mean error of as many new scans"] = f"{interval[0]:.3f} to {interval[1]:.3f} mm (95 %)"
         summary = report.summary()
+        rows["error budget"] = report.budget.sentence
         return Outcome(summary, rows=rows | pose_rows(report.result.X_BC) | work_rows(summary["work_point"]))
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
-    if poses is not None or refine is not None:
-        raise typer.BadParameter("--poses and --refine are for a dataset; omit them with --scenario")
+    if poses is not None or refine is not None or kinematics is not None:
+        raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
     from weldcal.tools.commands.procedures import calibrate_live
 
     found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)

@@ -16,6 +16,7 @@ from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibra
 from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -171,6 +172,7 @@ def calibrate_dataset(
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
+        orientations=orientations_of(inliers) if not data.pairs or all(p.has_orientation for p in data.pairs) else None,
         arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),

@@ -11,7 +11,7 @@ from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
 from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
-from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, stated_median_limit
+from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
@@ -86,7 +86,7 @@ def verify_dataset(
     seen = replace(seen, observations=moved)
     observations = tuple(o if correction is None else corrected_observation(correction, o) for o in seen.observations)
     local = field_from_document(calibration.local_field) if correct_scanner else None
-    scatter = None
+    scatter = scatter_elsewhere(calibration, observations) if shared is None else None
     if local is not None:
         scatter = local.at([o.X_BR for o in observations])[1]
         observations = tuple(local.applied(calibration.X_BC, observations))

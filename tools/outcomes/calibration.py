@@ -16,7 +16,11 @@ from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergenc
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.refinement.budget import USUAL_SCALE, ErrorBudget, error_budget
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.models.robots import get_robot
 from weldcal.tools.outcomes.poses import WorkPoint, work_point_error
 
 
@@ -90,6 +94,25 @@ class CalibrationReport:
         return work_point_error(self.estimate, np.mean(used, axis=0))
 
     @property
+    def budget(self) -> ErrorBudget:
+        """What contributes to the error at the work point."""
+        try:
+            repeatability_m = get_robot(self.result.robot).repeatability_m
+        except InputError:
+            repeatability_m = None  # an arm of the user's own
+        refinement = self.refinement or {}
+        motion = None if self.scanner is None else self.scanner.motion
+        scale = None if motion is None else float(np.hypot(motion.values[0] - 1.0, motion.sigma[0]))
+        return error_budget(
+            self.estimate,
+            self.observations,
+            repeatability_m=repeatability_m,
+            scale_error=scale if scale is not None and scale < USUAL_SCALE else None,
+            flange_m=get_flange(self.result.flange).outer_m,
+            refined=str(refinement["kind"]) if refinement.get("accepted") else "",
+        )
+
+    @property
     def interval_rows(self) -> dict[str, str]:
         """Rows for the terminal: the held-out figures, each with its bootstrap interval."""
         return interval_rows("held-out error", 1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
@@ -123,6 +146,7 @@ class CalibrationReport:
             "advice": list(self.advice),
             "notes": list(self.notes),
             "work_point": self.work_point.document(),
+            "error_budget": self.budget.document(),
             "features": feature_residuals(self.fits, self.patterns),
             **({} if self.refinement is None else {"refinement": self.refinement}),
             "algorithm1": None

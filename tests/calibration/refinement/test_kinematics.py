@@ -14,7 +14,7 @@ from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
 from weldcal.calibration.hand_eye.joints import flange_poses
 from weldcal.calibration.refinement.kinematics_choice import KinematicsChoice, choose_kinematics, kinematics_text
-from weldcal.calibration.refinement.kinematics_fit import KinematicsFit, arm_errors, fit_kinematics
+from weldcal.calibration.refinement.kinematics_fit import KinematicsFit, arm_errors, fit_kinematics, unsought
 from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import load_chain
 from weldcal.models.arrays import Array
@@ -36,6 +36,20 @@ def test_planned_scans_find_factory_size_errors_and_state_what_remains() -> None
     # 100 scans of four worlds that share their errors
     assert 88.0 < float(str(found["inside_95_percent"])) <= 100.0
     assert float(str(found["offsets_within_3_sigma_percent"])) >= 95.0
+
+
+def test_offsets_alone_state_what_unfitted_links_do_to_them() -> None:
+    """An arm whose axes are off besides its zeros: without the prior of the links the offsets would be stated far too well."""
+    world = station(46)
+    X_BC, plain = _near(world)
+    sought = arm_errors(ARM, "joints")
+    bare = fit_kinematics(world.observations, world.q, sought, X_BC, plain)
+    honest = fit_kinematics(world.observations, world.q, sought, X_BC, plain, considered=unsought(ARM, "joints"))
+    np.testing.assert_allclose(honest.values, bare.values)
+    off = np.abs(honest.values - world.errors.ravel()[sought.which])
+    assert (off < 3.0 * honest.sigma).all()
+    assert (honest.sigma > 1.2 * bare.sigma).all()
+    assert unsought(ARM, "links") is None
 
 
 def test_the_written_kinematics_reach_where_the_arm_is(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from weldcal.calibration.refinement.kinematics_fit import (
     KinematicsFit,
     arm_errors,
     fit_kinematics,
+    unsought,
 )
 from weldcal.calibration.refinement.poses import informative_poses
 from weldcal.models.arms.chain import Chain, load_chain
@@ -144,7 +145,9 @@ def study_station(world: Station, kind: str = "links", prior: FactoryPrior | Non
     X_BC, correction = calibrate_by_choice(world.observations, world.patterns)
     nothing = KinematicsFit(X_BC, correction, np.zeros(len(sought.which)), np.eye(1), 1e-4, 1e-3, 1.0, sought)
     holes = from_holes(world.observations, world.patterns)
-    fit = fit_kinematics(world.observations, world.q, sought, X_BC, correction, holes=holes)
+    fit = fit_kinematics(
+        world.observations, world.q, sought, X_BC, correction, holes=holes, considered=unsought(arm, kind)
+    )
     before, after = (
         np.array([f.X_BC @ o.p_CR - o.p_BR for o in f.applied(world.new, world.new_q)]) for f in (nothing, fit)
     )
