@@ -135,6 +135,11 @@ def test_the_sentences_that_the_page_of_failures_quotes_are_those_of_the_program
     assert [text for text in quoted if text not in sources] == []
 
 
+def test_each_page_begins_with_a_paragraph() -> None:
+    beginnings = {page.relative_to(ROOT).as_posix(): page.read_text().split("\n\n")[1] for page in DOCUMENTS}
+    assert [name for name, text in beginnings.items() if not re.match(r"[A-Za-z`*\"]", text)] == []
+
+
 def test_no_command_stands_in_a_block_that_is_not_found() -> None:
     hidden = re.compile(r"^(?: {4}|\t)\$? ?(?:weldcal|\./tools/run) ", re.MULTILINE)
     assert [page.name for page in DOCUMENTS if hidden.search(FENCE.sub("", page.read_text()))] == []
