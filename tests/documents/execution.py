@@ -6,7 +6,6 @@ import contextlib
 import io
 import os
 import shlex
-import signal
 import subprocess
 import tempfile
 import time
@@ -111,7 +110,7 @@ class Page:
             self._serve(["emulate-ur", "--host", EMULATED, "--control-port", "30091"])
 
     def _serve(self, arguments: list[str]) -> None:
-        """Start a server, wait for what it says first, and end it with the page as Ctrl-C would."""
+        """Start a server, wait for what it says first, and end it with the page, as a person does."""
         said = (self.folder / f"server{len(list(self.folder.glob('server*')))}.log").open("w+")
         server = subprocess.Popen(
             process(arguments), cwd=self.folder, env=self.environment, stdout=said, stderr=subprocess.STDOUT,
@@ -119,7 +118,7 @@ class Page:
         )  # fmt: skip
 
         def end() -> None:
-            server.send_signal(signal.SIGINT)
+            server.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 server.wait(30)
             server.kill()
