@@ -60,7 +60,7 @@ def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(contro
             seen["begun"] = {}
             threading.Thread(target=hold_for_a_while, daemon=True).start()
 
-    run = run_cell(build_cell(described), watch, person=person)
+    run = run_cell(build_cell(described, person=person), watch)
     assert run.reason is None
     assert run.held_by_person == 1
     assert [name for name, _, _ in run.phases] == ["start", "move_home", "park", "done"]
