@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem
 
 from weldcal.models.arrays import Array
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
-from weldcal.systems.messages import JobCommand
+from weldcal.systems.messages import JobCommand, PlannedSeam
 from weldcal.systems.motion.spine import JobPorts
 from weldcal.systems.wiring import Wiring
 
@@ -21,12 +21,12 @@ ACTIVE = ("TRACK", "COAST", "FINISH", "HELD", "BACK")
 
 
 class WeldRow(NamedTuple):
-    """One row of the weld's plots: time s, torch along the seam m, torch beside the felt seam m, deflection m, torch speed m/s,
-    whether the torch is on; NaN where there is no value."""
+    """One row of the weld's plots: time s, torch along the seam m, the felt seam to the left of the planned one m, deflection m, torch
+    speed m/s, whether the torch is on; NaN where there is no value."""
 
     time: float
     s_torch: float
-    beside: float
+    offset: float
     deflection: float
     speed: float
     torch_on: bool
@@ -92,10 +92,10 @@ class LiveWriter(LeafSystem):
             self._view.scans.append(ScanRow(*row[:3]))
         report = shown.get("servo_report")
         if isinstance(report, ServoReport) and self._p_TW is not None:
-            self._append(report, self._p_TW)
+            self._append(report, shown.get("planned_seam"), self._p_TW)
         return EventStatus.Succeeded()
 
-    def _append(self, report: ServoReport, p_TW: Array) -> None:
+    def _append(self, report: ServoReport, planned: PlannedSeam | None, p_TW: Array) -> None:
         if report.phase not in ACTIVE or report.command is None or report.X_BT is None:
             self._torch = None
             return
@@ -103,7 +103,13 @@ class LiveWriter(LeafSystem):
         if self._torch is not None and report.time > self._torch[0]:
             speed = float(np.linalg.norm(p_BW - self._torch[1])) / (report.time - self._torch[0])
         self._torch = (report.time, p_BW)
-        self._view.weld.append(WeldRow(report.time, d.s_torch, d.e_t, d.delta_n, speed, report.torch_on))
+        offset = math.nan
+        if d.p_BTorch_target is not None and planned is not None and planned.seam is not None:
+            plan = planned.seam.frame(planned.seam.nearest(d.p_BTorch_target, d.s_torch))
+            offset = float((d.p_BTorch_target - plan.position) @ plan.normal)
+        # past the seam's end the tip feels nothing
+        deflection = math.nan if report.phase == "FINISH" else d.delta_n
+        self._view.weld.append(WeldRow(report.time, d.s_torch, offset, deflection, speed, report.torch_on))
 
 
 def add_live_view(wiring: Wiring, ports: JobPorts, view: LiveView) -> LiveWriter:

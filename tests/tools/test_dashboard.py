@@ -17,7 +17,7 @@ import pytest
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.math import RigidTransform
 
-from tests.browser import Browser, colours
+from tests.browser import Browser, Pixels, colours
 from weldcal.systems.jobs.weld.calibration_pose_planner import NextPose
 from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, JobCommand, PlannedSeam
@@ -33,7 +33,8 @@ from weldcal.welding.seam.curve import SeamCurve
 from weldcal.welding.servo.state import Diagnostics, Phase, WeldingCommand
 
 STEPS = (("Calibrate", ("scan_pose", "move_to_pose")), ("Weld", ("weld",)), ("Go home", ("home",)))
-FACTS = Facts("s_groove", "simulated", True, STEPS, 0.15, 12, 8.0, 2.0, (0.4, 5.0))
+SECONDS = {"scan": 3.0, "Weld": 20.0, "Go home": 6.0}
+FACTS = Facts("s_groove", "simulated", True, STEPS, 0.15, 12, 6, SECONDS, 8.0, 2.0, (0.4, 5.0))
 SEAM = SeamCurve.from_points(np.linspace([0.5, 0.0, 0.0], [0.6, 0.0, 0.0], 40))
 SIZES = {"desktop": (1440, 900), "tablet": (1024, 768), "phone": (390, 844)}
 
@@ -56,7 +57,7 @@ def welding(live: LiveView, sigma_min: float = 0.3) -> None:
     shown = {"servo_report": report, "planned_seam": PlannedSeam(1, SEAM)}
     live.moment = Moment(40.0, JobCommand(phase="weld", mode="weld"), shown, sigma_min)
     s = np.linspace(0.0, 0.05, 60)
-    live.weld[:] = [WeldRow(30.0 + 100.0 * x, x, 5e-5 * math.sin(300.0 * x), 1.9e-3, 8e-3, True) for x in s]
+    live.weld[:] = [WeldRow(30.0 + 100.0 * x, x, 4e-4 * math.sin(60.0 * x), 1.9e-3, 8e-3, True) for x in s]
 
 
 @pytest.fixture
@@ -132,8 +133,6 @@ def test_a_run_is_held_goes_on_when_a_person_says_so_and_is_marked_as_a_replay_w
     browser.wait("document.getElementById('state').textContent === 'HELD'")
     assert "by the dashboard" in browser.text().lower()
     held_at = browser.run("return document.getElementById('clock').textContent")
-    pixels = browser.screenshot(tmp_path / "held.png", until=lambda picture: colours(picture) > 60)
-    assert colours(pixels[:, : int(0.65 * pixels.shape[1])]) > 40, "the 3D view is in the page"
     time.sleep(0.5)
     assert thread.is_alive()
     assert browser.run("return document.getElementById('clock').textContent") == held_at, "no time passes"
@@ -142,6 +141,12 @@ def test_a_run_is_held_goes_on_when_a_person_says_so_and_is_marked_as_a_replay_w
     browser.wait("document.getElementById('state').textContent === 'DONE'")
     assert browser.run("return document.getElementById('replay').offsetHeight"), "an arm that moves now is a replay"
     assert browser.run("return document.getElementById('hold').disabled")
+
+    def scene(picture: Pixels) -> Pixels:
+        return picture[:, : int(0.65 * picture.shape[1])]
+
+    pixels = browser.screenshot(tmp_path / "done.png", until=lambda picture: colours(scene(picture)) > 60)
+    assert colours(scene(pixels)) > 60, "the 3D view is in the page"
     thread.join(timeout=30)
     (finished,) = found
     assert finished.run.reason is None
@@ -182,12 +187,13 @@ def test_what_a_person_needs_is_on_the_page_at_every_size(
         "pose02: not used, no flange in the scan",
         "pose05",
         "3 scans",
+        "about 38 s left",
     ):
         assert words in text.lower(), words
     assert browser.run("return document.querySelectorAll('#plot_error circle').length") == 2
     welding(source.live)
     browser.wait("document.getElementById('seam').textContent.startsWith('50 of 100 mm, torch on')")
-    for words in ("0.04 mm", "1.90 mm", "8.0 mm/s", "about 6 s left"):
+    for words in ("the torch is 0.04 mm beside", "0.06 mm", "1.90 mm", "8.0 mm/s", "about 12 s left"):
         assert words in browser.text().lower(), words
     assert "Steering margin" not in browser.text()
     welding(source.live, sigma_min=0.04)

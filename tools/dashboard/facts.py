@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,13 +18,18 @@ from weldcal.systems.messages import CalibrationStatus
 from weldcal.systems.viewer.phase_labels import STEPS
 from weldcal.welding.servo.guards import ArmGuardConfig
 
+SCAN = "scan"
+# About how long steps take at speed_factor 1, s; of these the moves take longer at a lower one.
+_SCAN_S, _MOVES_S, _TOUCH_S, _WHOLE_SEAM_MM = 3.0, {"Park": 3.0, "Approach": 5.0, "Go home": 6.0}, 6.0, 300.0
+
 
 @dataclass(frozen=True, eq=False)
 class Facts:
     """Of a run: `steps`: name and phases of each step that the job will make; lengths in mm, NaN or None where the job has none.
 
     `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected error after
-    the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen.
+    the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen. `seconds`: about how long each
+    step takes, and SCAN, the scan of a pose with the way to it.
     """
 
     title: str = ""
@@ -33,6 +38,8 @@ class Facts:
     steps: tuple[tuple[str, tuple[str, ...]], ...] = ()
     required_mm: float = math.nan
     maximum_scans: int = 0
+    minimum_scans: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)
     weld_speed_mm_s: float = math.nan
     wanted_deflection_mm: float = math.nan
     band_mm: tuple[float, float] | None = None
@@ -50,6 +57,11 @@ def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
     wanted = {"calibrate": scenario.job.calibrate, "weld": scenario.job.weld}
     steps = tuple((name, phases) for name, needs, phases in STEPS if needs is None or wanted[needs])
     c, servo = scenario.calibration, job.servo_config
+    slower = 1.0 / scenario.job.speed_factor
+    seam_mm = (scenario.welding.seam_length_mm or _WHOLE_SEAM_MM) + 1e3 * servo.tool.torch_offset_m
+    seconds = {SCAN: _SCAN_S * slower, "Verify": c.verification_scans * _SCAN_S * slower, "Scan the part": 2.0}
+    seconds |= {name: s * slower for name, s in _MOVES_S.items()}
+    seconds["Weld"] = _TOUCH_S + seam_mm / (1e3 * servo.weld_speed_m_s)
     return Facts(
         title,
         robot,
@@ -57,6 +69,8 @@ def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
         steps,
         c.required_error_mm if scenario.job.calibrate else math.nan,
         c.maximum_scans,
+        c.minimum_scans,
+        seconds,
         1e3 * servo.weld_speed_m_s,
         1e3 * servo.deflection.delta_d_m,
         (1e3 * servo.contact.normal_min_m, 1e3 * servo.faults.lateral_m),

@@ -16,6 +16,7 @@ from weldcal.tools.dashboard.values import (
     RUNNING,
     STARTING,
     STOPPING,
+    left_s,
     phase_text,
     scan_rows,
     scan_values,
@@ -93,9 +94,9 @@ class DashboardSource:
                 "end": running and not person.ends,
                 "pace": running and facts.settable_pace,
             },
-            "steps": steps(facts, command.phase),
+            "steps": steps(facts, "done" if state == DONE else command.phase),
             "share": round(self._share, 3) if running else 1.0,
-            "left_s": self._left_s(weld),
+            "left_s": left_s(facts, moment) if running else None,
             "time_s": round(moment.time, 1),
             "pace": {"asked": person.pace or 0.0, "now": self._pace(moment.time)},
             "weld": weld,
@@ -132,15 +133,6 @@ class DashboardSource:
         if back > 0.0:
             return f"Go on: {1e3 * back:.1f} mm back along the seam (violet in the 3D view), then the arc starts again."
         return "Go on: the arm moves on along the rest of its path."
-
-    def _left_s(self, weld: dict[str, Any] | None) -> float | None:
-        """Seconds of the job that are left, of the weld where it is on; None where that is not known."""
-        if self.ended:
-            return None
-        if weld is not None:
-            return weld["left_s"]  # type: ignore[no-any-return]
-        time_s, share = self.live.moment.time, self._share
-        return None if share < 0.03 or time_s <= 0.0 else round(time_s * (1.0 - share) / share)
 
     def _pace(self, simulated: float) -> float | None:
         """Seconds of the run per second of the wall clock over the last seconds; None before they are known."""

@@ -11,7 +11,7 @@ from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import CalibrationStatus, PlannedSeam
 from weldcal.systems.viewer.live import ACTIVE, Moment, ScanRow, WeldRow
 from weldcal.systems.viewer.phase_labels import TEXT
-from weldcal.tools.dashboard.facts import Facts
+from weldcal.tools.dashboard.facts import SCAN, Facts
 
 STARTING, RUNNING, STOPPING, HELD, DONE, ENDED = "STARTING", "RUNNING", "STOPPING", "HELD", "DONE", "ENDED"
 LOW_MARGIN = 0.5
@@ -60,16 +60,34 @@ def weld_values(facts: Facts, moment: Moment, newest: Sequence[WeldRow]) -> dict
     margin = round(100.0 * max(share, 0.0)) if math.isfinite(share) and share < LOW_MARGIN else None
     return {
         "phase": report.phase,
-        "at_mm": mm(max(now.s_torch, 0.0), 1),
+        "at_mm": mm(min(max(now.s_torch, 0.0), length), 1),
         "length_mm": mm(length, 1),
         "left_s": number(left_s, 0),
         "beside_mm": mm(now.e_t),
-        "deflection_mm": mm(now.delta_n),
+        "offset_mm": None if row is None else mm(row.offset),
+        "deflection_mm": None if row is None else mm(row.deflection),
         "speed_mm_s": None if row is None else mm(row.speed, 2),
         "torch_on": report.torch_on,
         "margin_percent": margin,
         "back_mm": mm(report.way_back_m, 1) if report.way_back_m > 0.0 else None,
     }
+
+
+def left_s(facts: Facts, moment: Moment) -> float | None:
+    """Seconds of the job that are left, about; None for a job that states no steps."""
+    at = [k for k, step in enumerate(steps(facts, moment.command.phase)) if step["is"] == "now"]
+    if not at or moment.time <= 0.0:
+        return None
+    name, after = facts.steps[at[0]][0], [name for name, _ in facts.steps[at[0] + 1 :]]
+    now, weld = facts.seconds.get(name, 0.0), weld_values(facts, moment, ())
+    status = moment.shown.get("calibration_status")
+    if weld is not None and weld["left_s"] is not None:
+        now = weld["left_s"]
+    elif name == "Calibrate" and isinstance(status, CalibrationStatus):
+        scans = status.calibration_scans
+        each = moment.time / scans if scans > 1 else facts.seconds.get(SCAN, 0.0)
+        now = each * max(facts.minimum_scans - scans, 1)
+    return round(now + sum(facts.seconds.get(n, 0.0) for n in after))
 
 
 def scan_values(facts: Facts, moment: Moment) -> dict[str, Any] | None:
@@ -120,11 +138,8 @@ def _next_pose(facts: Facts, status: CalibrationStatus, pose: NextPose) -> str:
 
 
 def weld_rows(rows: Sequence[WeldRow]) -> list[list[float | None]]:
-    """Rows of the weld's plots: time s, mm of seam, mm beside, mm of deflection, mm/s."""
-    return [
-        [number(r.time, 2), mm(r.s_torch, 2), mm(r.beside) if r.torch_on else None, mm(r.deflection), mm(r.speed, 2)]
-        for r in rows
-    ]
+    """Rows of the weld's plots: time s, mm of seam, mm beside the plan, mm of deflection, mm/s."""
+    return [[number(r.time, 2), mm(r.s_torch, 2), mm(r.offset), mm(r.deflection), mm(r.speed, 2)] for r in rows]
 
 
 def scan_rows(rows: Sequence[ScanRow]) -> list[list[float | None]]:

@@ -16,7 +16,7 @@ from weldcal.welding.servo.state import Diagnostics, Phase, ServoSample, Welding
 from weldcal.welding.servo.step import fault, watch, welding_step
 
 RAMP_S = 0.04  # from welding speed to rest
-STILL_S = 0.15  # of rest before the tool counts as standing: the arm lags behind its commands
+STILL_S = 0.25  # of rest before the tool counts as standing: the arm lags behind its commands
 OVERLAP_M = 5.0e-3  # of seam welded twice, over the crater that the arc left
 TRAIL_TICKS = 600  # 5 s: longer than the overlap takes at any speed but creeping round a corner
 EASE_S = 0.15  # from rest to the speed of the way back, and to rest again

@@ -59,15 +59,17 @@ function thinned(all, column) {
   return all.filter((_, k) => k % step === 0 || k === all.length - 1).map(r => [r[1], r[column]]);
 }
 
+const known = {};  // of a weld that is over
+
 function drawWeld(v) {
-  const length = v.weld ? v.weld.length_mm : Math.max(1, ...rows.weld.slice(-1).map(r => r[1] || 1));
-  const x = [0, length], limits = v.limits;
-  const on = rows.weld.filter(r => r[1] !== null && r[1] >= 0);
-  const beside = thinned(on, 2), deflection = thinned(on, 3), speed = thinned(on, 4);
-  const reach = Math.max(0.2, nice(largest(beside, 0.1)));
-  plot("plot_beside", beside, { x, y: [-reach, reach], unit: "mm of seam", places: 1, limit: 0 });
-  const wanted = limits.deflection || drawWeld.wanted, band = limits.band || drawWeld.band, target = limits.speed || drawWeld.target;
-  [drawWeld.wanted, drawWeld.band, drawWeld.target] = [wanted, band, target];
+  known.length = v.weld ? v.weld.length_mm : known.length || Math.max(1, ...rows.weld.slice(-1).map(r => r[1] || 1));
+  const length = known.length, x = [0, length], limits = v.limits;
+  const on = rows.weld.filter(r => r[1] !== null && r[1] >= 0 && r[1] <= length);
+  const offset = thinned(on, 2), deflection = thinned(on, 3), speed = thinned(on, 4);
+  const reach = Math.max(0.5, nice(largest(offset, 0.1)));
+  plot("plot_offset", offset, { x, y: [-reach, reach], unit: "mm of seam", places: 1, limit: 0, limitName: "plan" });
+  const wanted = limits.deflection || known.wanted, band = limits.band || known.band, target = limits.speed || known.target;
+  [known.wanted, known.band, known.target] = [wanted, band, target];
   plot("plot_deflection", deflection, { x, y: [0, wanted ? 2 * wanted : 3], unit: "mm of seam", places: 1, limit: wanted, limitName: wanted ? "wanted " + wanted.toFixed(1) : "", band });
   plot("plot_speed", speed, { x, y: [0, target ? 2 * target : 20], unit: "mm of seam", places: 0, limit: target, limitName: target ? "wanted " + target.toFixed(1) : "" });
 }
@@ -91,7 +93,7 @@ function update(v) {
   for (const name of ["hold", "go_on", "end"]) if (el(name)) el(name).disabled = !v.can[name];
   if (!v.can.end) unsure();
   el("bar").style.width = (100 * v.share).toFixed(1) + "%";
-  say("clock", v.time_s > 0 ? duration(v.time_s) + " so far" : "");
+  say("clock", v.time_s > 0 ? duration(v.time_s) + (v.can.end ? " so far" : "") : "");
   say("left", v.left_s === null ? "" : "about " + duration(v.left_s) + " left");
   el("steps").replaceChildren(...v.steps.map(s => {
     const li = document.createElement("li");
@@ -103,9 +105,13 @@ function update(v) {
   const w = v.weld, c = v.calibration;
   if (w || rows.weld.length) {
     show("welding", true);
-    if (w) {
+    if (!w) {
+      for (const name of ["seam", "offset", "deflection", "speed", "beside"]) say(name, "");
+      show("margin", false);
+    } else {
       say("seam", w.at_mm.toFixed(0) + " of " + w.length_mm.toFixed(0) + " mm" + (w.torch_on ? ", torch on" : ", torch off"));
-      say("beside", fixed(w.beside_mm, 2, "mm"));
+      say("offset", fixed(w.offset_mm, 2, "mm"));
+      say("beside", w.beside_mm === null ? "" : "The torch is " + Math.abs(w.beside_mm).toFixed(2) + " mm beside the seam that the tip has felt.");
       say("deflection", fixed(w.deflection_mm, 2, "mm"));
       say("speed", fixed(w.speed_mm_s, 1, "mm/s"));
       show("margin", w.margin_percent !== null);
@@ -124,7 +130,7 @@ function update(v) {
     if (!welding) el("welding").before(el("calibrating")); else el("welding").after(el("calibrating"));
     drawScans(c);
   }
-  say("pace_now", v.pace.now === null ? "" : v.pace.now.toFixed(2) + " of real time");
+  say("pace_now", v.pace.now === null || v.state === "HELD" ? "" : v.pace.now.toFixed(2) + " of real time");
   if (el("pace")) {
     show("pace_label", v.can.pace);
     el("pace").disabled = !v.can.pace;
