@@ -35,6 +35,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 # Completed share of a run at the start of a phase, for the progress bar: calibration, planning, weld.
 SHARES = {
@@ -102,6 +103,14 @@ class WeldJob(AddedJob):
         report: ServoReport = self.welding.report.Eval(self.welding.report.get_system().GetMyContextFromRoot(root))
         return report
 
+    def can_stand(self, root: Context) -> bool:
+        """See AddedJob: the servo turns the torch off and brings the tool to rest."""
+        if self.command(root).mode != "weld":
+            return True
+        report = self.servo_report(root)
+        over = report.phase in ("IDLE", Phase.DONE, Phase.FAULT)
+        return not over and report.interruption.at_rest(self.servo_config)
+
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
         command = self.command(root)
@@ -167,12 +176,12 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             calibration_status=status,
             planned_seam=welding.seam,
             servo_report=welding.report,
-            hold=spine.hold,
+            hold=spine.end,
             arm_stopped=spine.switch.GetOutputPort("arm_stopped"),
         )
         state = sequencer.GetOutputPort("job_state")
         if wiring.meshcat is not None:
-            shown = {
+            drawn = {
                 "job_state": state,
                 "calibration_status": status,
                 "flange_estimate": estimator.GetOutputPort("flange_estimate"),
@@ -180,7 +189,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
                 "planned_seam": welding.seam,
                 "servo_report": welding.report,
             }
-            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, config.weld_speed_m_s, shown)
+            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, config.weld_speed_m_s, drawn)
         logged = dict(welding.logged)
         if logged:
             logged["torch_on"] = spine.switch.GetOutputPort("process_on")
@@ -190,7 +199,15 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             "calibration_status": status,
             "planned_seam": welding.seam,
         }
-        ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results)
+        shown = {
+            "calibration_status": status,
+            "next_pose": chooser.GetOutputPort("next_pose"),
+            "planned_seam": welding.seam,
+            "servo_report": welding.report,
+        }
+        ports = JobPorts(
+            (command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results, shown
+        )
         return WeldJob(
             *(scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports),
             *(times.maximum_time_s, times.seams),
@@ -250,6 +267,7 @@ def _add_welding(
         position_measured=position,
         sample_time=out("arm.sample_time"),
         job=command,
+        hold=spine.hold,
     )
     if station.diagram.HasOutputPort("arm.arc_established"):
         wiring.connect(servo, arc_established=out("arm.arc_established"))

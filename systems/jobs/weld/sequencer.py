@@ -287,7 +287,7 @@ def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if not seen.robot.ready:
         return hold(state, seen, seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}.")
     if seen.hold_requested:
-        return hold(state, seen, f"A person held the job, in the phase '{state.command.phase}'.")
+        return hold(state, seen, f"A person ended the job, in the phase '{state.command.phase}'.")
     if seen.time > plan.maximum_time_s:
         return hold(
             state,

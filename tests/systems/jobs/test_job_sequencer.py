@@ -225,7 +225,7 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     ),
     "robot fault": ("park", 0.1, {"robot": UrStatus(fault="WALL: it hit a wall.")}, "^WALL: it hit a wall.$"),
     "a singular arm": ("weld", 0.1, {"arm_stopped": True}, "too near to a singular position"),
-    "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person held the job, in the phase 'weld'"),
+    "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person ended the job, in the phase 'weld'"),
     "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
     "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),
     "cloud pose not reached": ("move_to_verification_cloud", 21.0, {}, "did not come to rest at its goal within 20 s"),
