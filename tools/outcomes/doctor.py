@@ -94,7 +94,7 @@ def _moved(c: Cause) -> tuple[str, str]:
     return (
         f"From '{c.where[1]}' on the scans agree on another camera pose than up to '{c.where[0]}': {c.numbers['shift_mm']:.2f} mm and "
         f"{c.numbers['turn_deg']:.3f} degrees apart; {_fits(c)}.",
-        f"Fasten the scanner and calibrate the later part: weldcal calibrate FOLDER --poses {c.where[1]}:",
+        f"Fasten the scanner. Calibrate the later part alone (weldcal calibrate FOLDER --poses {c.where[1]}:).",
     )
 
 
