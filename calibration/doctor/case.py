@@ -12,6 +12,16 @@ Which = NDArray[np.bool_] | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
+class ArmErrors:
+    """What joint zeros and link lengths of p numbers do: change D (n, 3, p) of p_CR's place in the base, change T (n, 3, p) of the normals,
+    and one sigma (p,) of the numbers for an arm as it leaves the factory."""
+
+    D: Array
+    T: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Case:
     """n scans of a flange: X_BF (n, 4, 4) as the robot states it, X_FR (4, 4) of the feature, centres c (n, 3) m and outward normals m
     (n, 3) in the camera (NaN rows: not seen), ``time`` (n,) s or the order of the scans, ``noise`` (n,) m rms of each face about its plane
@@ -19,7 +29,8 @@ class Case:
 
     ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the feature. ``flange`` is
     the stated designation, ``fits_flange`` the one that was found (empty: the stated one). ``refused`` lists (id, reason);
-    ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have positions only.
+    ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have positions only. Every fit holds the errors of the
+    ``arm`` to their usual size (None: no fit has them).
     """
 
     ids: tuple[str, ...]
@@ -38,6 +49,7 @@ class Case:
     refused: tuple[tuple[str, str], ...] = ()
     near_far: tuple[float, float] | None = None
     oriented: bool = True
+    arm: ArmErrors | None = None
 
     @property
     def n(self) -> int:
@@ -67,8 +79,8 @@ class Case:
         return np.asarray((t - t.min()) / span if span > 0.0 else np.linspace(0.0, 1.0, self.n))
 
     def with_poses(self, X_BF: Array) -> Self:
-        """The same scans with other robot poses."""
-        return replace(self, X_BF=X_BF)
+        """The same scans with other robot poses, to which no errors of the arm are known."""
+        return replace(self, X_BF=X_BF, arm=None)
 
     def pick(self, which: Which) -> Self:
         """Some of the scans."""
@@ -86,4 +98,5 @@ class Case:
             time=some(self.time),
             noise=some(self.noise),
             coverage=some(self.coverage),
+            arm=None if self.arm is None else replace(self.arm, D=self.arm.D[kept], T=self.arm.T[kept]),
         )

@@ -11,7 +11,7 @@ import numpy as np
 
 from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.fit import Fit, fit
-from weldcal.calibration.doctor.models import Explained, explanations
+from weldcal.calibration.doctor.models import Explained, explanations, with_arm_errors
 from weldcal.calibration.doctor.quality import (
     installation,
     noise_growth,
@@ -35,11 +35,12 @@ LEAST_EFFECT_M = {
     "scanner moved": 3e-4,
     "TCP set at the controller": 2e-3,
     "warm-up drift": 1.5e-4,
-    "slack flange or loose mount": 3e-4,
-    "wrong kinematics file": 3e-4,
+    "slack flange or loose mount": 5e-4,
+    "wrong kinematics file": 1e-3,
     "outlier scans or partial views": 1e-3,
 }
 """Smaller ones are what arms and scanners are off anyway."""
+CLEAR = 1.2  # factor by which a cause must bring the median residual down
 _LOOKS_WRONG_M, _LOOKS_WRONG_RAD = 3e-3, 0.03
 
 
@@ -78,6 +79,7 @@ def diagnose(case: Case) -> Diagnosis:
         if partial is not None:
             causes.append(Cause(partial.cause, 0.9, partial.score, partial.numbers, partial.where))
         return Diagnosis(tuple(causes), case.n, float("nan"))
+    bare, case = case, with_arm_errors(case)
     null = fit(case)
     wrong = null.rms > _LOOKS_WRONG_M or (
         np.isfinite(null.tilt).any() and float(np.nanmedian(null.tilt)) > _LOOKS_WRONG_RAD
@@ -85,7 +87,8 @@ def diagnose(case: Case) -> Diagnosis:
     models = _ranked(case, null)
     winner = next((m for m in models if _named(m, null)), None)
     if wrong:
-        reading = best_reading(case, null)
+        plain = fit(bare)
+        reading = best_reading(bare, plain)
         rival = winner.bic if winner is not None else null.bic
         if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
             causes.append(
@@ -98,7 +101,8 @@ def diagnose(case: Case) -> Diagnosis:
                     reading.words,
                 )
             )
-            case, null = reading.case, reading.fit
+            case = with_arm_errors(reading.case)
+            null = fit(case)
             models = _ranked(case, null)
             winner = next((m for m in models if _named(m, null)), None)
     best = null if winner is None else winner.fit
@@ -128,7 +132,8 @@ def _ranked(case: Case, null: Fit) -> list[Explained]:
 
 
 def _named(m: Explained, null: Fit) -> bool:
-    return null.bic - m.bic > THRESHOLDS[m.cause] and m.effect_m > LEAST_EFFECT_M[m.cause]
+    shows = m.cause.startswith("outlier") or null.rms > CLEAR * m.fit.rms
+    return shows and null.bic - m.bic > THRESHOLDS[m.cause] and m.effect_m > LEAST_EFFECT_M[m.cause]
 
 
 def _weight(winner: Explained, models: list[Explained], null: Fit) -> float:

@@ -94,14 +94,21 @@ def fit(
 ) -> Fit:
     """The best numbers of a model; ``columns`` (n, 3, p) of the cause, ``groups`` (n,) the camera pose of each scan.
 
-    ``turning`` (n, 3, p) is what the cause does to the normals z; ``prior`` (p,) one sigma of its numbers about zero.
+    ``turning`` (n, 3, p) is what the cause does to the normals z; ``prior`` (p,) one sigma of its numbers about zero. The arm's usual errors
+    are in the model, too, where the case has them.
     """
     n, b, c = case.n, case.b, case.c
     g = np.zeros(n, dtype=int) if groups is None else groups
-    G, p = int(g.max()) + 1, 0 if columns is None else columns.shape[2]
+    G, own_numbers = int(g.max()) + 1, 0 if columns is None else columns.shape[2]
     D = np.zeros((n, 3, 0)) if columns is None else columns
-    T = np.zeros((n, 3, p)) if turning is None else turning
-    weak = np.zeros(p) if prior is None else 1.0 / prior
+    T = np.zeros((n, 3, own_numbers)) if turning is None else turning
+    sigmas = np.full(own_numbers, np.inf) if prior is None else prior
+    if case.arm is not None:
+        D, T = np.concatenate([D, case.arm.D], axis=2), np.concatenate([T, case.arm.T], axis=2)
+        sigmas = np.concatenate([sigmas, case.arm.sigma])
+    p = len(sigmas)
+    held = np.isfinite(sigmas)
+    weak = np.where(held, 1.0 / sigmas, 0.0)
     has: NDArray[np.bool_] = np.isfinite(case.m).all(axis=1) & np.full(n, normals)
     m = np.where(has[:, None], case.m, 0.0)
     z = stated = case.z
@@ -166,14 +173,20 @@ def fit(
     loglik = student(np.sqrt((e**2).sum(axis=1)), sigma, 3) - 0.5 * float(((s / _USUAL) ** 2).sum())
     if has.any():
         loglik += student(tilt[has], sigma_n, 2)
-    if prior is None:
-        return Fit(R, t, s, a, e, tilt, sigma, sigma_n, loglik, 6 * G + p, n)
+    free = 6 * G + int(np.count_nonzero(~held))
     loglik -= 0.5 * float(((a * weak) ** 2).sum())
+    occam = (
+        _narrowed(rows, np.concatenate([np.zeros(6 * G + 4, dtype=bool), held]), sigmas[held]) if held.any() else 0.0
+    )
+    return Fit(R, t, s, a[:own_numbers], e, tilt, sigma, sigma_n, loglik, free, n, occam)
+
+
+def _narrowed(rows: Array, held: NDArray[np.bool_], sigma: Array) -> float:
+    """Logarithm of how much the rows narrow the numbers that a prior holds, all others free (twice Laplace's factor)."""
     H = rows.T @ rows
-    at = 6 * G + 4
-    kept = H[at:, at:] - H[at:, :at] @ np.linalg.lstsq(H[:at, :at], H[:at, at:], rcond=1e-12)[0]
-    occam = float(np.linalg.slogdet(kept * np.outer(prior, prior))[1])
-    return Fit(R, t, s, a, e, tilt, sigma, sigma_n, loglik, 6 * G, n, occam)
+    cross = H[np.ix_(~held, held)]
+    kept = H[np.ix_(held, held)] - cross.T @ np.linalg.lstsq(H[np.ix_(~held, ~held)], cross, rcond=1e-12)[0]
+    return float(np.linalg.slogdet(kept * np.outer(sigma, sigma))[1])
 
 
 def _cross_change(u: Array, z: Array) -> Array:

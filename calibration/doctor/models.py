@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
 
-from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.case import ArmErrors, Case
 from weldcal.calibration.doctor.fit import Fit, fit
 from weldcal.calibration.geometry.se3 import exp_rotation, log_rotation, skew
 from weldcal.models.arms.chain import Chain, chain_inverse, chain_poses, load_chain
@@ -19,6 +19,8 @@ LEAST_PART = 3  # scans before and after a move
 _LEAST_SHARE = 0.2  # of the scans in the smaller of two states
 _STATES = 12  # reassignments of the scans to two states
 _TURNED = 0.03  # rad from which on a face is turned by the TCP and not by noise
+FEWEST_FOR_ARM = 9  # scans
+FACTORY_RAD, FACTORY_M = 8e-4, 5e-4  # joint zeros and link lengths of a new arm, one sigma
 _STEP_RAD, _STEP_M = 1e-4, 1e-3  # of numerical derivatives
 _ANOTHER_ARM_M = 1e-3  # residuals below which the arm is the right one
 _SIBLING_M = 0.1  # that arms may differ by in the same joints
@@ -214,16 +216,17 @@ def _two_states(case: Case, null: Fit, T: Array, state: Array) -> tuple[float, F
 
 def kinematics(case: Case, null: Fit) -> Explained | None:
     """Other joint zeros and link lengths than those by which the poses were computed."""
-    if not case.robot or case.n < 9:
+    if not case.robot or case.n < FEWEST_FOR_ARM:
         return None
     try:
         arm = load_chain(case.robot)
     except InputError:
         return None
     best = another_arm(case, null, arm)
+    bare = replace(case, arm=None)
     for q in joint_angles(case, arm):
         D, T, prior, names = _arm_columns(case, arm, q)
-        one = fit(case, columns=D, turning=T, prior=prior, start=null)
+        one = fit(bare, columns=D, turning=T, prior=prior, start=null)
         if best is None or one.bic < best.bic:
             made = np.linalg.norm(D @ one.a - (D @ one.a).mean(axis=0), axis=1)
             worst = int(np.argmax(np.abs(one.a) * np.linalg.norm(D, axis=(0, 1))))
@@ -232,6 +235,27 @@ def kinematics(case: Case, null: Fit) -> Explained | None:
                 "wrong kinematics file", one.bic, one, float(np.sqrt((made**2).mean())), numbers, (names[worst],)
             )
     return best
+
+
+def with_arm_errors(case: Case) -> Case:
+    """The case with the errors of its arm as it leaves the factory, on the branch of joint angles that suits the scans best."""
+    if not case.robot or case.n < FEWEST_FOR_ARM:
+        return case
+    try:
+        arm = load_chain(case.robot)
+    except InputError:
+        return case
+    best: tuple[float, Case] | None = None
+    for q in joint_angles(case, arm):
+        D, T, usual, _ = _arm_columns(case, arm, q)
+        one = replace(
+            case,
+            arm=ArmErrors(D, T, usual * np.where(usual == _ZERO_RAD, FACTORY_RAD / _ZERO_RAD, FACTORY_M / _LENGTH_M)),
+        )
+        bic = fit(one).bic
+        if best is None or bic < best[0]:
+            best = bic, one
+    return case if best is None else best[1]
 
 
 def another_arm(case: Case, null: Fit, arm: Chain) -> Explained | None:

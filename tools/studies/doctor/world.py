@@ -48,8 +48,8 @@ def make_world(seed: int, *, alike: bool = False) -> World:
     name = ARMS[int(rng.integers(len(ARMS)))]
     reach = 1.0 if name == "ur10e" else 0.72
     believed = load_chain(name)
-    true = _off(believed, rng, 8e-5)
-    zeros = np.radians(rng.normal(0.0, 0.006, believed.n))
+    true = _off(believed, rng, 2e-4)
+    zeros = np.radians(rng.normal(0.0, 0.02, believed.n))
     at = reach * np.array([0.62, 0.0, 0.95]) + rng.normal(0.0, 0.05, 3)
     look = Rotation.from_euler(
         "xyz", [180.0 + rng.normal(0, 6), rng.normal(0, 6), rng.uniform(-180, 180)], degrees=True
