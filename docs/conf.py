@@ -15,6 +15,10 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "comma
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_extensions"]
 
+# "--option" stays as it is typed, and `names` of docstrings are code.
+smartquotes = False
+default_role = "code"
+
 # Links to headings, as GitHub makes them.
 myst_heading_anchors = 4
 

@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 from tests.documents.blocks import DOCUMENTS
-from tests.documents.execution import FAILED, LEFT_OUT, SHORT, WRITTEN, Executed, execute_page
+from tests.documents.execution import FAILED, LEFT_OUT, SHORT, WRITTEN, Check, Executed, execute_page
 
 
 def arguments() -> argparse.Namespace:
@@ -43,11 +43,12 @@ def main() -> int:
         return asked.list or not wanted
 
     results: list[Executed] = []
+    check = Check(asked.full, skip)
     with tempfile.TemporaryDirectory(prefix="weldcal-docs-") as scratch:
         for number, page in enumerate(pages):
             folder = Path(scratch) / f"{number:02d}-{page.stem}"
             folder.mkdir()
-            for done in execute_page(page, folder, full=asked.full, skip=skip):
+            for done in execute_page(page, folder, check):
                 report(done)
                 results.append(done)
     counts = Counter(done.how for done in results)

@@ -30,9 +30,10 @@ ELSEWHERE = {
 }
 # What is long is shortened: a pattern of the line, and its short form. The long form runs with `--full`.
 SHORT = (
-    (r"demo( s_groove| straight_groove)?$", r"demo --scenario short.yaml"),
-    (r"demo --scenario (straight_groove|s_groove|my_cell/cell\.yaml)", r"demo --scenario short.yaml"),
-    (r"demo (--robot|--record|--seed)", r"demo --scenario short.yaml \1"),
+    (r"^demo( s_groove| straight_groove)?$", r"demo --scenario short.yaml"),
+    (r"^demo --scenario (straight_groove|s_groove)", r"demo --scenario short.yaml"),
+    (r"^demo --scenario my_cell/cell\.yaml", r"demo --scenario short_cell.yaml"),
+    (r"^demo (--robot|--record|--seed)", r"demo --scenario short.yaml \1"),
     (r"(benchmark hand-eye) --data \S+", r"\1 --quick"),
     (r"(benchmark mountings) --runs 3", r"\1 --runs 1 --scenario eye_on_base"),
     (r"benchmark robot-faults$", "benchmark robot-faults --sequences 1 --seconds 5"),

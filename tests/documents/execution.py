@@ -6,13 +6,12 @@ import contextlib
 import io
 import os
 import shlex
-import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.documents.blocks import Block, blocks_of, is_command
@@ -38,14 +37,21 @@ class Executed:
     said: str = ""
 
 
+@dataclass(frozen=True)
+class Check:
+    """How pages are checked: nothing shortened or what is long, without the lines that `skip` names, and without executing twice
+    what an earlier page has executed (`done`: how, by its words) and leaves nothing for its own page."""
+
+    full: bool = False
+    skip: Callable[[str], bool] = lambda _: False
+    done: dict[tuple[str, ...], str] = field(default_factory=dict)
+
+
 class Page:
     """A reader of one page: a folder of their own, what runs beside, and the names that earlier Python blocks have defined."""
 
-    def __init__(
-        self, folder: Path, entry_points: str, *, full: bool = False, skip: Callable[[str], bool] | None = None
-    ):
-        self.folder, self.entry_points, self.full = folder, entry_points, full
-        self.skip = skip or (lambda _: False)
+    def __init__(self, folder: Path, entry_points: str, check: Check | None = None) -> None:
+        self.folder, self.entry_points, self.check = folder, entry_points, check or Check()
         self.names: dict[str, object] = {}
         self.beside = ExitStack()
         self.environment = {**os.environ, "BROWSER": "true", "OMP_NUM_THREADS": "1"}
@@ -74,9 +80,12 @@ class Page:
     def _command(self, line: CommandLine, made: tuple[str, ...]) -> str:
         if line.elsewhere or not is_command(line.text):
             return ELSEWHERE
-        if self.skip(line.name) or (needs_data(line.name) and not SHARED_DATA.exists()):
+        if self.check.skip(line.name) or (needs_data(line.name) and not SHARED_DATA.exists()):
             return LEFT_OUT
-        arguments = line.arguments(full=self.full)
+        arguments = line.arguments(full=self.check.full)
+        leaves_nothing = not line.makes and not line.server
+        if leaves_nothing and tuple(arguments) in self.check.done:
+            return self.check.done[tuple(arguments)]
         lay_out(shlex.join(arguments), self.folder, made)
         if ROBOT in line.name:
             self._emulated_robot()
@@ -89,7 +98,10 @@ class Page:
             )  # fmt: skip
             if finished.returncode != 0:
                 raise RuntimeError(f"exit code {finished.returncode}: {' '.join(finished.stderr.split())[-600:]}")
-        return WRITTEN if shlex.join(arguments) in (line.name, line.name.replace(ROBOT, EMULATED)) else SHORT
+        how = WRITTEN if shlex.join(arguments) in (line.name, line.name.replace(ROBOT, EMULATED)) else SHORT
+        if leaves_nothing:
+            self.check.done[tuple(arguments)] = how
+        return how
 
     def _emulated_robot(self) -> None:
         """Start the emulated robot that takes the place of the real one, once for the page."""
@@ -98,7 +110,7 @@ class Page:
             self._serve(["emulate-ur", "--host", EMULATED, "--control-port", "30091"])
 
     def _serve(self, arguments: list[str]) -> None:
-        """Start a server, wait for what it says first, and end it with the page as Ctrl-C would."""
+        """Start a server, wait for what it says first, and end it with the page, as a person does."""
         said = (self.folder / f"server{len(list(self.folder.glob('server*')))}.log").open("w+")
         server = subprocess.Popen(
             process(arguments), cwd=self.folder, env=self.environment, stdout=said, stderr=subprocess.STDOUT,
@@ -106,7 +118,7 @@ class Page:
         )  # fmt: skip
 
         def end() -> None:
-            server.send_signal(signal.SIGINT)
+            server.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 server.wait(30)
             server.kill()
@@ -141,11 +153,9 @@ def entry_points_of(pages: list[Path]) -> str:
     return next((block.text for page in pages for block in blocks_of(page) if block.kind == "toml"), "")
 
 
-def execute_page(
-    page: Path, folder: Path, *, full: bool, skip: Callable[[str], bool] | None = None
-) -> Iterator[Executed]:
+def execute_page(page: Path, folder: Path, check: Check) -> Iterator[Executed]:
     """Execute all blocks of a page in order."""
-    reader = Page(folder, entry_points_of([ROOT / "docs" / "developers.md"]), full=full, skip=skip)
+    reader = Page(folder, entry_points_of([ROOT / "docs" / "developers.md"]), check)
     with reader.beside:
         for block in blocks_of(page):
             yield from reader.execute(block)

@@ -76,6 +76,16 @@ def _calibration(path: Path) -> None:
         weldcal.calibrate(write_scans(Path(folder) / "scans", 12, 0), out=path)
 
 
+def _demo(path: Path) -> None:
+    """The result of a demo on a short seam: a minute."""
+    from weldcal.tools.cli.app import app
+
+    scenario = path.parents[1] / "short.yaml"
+    PROPS["short.yaml"](scenario)
+    words = ["demo", "--no-browser", "--scenario", str(scenario), "--out", str(path)]
+    assert CliRunner().invoke(app, words).exit_code == 0
+
+
 def _profiler(name: str) -> Callable[[Path], None]:
     """One set of the fixed profiler files, in mm, with the names of docs/profiler.md."""
 
@@ -127,8 +137,10 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "my_result": _calibration,
     "my_cell": lambda path: write_cell(path, "s_groove"),
     "short.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
+    "short_cell.yaml": lambda path: path.write_text(f"extends: my_cell/cell.yaml\n{SHORT_JOB}", encoding="utf-8"),
+    "weldcal-out/demo-s_groove-seed0": _demo,
     "my_cell.yaml": lambda path: path.write_text(HELD_AFTER_3_S, encoding="utf-8"),
-    "my_scenario.yaml": lambda path: path.write_text(HELD_AFTER_3_S, encoding="utf-8"),
+    "my_scenario.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "touches.csv": lambda path: write_visit(path.parent),
     "edge.npz": _profiler("edge"),
     "sphere.npz": _profiler("sphere"),

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import weldcal
 from tests.documents.blocks import DOCUMENTS, FENCE, Block, all_blocks, blocks_of, is_command
 from tests.documents.command_lines import SHORT, CommandLine
-from tests.documents.execution import FAILED, WRITTEN, Page, entry_points_of
+from tests.documents.execution import ELSEWHERE, FAILED, WRITTEN, Check, Page, entry_points_of
 from tests.documents.props import PROPS, lay_out, named_in, needs_data
 from tests.documents.yaml_blocks import check_yaml
 from tests.places import ROOT, SHARED_DATA, needs
@@ -111,6 +111,16 @@ def test_a_block_of_python_that_fails_would_be_caught(tmp_path: Path) -> None:
     assert "calibrat" in done.said
 
 
+def test_a_check_executes_each_line_once_and_says_what_failed(tmp_path: Path) -> None:
+    check = Check()
+    text = "weldcal robots ur10e\nweldcal robots nobody\n./tools/run robots ur10e\n./tools/run test\n"
+    done = list(Page(tmp_path, "", check).execute(Block("docs/arms.md", 1, "sh", text)))
+    assert [step.how for step in done] == [WRITTEN, FAILED, WRITTEN, ELSEWHERE]
+    assert "exit code 1" in done[1].said
+    assert "nobody" in done[1].said
+    assert check.done == {("robots", "ur10e"): WRITTEN}
+
+
 def test_each_other_block_is_a_listing() -> None:
     others = [block for block in BLOCKS if block.kind == "text"]
     assert len(others) == LISTINGS, [named(block) for block in others]
@@ -135,6 +145,11 @@ def test_the_sentences_that_the_page_of_failures_quotes_are_those_of_the_program
     assert [text for text in quoted if text not in sources] == []
 
 
+def test_each_page_begins_with_a_paragraph() -> None:
+    beginnings = {page.relative_to(ROOT).as_posix(): page.read_text().split("\n\n")[1] for page in DOCUMENTS}
+    assert [name for name, text in beginnings.items() if not re.match(r"[A-Za-z`*\"]", text)] == []
+
+
 def test_no_command_stands_in_a_block_that_is_not_found() -> None:
     hidden = re.compile(r"^(?: {4}|\t)\$? ?(?:weldcal|\./tools/run) ", re.MULTILINE)
     assert [page.name for page in DOCUMENTS if hidden.search(FENCE.sub("", page.read_text()))] == []
@@ -153,7 +168,7 @@ def test_every_short_form_is_of_a_line_and_can_be_typed() -> None:
 
 
 def test_every_file_that_can_be_made_is_named_by_a_page() -> None:
-    named = {name for block in BLOCKS for name in named_in(block.text)} | {"short.yaml"}
+    named = {name for block in BLOCKS for name in named_in(block.text)} | {"short.yaml", "short_cell.yaml"}
     assert set(PROPS) - named == set()
 
 

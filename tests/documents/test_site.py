@@ -11,6 +11,7 @@ import pytest
 import typer.main
 
 import weldcal
+from tests.browser import Browser, colours
 from tests.documents.blocks import DOCUMENTS
 from tests.places import ROOT
 from weldcal.tools.cli.app import app
@@ -46,11 +47,24 @@ def test_the_four_parts_are_in_the_navigation(site: Path) -> None:
     ]
 
 
-def test_a_search_finds_words_in_an_index_that_is_a_file_of_the_site(site: Path) -> None:
-    index = (site / "searchindex.js").read_text()
-    assert index.startswith("Search.setIndex(")
-    assert all(f'"{word}"' in index or f"{word}:" in index for word in ("charuco", "urscript", "polyscop"))
-    assert "searchindex.js" in (site / "search.html").read_text()
+def test_a_search_without_a_network_finds_the_page_that_explains_a_word(site: Path, browser: Browser) -> None:
+    browser.open(site / "search.html")
+    browser.run("location.search = '?q=charuco'")
+    browser.wait("document.querySelectorAll('#search-results li a').length > 1")
+    links = browser.run("return [...document.querySelectorAll('#search-results li a')].map(link => link.href)")
+    assert isinstance(links, list)
+    assert any(link.partition("?")[0].endswith("/sensors.html") for link in links)
+    assert [name for name in browser.outside_addresses() if not name.startswith("file:")] == []
+
+
+def test_a_page_fits_a_phone(site: Path, browser: Browser, tmp_path: Path) -> None:
+    browser.resize(390, 844)
+    try:
+        browser.open(site / "first_hour" / "your_scans.html")
+        assert browser.run("return document.documentElement.scrollWidth <= 390")
+        assert colours(browser.screenshot(tmp_path / "phone.png")) > 4
+    finally:
+        browser.resize(1280, 800)
 
 
 def test_the_reference_has_every_command_with_every_option(site: Path) -> None:
