@@ -18,7 +18,13 @@ HAND_EYE = {
 ROBOT_WORLD = {"SHAH": cv2.CALIB_ROBOT_WORLD_HAND_EYE_SHAH, "LI": cv2.CALIB_ROBOT_WORLD_HAND_EYE_LI}
 MOST_COMPARED = 200
 """Poses that a command fits these methods to: their time and memory grow with the square of the number."""
+_MANY = 1000  # pairs from which on half as many are compared
 METHODS = (*HAND_EYE, *ROBOT_WORLD)
+
+
+def most_compared(n: int) -> int:
+    """Poses of each fold that a command fits OpenCV's methods to, of n pairs."""
+    return MOST_COMPARED if n <= _MANY else MOST_COMPARED // 2
 
 
 def opencv_solve(method: str, F: Array, G: Array) -> tuple[Array, Array] | None:

@@ -17,7 +17,7 @@ from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
 from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
-from weldcal.calibration.hand_eye.opencv_methods import METHODS, MOST_COMPARED, opencv_held_out
+from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
 from weldcal.calibration.motion.pose_streams import is_stream_file, read_streams, synchronise
@@ -198,7 +198,7 @@ def _compare(problem: Problem, ours: HandEyeResult) -> tuple[MethodRow, ...]:
     rows = [MethodRow("weldcal", ours.held_out.rms_deg, 1e3 * ours.held_out.rms_translation)]
     if problem.free == (True, True, False):
         for m in METHODS:
-            held = opencv_held_out(m, problem.F, problem.G, most=MOST_COMPARED)
+            held = opencv_held_out(m, problem.F, problem.G, most=most_compared(len(problem.F)))
             whole = bool(np.isfinite(held.translation).all())
             rows.append(
                 MethodRow(

@@ -7,7 +7,7 @@ import numpy as np
 
 from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
-from weldcal.calibration.hand_eye.opencv_methods import MOST_COMPARED
+from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
 from weldcal.calibration.motion.pose_streams import Synchronised
 from weldcal.calibration.planning.next_pose import NextPose
@@ -100,8 +100,9 @@ class HandEyeReport:
         if self.corners:
             lines += ["", self.corners]
         if self.comparison:
-            few = 0.8 * len(r.inliers) > MOST_COMPARED
-            note = f"   (OpenCV's methods: fitted to {MOST_COMPARED} of the poses)" if few else ""
+            most = most_compared(len(r.inliers))
+            few = 0.8 * len(r.inliers) > most
+            note = f"   (OpenCV's methods: fitted to {most} of the poses)" if few else ""
             lines += ["", f"method        held-out deg   held-out mm{note}"]
             for c in self.comparison:
                 failed = not (np.isfinite(c.deg) and np.isfinite(c.mm))

@@ -1,5 +1,7 @@
 """Computes the weld job's settings from scenario and station: feature, poses, stop criterion, servo."""
 
+from dataclasses import replace
+
 import numpy as np
 from pydrake.math import RigidTransform
 
@@ -75,8 +77,8 @@ def seated_tip(station: Station, seam: int = 0) -> Seated:
     return numbered(cad, seam).seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
 
 
-def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
-    """Plan all calibration and verification poses, best first, checked for reach, visibility and clearance.
+def plan_poses(scenario: Scenario, station: Station, seed: int, *, count: int | None = None) -> tuple[PlannedPose, ...]:
+    """Plan all calibration and verification poses, or ``count``, best first, checked for reach, visibility and clearance.
 
     Raises:
         UnreachableScanner: no such set of poses exists for the scanner at its nominal pose.
@@ -95,12 +97,17 @@ def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[Planned
         work_point_B=tuple(work_point(scenario)),
         surroundings=station.surroundings,
     )
+    if count is not None:
+        # from half as many candidates again, which may lie closer together
+        config = replace(
+            config, candidates=max(config.candidates, 3 * count // 2), min_spacing_m=0.01, max_trials=60 * count
+        )
     poses = plan_calibration_poses(
         station.arm,
         feature_on_flange(scenario, station),
         c.mounting_guess.pose(),
         preset,
-        c.maximum_scans + c.verification_scans + SPARE_POSES,
+        c.maximum_scans + c.verification_scans + SPARE_POSES if count is None else count,
         q_start=np.deg2rad(scenario.home_deg),
         config=config,
         tool=() if tool is None else tool.capsules(),

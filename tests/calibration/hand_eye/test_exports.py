@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.common.yaml import yaml_load_file
+from pydrake.common.yaml import yaml_dump, yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.parsing import LoadModelDirectivesFromString, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import MultibodyPlant
@@ -39,6 +39,7 @@ def same(found: RigidTransform, X: RigidTransform) -> None:
 def test_yaml_and_json_hold_the_whole_pose(written: tuple[HandEyeReport, Path]) -> None:
     report, folder = written
     saved = json.loads((folder / "hand_eye.json").read_text())
+    assert (folder / "hand_eye.yaml").read_text() == yaml_dump(saved)
     for whole in (saved, yaml_load_file(str(folder / "hand_eye.yaml"))):
         for symbol, X in (("X_FC", report.result.X), ("X_BM", report.result.Y)):
             p = whole["poses"][symbol]
