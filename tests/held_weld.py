@@ -45,6 +45,7 @@ class HeldWeld:
     largest_m: float
     left_out_m: float
     welded_twice_m: float
+    live: LiveView
 
 
 def held_weld(scenario: Scenario, open_sink: OpenSink | None = None) -> HeldWeld:
@@ -78,4 +79,4 @@ def held_weld(scenario: Scenario, open_sink: OpenSink | None = None) -> HeldWeld
     twice = -float(np.diff(error.s).min())
     left_out = float(np.diff(np.sort(error.s[near])).max())
     still_ms = 1e3 * float(times[still] - times[off])
-    return HeldWeld(run, still_ms, float(aside.mean()), float(aside.max()), left_out, twice)
+    return HeldWeld(run, still_ms, float(aside.mean()), float(aside.max()), left_out, twice, live)
