@@ -17,7 +17,6 @@ from weldcal.systems.runner import run_cell
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.emulators.ur.process import LOCKSTEP_S, Emulator, emulator_process
-from weldcal.welding.servo.interruption import OVERLAP_M
 
 AWAY_RAD = 0.8
 MOVING_S, HELD_S = 0.6, 0.6
@@ -87,4 +86,4 @@ def test_a_held_weld_is_finished_over_the_join() -> None:
     assert found.run.held_by_person == 1
     assert found.still_ms < 100.0
     assert found.mean_m <= 0.15e-3
-    assert found.welded_twice_m > OVERLAP_M - 1e-3, "the join lies in what is welded twice"
+    assert found.welded_twice_m > 4e-3, "the join lies in what is welded twice"

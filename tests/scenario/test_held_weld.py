@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.held_weld import HELD_AT_M, HeldWeld, held_weld, short_weld
+from tests.held_weld import HeldWeld, held_weld, short_weld
 from weldcal.systems.runner import Run
 from weldcal.tools.commands.record import RunRecorder
 from weldcal.tools.commands.replay import replay
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import weld_outcome
-from weldcal.welding.servo.interruption import OVERLAP_M
 
 
 @pytest.fixture(scope="module")
@@ -36,8 +35,7 @@ def test_a_held_weld_is_finished_over_the_join(held: tuple[HeldWeld, Path]) -> N
     assert found.mean_m <= 0.15e-3
     assert found.largest_m <= 0.3e-3
     assert found.left_out_m < 0.3e-3
-    assert OVERLAP_M - 1e-3 < found.welded_twice_m < OVERLAP_M + 1e-3
-    assert HELD_AT_M > OVERLAP_M
+    assert 4e-3 < found.welded_twice_m < 6e-3
 
 
 def test_the_page_shows_how_far_the_seam_is_beside_the_plan(held: tuple[HeldWeld, Path]) -> None:
