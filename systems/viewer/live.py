@@ -14,6 +14,7 @@ from weldcal.systems.jobs.weld.welding_velocity_servo import ServoReport
 from weldcal.systems.messages import JobCommand, PlannedSeam
 from weldcal.systems.motion.spine import JobPorts
 from weldcal.systems.wiring import Wiring
+from weldcal.welding.servo.state import Phase
 
 PERIOD_S = 0.1
 ACTIVE = ("TRACK", "COAST", "FINISH", "HELD", "BACK")
@@ -21,11 +22,12 @@ ACTIVE = ("TRACK", "COAST", "FINISH", "HELD", "BACK")
 
 
 class WeldRow(NamedTuple):
-    """One row of the weld's plots: time s, torch along the seam m, the felt seam to the left of the planned one m, deflection m, torch
+    """One row of the weld's plots: time s, torch and tip along the seam m, the felt seam to the left of the planned one m, deflection m, torch
     speed m/s, whether the torch is on; NaN where there is no value."""
 
     time: float
     s_torch: float
+    s_tip: float
     offset: float
     deflection: float
     speed: float
@@ -108,8 +110,9 @@ class LiveWriter(LeafSystem):
             plan = planned.seam.frame(planned.seam.nearest(d.p_BTorch_target, d.s_torch))
             offset = float((d.p_BTorch_target - plan.position) @ plan.normal)
         # past the seam's end the tip feels nothing
-        deflection = math.nan if report.phase == "FINISH" else d.delta_n
-        self._view.weld.append(WeldRow(report.time, d.s_torch, offset, deflection, speed, report.torch_on))
+        past = report.state is not None and report.state.phase == Phase.FINISH
+        deflection = math.nan if past else d.delta_n
+        self._view.weld.append(WeldRow(report.time, d.s_torch, d.s_tip, offset, deflection, speed, report.torch_on))
 
 
 def add_live_view(wiring: Wiring, ports: JobPorts, view: LiveView) -> LiveWriter:

@@ -57,7 +57,7 @@ def welding(live: LiveView, sigma_min: float = 0.3) -> None:
     shown = {"servo_report": report, "planned_seam": PlannedSeam(1, SEAM)}
     live.moment = Moment(40.0, JobCommand(phase="weld", mode="weld"), shown, sigma_min)
     s = np.linspace(0.0, 0.05, 60)
-    live.weld[:] = [WeldRow(30.0 + 100.0 * x, x, 4e-4 * math.sin(60.0 * x), 1.9e-3, 8e-3, True) for x in s]
+    live.weld[:] = [WeldRow(30.0 + 100.0 * x, x, x + 0.03, 4e-4 * math.sin(60.0 * x), 1.9e-3, 8e-3, True) for x in s]
 
 
 @pytest.fixture

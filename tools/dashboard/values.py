@@ -138,8 +138,11 @@ def _next_pose(facts: Facts, status: CalibrationStatus, pose: NextPose) -> str:
 
 
 def weld_rows(rows: Sequence[WeldRow]) -> list[list[float | None]]:
-    """Rows of the weld's plots: time s, mm of seam, mm beside the plan, mm of deflection, mm/s."""
-    return [[number(r.time, 2), mm(r.s_torch, 2), mm(r.offset), mm(r.deflection), mm(r.speed, 2)] for r in rows]
+    """Rows of the weld's plots: time s, mm of seam of torch and tip, mm beside the plan, mm of deflection, mm/s."""
+    return [
+        [number(r.time, 2), mm(r.s_torch, 2), mm(r.s_tip, 2), mm(r.offset), mm(r.deflection), mm(r.speed, 2)]
+        for r in rows
+    ]
 
 
 def scan_rows(rows: Sequence[ScanRow]) -> list[list[float | None]]:

@@ -14,7 +14,7 @@ from weldcal.tools.studies.weld.budgets import NOMINAL
 from weldcal.tools.studies.weld.groove import SEAT_M
 from weldcal.welding.record.process import path_error
 from weldcal.welding.seam.curve import SeamCurve
-from weldcal.welding.servo.interruption import OVERLAP_M, RAMP_S, Interruption, interruptible_step
+from weldcal.welding.servo.interruption import RAMP_S, Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig, TouchConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
 
@@ -98,7 +98,7 @@ def test_a_held_weld_goes_on_over_its_crater_and_the_join_is_as_good_as_the_rest
 
 
 def test_the_way_back_is_the_overlap_and_never_before_the_seams_begin(monkeypatch: pytest.MonkeyPatch) -> None:
-    for place, least, most in ((0.015, OVERLAP_M, OVERLAP_M + 0.2 * MM), (0.002, 1.0 * MM, 2.5 * MM)):
+    for place, least, most in ((0.015, 5.0 * MM, 5.2 * MM), (0.002, 1.0 * MM, 2.5 * MM)):
         held = Held(place, held_s=1e9)
         ways = []
 

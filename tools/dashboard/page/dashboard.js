@@ -54,9 +54,13 @@ function plot(id, points, o) {
 const nice = v => { const e = Math.pow(10, Math.floor(Math.log10(Math.max(v, 1e-6)))); return [1, 2, 5, 10].map(k => k * e).find(k => k >= v - 1e-12); };
 const largest = (points, least) => points.reduce((m, p) => p[1] === null ? m : Math.max(m, Math.abs(p[1])), least);
 
-function thinned(all, column) {
-  const step = Math.max(1, Math.floor(all.length / 500));
-  return all.filter((_, k) => k % step === 0 || k === all.length - 1).map(r => [r[1], r[column]]);
+// Columns of a row of the weld: time, torch and tip along the seam, and the three that are drawn.
+const TORCH = 1, TIP = 2, OFFSET = 3, DEFLECTION = 4, SPEED = 5;
+
+function drawn(along, column, length) {
+  const on = rows.weld.filter(r => r[along] !== null && r[along] >= 0 && r[along] <= length);
+  const step = Math.max(1, Math.floor(on.length / 500));
+  return on.filter((_, k) => k % step === 0 || k === on.length - 1).map(r => [r[along], r[column]]);
 }
 
 const known = {};  // of a weld that is over
@@ -64,8 +68,7 @@ const known = {};  // of a weld that is over
 function drawWeld(v) {
   known.length = v.weld ? v.weld.length_mm : known.length || Math.max(1, ...rows.weld.slice(-1).map(r => r[1] || 1));
   const length = known.length, x = [0, length], limits = v.limits;
-  const on = rows.weld.filter(r => r[1] !== null && r[1] >= 0 && r[1] <= length);
-  const offset = thinned(on, 2), deflection = thinned(on, 3), speed = thinned(on, 4);
+  const offset = drawn(TORCH, OFFSET, length), deflection = drawn(TIP, DEFLECTION, length), speed = drawn(TORCH, SPEED, length);
   const reach = Math.max(0.5, nice(largest(offset, 0.1)));
   plot("plot_offset", offset, { x, y: [-reach, reach], unit: "mm of seam", places: 1, limit: 0, limitName: "plan" });
   const wanted = limits.deflection || known.wanted, band = limits.band || known.band, target = limits.speed || known.target;
