@@ -33,6 +33,7 @@ from weldcal.welding.servo.touch import touch_start_pose
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
 CLEAR_OF_PART_M = 0.002
+HIGHER = (1.0, 2.0, 4.0)  # of the clearance above the seam, until the moves are clear
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -59,7 +60,7 @@ class SeamPlanning:
     def waypoints(
         self, seam: SeamCurve, X_BP: RigidTransform | None
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Joint positions of the approach; see arm_waypoints.
+        """Joint positions of the approach; see arm_waypoints. Beside a high part they are higher above the seam than the clearance.
 
         Raises:
             WeldcalError: the seam is not feasible, the tool has no room beside the part at X_BP, it is out of reach, or something is in
@@ -70,12 +71,19 @@ class SeamPlanning:
             check_room(self.workpiece.mesh, X_BP, seam, tool.capsules(), tool.X_FT, tool.chord_m)
             check_ends(self.workpiece.mesh, X_BP, seam, tool.chord_m, tool.tip_radius_m)
         check_feasible(seam, self.tool.chord_m, self.config.weld_speed_m_s)
-        q_start, q_above, q_retract = arm_waypoints(
-            self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m
-        )
-        check_weld_path(self, seam, q_start, q_above, q_retract)
-        if X_BP is not None:
-            check_moves(self, X_BP, q_above, q_retract)
+        for share in HIGHER:
+            clearance_m = share * self.clearance_m
+            q_start, q_above, q_retract = arm_waypoints(
+                self.arm, self.tool, seam, self.config, self.q_near, clearance_m
+            )
+            try:
+                check_weld_path(self, seam, q_start, q_above, q_retract)
+                if X_BP is not None:
+                    check_moves(self, X_BP, q_above, q_retract)
+                break
+            except SeamObstructed:
+                if share == HIGHER[-1]:
+                    raise
         return q_start, q_above, q_retract
 
 
@@ -215,8 +223,8 @@ def check_moves(
     for way, a, b in (("to the seam", planning.q_near, q_above), ("from the seam", q_retract, planning.q_near)):
         if part.touched_on_path(planning.arm, bodies, a, b):
             raise SeamObstructed(
-                f"The arm or its tool would touch the part on its way {way}: set welding.clearance_mm larger than "
-                f"{1e3 * planning.clearance_m:.0f}, choose another home_deg, or turn the part."
+                f"The arm or its tool would touch the part on its way {way}, even {1e3 * HIGHER[-1] * planning.clearance_m:.0f} mm "
+                "above the seam: choose another home_deg, or turn the part."
             )
 
 

@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
-FINE_PLACES, FINE_RIVALS = 10, 5
+COARSE_PLACES, FINE_PLACES, FINE_RIVALS = 24, 10, 5
 NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
@@ -124,9 +124,13 @@ def _check_size(scan: PreparedScan, model: PartModel) -> None:
 def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
     """Poses from the search, fitted to the coarse points, best first."""
     scored: list[tuple[float, RigidTransform]] = []
-    for place in rough_places(scan, model, config):
+    places = [place.X_BP for place in rough_places(scan, model, config)]
+    if len(places) > COARSE_PLACES:
+        every = [agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score for X in places]
+        places = [places[k] for k in np.argsort(every)[::-1][:COARSE_PLACES]]
+    for place in places:
         # A flat part may slide along itself in the coarse fit, so the pose before it is compared too.
-        tried = (place.X_BP, coarse_fit(scan, model, place.X_BP, COARSE_GATES))
+        tried = (place, coarse_fit(scan, model, place, COARSE_GATES))
         some = [
             (agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X)
             for X in tried
@@ -218,7 +222,11 @@ def _rotvec(X: RigidTransform) -> Floats:
 def _check_fit(best: _Judged, config: PartConfig) -> None:
     """Raise PartNotFound where the best pose does not agree with the scan."""
     a = best.agreement
-    if a.n_met < config.min_points or a.seen < config.min_seen:
+    if a.n_met < config.min_points:
+        raise PartNotFound(
+            f"The scan shows only {a.n_met} points of the part, and {config.min_points} are needed: clear the view, or scan from nearer."
+        )
+    if a.seen < config.min_seen:
         raise PartNotFound(
             f"The scan shows only {100 * a.seen:.0f} % of the part's visible surface ({a.n_met} points): clear the view or scan from elsewhere."
         )
