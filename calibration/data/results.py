@@ -57,7 +57,10 @@ class CalibrationResult:
     ``clock`` of the scanner and ``clock_covariance`` (6 + K, 6 + K) of X_BC and its offset (s), drift and rolling time (s), as far as
     they were estimated, where the calibration was made in motion;
     With the ``configuration`` eye_in_hand ``X_BC`` holds X_FC, and ``target`` the centre (3,) m and normal (3,) of what was seen, in the base.
-    ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans."""
+    ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of
+    what --refine local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
+    ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean (quaternion wxyz) of
+    the flange's in the base, and how far they lie from it at most (deg)."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -82,6 +85,10 @@ class CalibrationResult:
     clock_covariance: Array | None = None
     configuration: str = ON_BASE
     target: tuple[Array, Array] | None = None
+    local_field: dict[str, Any] | None = None
+    kinematics_file: str = ""
+    arm_errors: dict[str, Any] | None = None
+    orientations: dict[str, Any] | None = None
 
     @property
     def symbol(self) -> str:
@@ -154,6 +161,10 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
             "matrix": [[float(v) for v in row] for row in result.clock_covariance],
         },
         "axis_turn_deg": None if result.axis_turn_deg is None else list(result.axis_turn_deg),
+        **({} if result.local_field is None else {"local_field": result.local_field}),
+        **({} if not result.kinematics_file else {"kinematics_file": result.kinematics_file}),
+        **({} if result.orientations is None else {"orientations": result.orientations}),
+        **({} if result.arm_errors is None else {"arm_errors": result.arm_errors}),
         "held_out_mm": {k: v if np.isfinite(v) else None for k, v in result.held_out_mm.items()},
         "tilt_deg": result.tilt_deg,
         "sigma_position_mm": result.sigma_position_mm,
@@ -227,6 +238,10 @@ def load_result(path: Path) -> CalibrationResult:
         joint_covariance=joint,
         axis_turn_deg=None if turn is None else (float(turn[0]), float(turn[1])),
         software=d.text("software"),
+        local_field=d.values.get("local_field"),
+        kinematics_file=d.text("kinematics_file"),
+        arm_errors=d.values.get("arm_errors"),
+        orientations=d.values.get("orientations"),
         clock=clock_from_document(d.values.get("clock"), path.name),
         clock_covariance=_covariance(d, "clock_covariance", len(d.section("clock_covariance").items("matrix")))
         if d.has("clock_covariance")
@@ -303,16 +318,22 @@ def export_ur_pose(X_BC: RigidTransform) -> str:
 
 
 def correction_note(result: CalibrationResult) -> str | None:
-    """Note for users of X_BC in other programs that it applies to corrected points; None without a correction."""
-    c = result.scanner_correction
-    if c is None:
-        return None
-    correction = correction_from_document(c)
-    assert correction is not None
-    return (
-        "X_BC applies to corrected scanner points: multiply every point (x, y, z), in metres, by "
-        f"{correction.formula} before use, or calibrate with --no-scanner-correction."
-    )
+    """Note for users of X_BC in other programs that it applies to corrected points; None where it needs none."""
+    said = []
+    correction = correction_from_document(result.scanner_correction)
+    if correction is not None:
+        said.append(
+            "X_BC applies to corrected scanner points: multiply every point (x, y, z), in metres, by "
+            f"{correction.formula} before use, or calibrate with --no-scanner-correction."
+        )
+    if result.local_field is not None:
+        said.append(
+            "This format cannot hold the local field (--refine local) of calibration.yaml: without it errors are those of the plain "
+            "calibration."
+        )
+    if result.kinematics_file:
+        said.append(f"X_BC belongs to the arm with the kinematics of {result.kinematics_file}.")
+    return " ".join(said) or None
 
 
 def result_parent(result: CalibrationResult) -> str:

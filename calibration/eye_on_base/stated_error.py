@@ -1,29 +1,42 @@
 """The error that a calibration states for scans it did not use: the limit for the median of some of them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.geometry.se3 import skew
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
 
 FALSE_ALARM = 0.01  # of verifications of a good calibration that exceed the limit
 _DRAWS = 6_000  # the limit's own error is then 1 to 2 %
 _SEED = 1
 _LEAST_FREE = 3.0
+USUAL_FIELD_M = 1.5e-4
+"""Spread per axis of what an arm leaves of a calibration from place to place."""
+USUAL_TURN_RAD = float(np.radians(10.0))
+"""Angle over which that is alike."""
 
 
 def stated_median_limit(
-    result: CalibrationResult, observations: Sequence[Observation], correction: ScannerCorrection | None
+    result: CalibrationResult,
+    observations: Sequence[Observation],
+    correction: ScannerCorrection | None,
+    scatter_m: Array | None = None,
+    shared: tuple[Array, Array] | None = None,
 ) -> float | None:
     """Limit (mm) that the median error at these new observations (n) exceeds by chance in FALSE_ALARM of verifications.
 
     The median of n errors has no closed form where all share the calibration's own error, so it is drawn: one error of pose
     and scanner correction from their joint covariance for all scans, and for each scan the spread of robot and scanner and the
     noise of its fit. The spread was estimated from few residuals, so its square is drawn as well (scaled inverse chi-square). A
+    calibration with a local field states the spread (n,) m per axis that this leaves at each scan: ``scatter_m``; one with errors of the
+    arm what these contribute: ``shared``, derivatives (n, 3, p) of the positions and the covariance (p, p) in place of the result's. A
     calibration states its held-out errors besides: their 95 % percentile counts where it is larger. None where it states no
     error at all. Deterministic.
     """
@@ -37,6 +50,8 @@ def stated_median_limit(
         joint = None  # of another correction
     J = np.array([_sensitivity(result, o, correction if joint is not None else None) for o in observations])
     whole = result.covariance if joint is None else joint
+    if shared is not None:
+        J, whole = shared
     values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     used = sum(p.used for p in result.poses)
@@ -48,12 +63,41 @@ def stated_median_limit(
     for first in range(0, _DRAWS, 1000):
         k, n = slice(first, first + 1000), len(observations)
         shared = np.einsum("nij,kj->kni", J, rng.standard_normal((1000, root.shape[1])) @ root.T)
-        sigma = 1e-3 * result.sigma_position_mm * np.sqrt(free / rng.chisquare(free, 1000))
-        scatter = sigma[:, None, None] * rng.standard_normal((1000, n, 3))
+        own_sigma = 1e-3 * result.sigma_position_mm * np.ones(n) if scatter_m is None else scatter_m
+        sigma = own_sigma * np.sqrt(free / rng.chisquare(free, 1000))[:, None]
+        scatter = sigma[:, :, None] * rng.standard_normal((1000, n, 3))
         noise = np.einsum("nij,knj->kni", fits, rng.standard_normal((1000, n, 3)))
         medians[k] = np.median(np.linalg.norm(shared + scatter + noise, axis=2), axis=1)
     limit = 1e3 * float(np.quantile(medians, 1.0 - FALSE_ALARM))
     return limit if floor is None else max(limit, floor)
+
+
+def orientations_of(observations: Sequence[Observation]) -> dict[str, Any]:
+    """Mean orientation of the flange in the base and the largest angle (deg) from it, for CalibrationResult.orientations."""
+    turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
+    mean = turned.mean()
+    x, y, z, w = (float(v) for v in mean.as_quat())
+    return {"wxyz": [w, x, y, z], "spread_deg": float(np.degrees((mean.inv() * turned).magnitude().max()))}
+
+
+def scatter_elsewhere(result: CalibrationResult, observations: Sequence[Observation]) -> Array | None:
+    """Spread (n,) m per axis of new scans, grown where the flange is turned beyond the orientations of the calibration.
+
+    What an arm leaves at one orientation says nothing of it at another: there its usual size is added, with the covariance over angles that
+    a local field has before any scan (0.15 mm per axis, 10 degrees). None where the result does not hold its orientations. Raises
+    InputError where they cannot be read.
+    """
+    if result.orientations is None:
+        return None
+    try:
+        w, x, y, z = (float(v) for v in result.orientations["wxyz"])
+        mean, spread = Rotation.from_quat([x, y, z, w]), np.radians(float(result.orientations["spread_deg"]))
+    except (KeyError, TypeError, ValueError) as problem:
+        raise InputError("The orientations in the result cannot be read; run 'weldcal calibrate' again.") from problem
+    turned = Rotation.from_matrix(np.array([o.X_BR.rotation().matrix() for o in observations]))
+    beyond = np.maximum((mean.inv() * turned).magnitude() - spread, 0.0)
+    unknown = USUAL_FIELD_M**2 * (1.0 - np.exp(-0.5 * (beyond / USUAL_TURN_RAD) ** 2))
+    return np.asarray(np.sqrt((1e-3 * result.sigma_position_mm) ** 2 + unknown))
 
 
 def _sensitivity(result: CalibrationResult, o: Observation, correction: ScannerCorrection | None) -> Array:

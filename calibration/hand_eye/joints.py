@@ -183,6 +183,15 @@ def refine_joints(
     return JointRefinement(names, values, sigma * robot.scale, True, better, said)
 
 
+def poses_of_arm(pairs: PosePairs, arm: Chain) -> PosePairs:
+    """The pairs with the poses that this arm, with kinematics of its own, reaches at their joint angles; a constant tool stays.
+
+    Raises as refine_joints does.
+    """
+    robot, _ = _robot(pairs, arm, "joints", JointPrior())
+    return replace(pairs, robot=flange_poses(arm, robot.q, np.zeros((arm.n, 6))) @ robot.tool)
+
+
 def _number(value: float, sigma: float, name: str) -> str:
     if name[-1] in "xyz" and "shift" in name:
         return f"{1e3 * value:+.2f} +- {1e3 * sigma:.2f} mm"

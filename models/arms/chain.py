@@ -52,14 +52,21 @@ def is_urdf(name: str) -> bool:
     return name.lower().endswith(".urdf")
 
 
-def load_chain(name: str) -> Chain:
-    """The arm of that name, or of a URDF file, as a chain. Raises InputError naming the known ones, or where its file is not one."""
+def load_chain(name: str, kinematics: Path | None = None) -> Chain:
+    """The arm of that name, or of a URDF file, as a chain; ``kinematics``: the file of one Universal Robots arm (see load_arm).
+
+    Raises InputError naming the known ones, where its file is not one, or for ``kinematics`` of another arm.
+    """
+    if kinematics is not None and name not in known_arms():
+        raise InputError(
+            f"A kinematics file is for a Universal Robots arm ({', '.join(known_arms())}), not for {name!r}."
+        )
     if is_urdf(name):
         if not Path(name).is_file():
             raise InputError(f"There is no file '{name}' of an arm.")
         return Chain(Path(name).name, *read_urdf_chain(Path(name)))
     if name in known_arms():
-        arm = load_arm(name)
+        arm = load_arm(name, kinematics)
         limits = (arm.position_lower, arm.position_upper, arm.velocity_limit)
         return Chain(name, arm.joint_names, arm.stack, np.eye(4), *limits)
     path = _HERE / name / "chain.yaml"

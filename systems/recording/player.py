@@ -50,16 +50,18 @@ class PortPlayer(LeafSystem):
         for name, size in inputs.items():
             self.DeclareVectorInputPort(name, size)
         self._state = self.DeclareDiscreteState([-1.0])
+        known = {self.time_ticket(), self.all_state_ticket()}  # no output depends on an input
         for name, track in tracks.items():
             first = track.values[0]
             if isinstance(first, np.ndarray) and first.ndim == 1:
-                self.DeclareVectorOutputPort(name, first.size, partial(self._vector, track))
+                self.DeclareVectorOutputPort(name, first.size, partial(self._vector, track), known)
             elif isinstance(first, RigidTransform):
                 self.DeclareAbstractOutputPort(
-                    name, lambda: AbstractValue.Make(RigidTransform()), partial(self._value, track)
+                    name, lambda: AbstractValue.Make(RigidTransform()), partial(self._value, track), known
                 )
             else:
-                self.DeclareAbstractOutputPort(name, partial(AbstractValue.Make, first), partial(self._value, track))
+                make = partial(AbstractValue.Make, first)
+                self.DeclareAbstractOutputPort(name, make, partial(self._value, track), known)
         self.DeclarePeriodicUnrestrictedUpdateEvent(PERIOD_S * UPDATE_TICKS, 0.0, self._update)
 
     def _update(self, context: Context, state: State) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from weldcal.tools.cli.options import Call, Outcome, ScenarioOption, command, option, switch
+from weldcal.tools.cli.options import FARM, Call, Outcome, ScenarioOption, command, option, switch
 
 
 @command("benchmark tablet")
@@ -64,6 +64,22 @@ def part_welds(
     return Outcome(summary)
 
 
+@command("benchmark part-registration")
+def part_registration(
+    call: Call,
+    part: Annotated[list[str] | None, option("--part", "NAME", "A part; repeat for more.", show_default="all")] = None,
+    scenes: Annotated[int, option("--scenes", "N", "Scenes with clutter, without a guess.", min=0)] = 40,
+    plans: Annotated[int, option("--plans", "N", "Plans of each part's seam, seeds from --seed on.", min=0)] = 3,
+    refusals: Annotated[int, option("--refusals", "N", "Scenes of each subject that must be refused.", min=0)] = 3,
+) -> Outcome:
+    """Register twelve parts from STEP files in simulated scans, plan their seams, and compare both with the truth."""
+    from weldcal.tools.studies.parts.study import run_registration_study
+
+    folder = call.folder("benchmark", "part-registration")
+    first, second, third = (range(call.seed, call.seed + count) for count in (scenes, plans, refusals))
+    return Outcome(run_registration_study(folder, first, second, third, part, call.progress))
+
+
 @command("benchmark hand-eye")
 def hand_eye(
     call: Call,
@@ -79,7 +95,7 @@ def hand_eye(
     return Outcome(result.summary(), text=write_table(result, folder))
 
 
-@command("benchmark hand-eye-cells")
+@command("benchmark hand-eye-cells", options=FARM)
 def hand_eye_cells(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of cells of each kind.", min=1)] = 40,
@@ -87,11 +103,11 @@ def hand_eye_cells(
     """Compare held-out errors with OpenCV's best on simulated cells with a wrong camera matrix, a wrong robot, or both."""
     from weldcal.tools.studies.hand_eye.cells_against_opencv import run_cells
 
-    summary, table = run_cells(runs, call.seed, call.progress)
+    summary, table = run_cells(call.farm(call.folder("benchmark", "hand-eye-cells")), runs, call.seed)
     return Outcome(summary, text=table)
 
 
-@command("benchmark mountings")
+@command("benchmark mountings", options=FARM)
 def mountings(
     call: Call,
     runs: Annotated[int, option("--runs", "N", "Number of seeds of each.", min=1)] = 5,
@@ -102,7 +118,7 @@ def mountings(
     from weldcal.tools.studies.hand_eye.mountings import run_mountings
 
     folder, seeds = call.folder("benchmark", "mountings"), range(call.seed, call.seed + runs)
-    summary, table = run_mountings(folder, seeds, tuple(names or ()), call.progress)
+    summary, table = run_mountings(call.farm(folder), seeds, tuple(names or ()))
     if not call.json:
         typer.echo(table)
     return Outcome(summary)
@@ -130,7 +146,7 @@ def cell(call: Call) -> Mapping[str, object]:
     return run_cell_benchmark(call.folder("benchmark", "cell"), call.seed, call.progress)
 
 
-@command("benchmark seeds")
+@command("benchmark seeds", options=FARM)
 def seeds(
     call: Call,
     scenario: ScenarioOption = "s_groove",
@@ -140,10 +156,34 @@ def seeds(
     from weldcal.tools.studies.cell.seeds import run_seeds
 
     folder = call.folder("benchmark", f"seeds-{scenario}")
-    return run_seeds(scenario, folder, range(call.seed, call.seed + runs), call.progress)
+    return run_seeds(scenario, call.farm(folder), range(call.seed, call.seed + runs))
 
 
-@command("benchmark arms")
+@command("benchmark fleet", options=FARM)
+def fleet(
+    call: Call,
+    cells: Annotated[int, option("--cells", "N", "Number of cells.", min=1)] = 25,
+    datasets: Annotated[int, option("--datasets", "N", "Datasets of each.", min=1)] = 8,
+) -> Mapping[str, object]:
+    """Write made cells, some of which move, drift or break, and count what `weldcal fleet` says of them."""
+    from weldcal.tools.studies.fleet.study import run_fleet_study
+
+    return run_fleet_study(call.farm(call.folder("benchmark", "fleet")), cells, datasets, call.seed)
+
+
+@command("benchmark replay", options=FARM)
+def replays(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of runs, over all kinds in turn.", min=1)] = 20,
+) -> Outcome:
+    """Record runs of every kind (simulated, on an emulated controller, by wire, with faults), and replay each bit for bit."""
+    from weldcal.tools.studies.replay.study import run_replays
+
+    summary, table = run_replays(call.farm(call.folder("benchmark", "replay")), runs, call.seed)
+    return Outcome(summary, text=table)
+
+
+@command("benchmark arms", options=FARM)
 def arms(
     call: Call,
     names: Annotated[list[str] | None, option("--arm", "NAME", "Only this arm; repeat for more.")] = None,
@@ -157,7 +197,7 @@ def arms(
     from weldcal.tools.studies.arms.demo import ARMS, arms_table, run_arms
 
     chosen = [get_robot(name).name for name in names] if names else list(ARMS)
-    summary, rows = run_arms(call.folder("benchmark", "arms"), chosen, call.seed, seam, robot, call.progress)
+    summary, rows = run_arms(call.farm(call.folder("benchmark", "arms")), chosen, call.seed, seam, robot)
     return Outcome(summary, text=arms_table(rows))
 
 
@@ -247,12 +287,15 @@ COMMANDS = (
     tablet,
     seam_planning,
     part_welds,
+    part_registration,
     hand_eye,
     hand_eye_cells,
     mountings,
     profiler,
     cell,
     seeds,
+    fleet,
+    replays,
     arms,
     fuzz_files,
     robot_faults,

@@ -198,15 +198,33 @@ def held_out(
     call: Call,
     dataset: Annotated[Path, typer.Argument(help="A dataset folder of at least sixteen scans.")],
     draws: Annotated[int, option("--draws", "N", "Number of random halves.", min=1)] = 20,
+    local: Annotated[
+        bool, switch("--local", "Calibrate from two thirds with --refine local, and judge it on the others.")
+    ] = False,
 ) -> Outcome:
     """Calibrate from random halves of the scans: the stated held-out error and its interval, against the error on the other half."""
     from weldcal.tools.studies.flange.held_out import study_halves
     from weldcal.tools.studies.flange.tables import halves_table
 
-    return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress)))
+    return _figures(call, halves_table(study_halves(dataset, draws, call.seed, call.progress, local=local)))
 
 
-COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect, held_out)
+@command("benchmark flange-arm")
+def arm(
+    call: Call,
+    worlds: Annotated[int, option("--worlds", "N", "Number of simulated cells.", min=1)] = 40,
+    kind: Annotated[
+        str, option("--kind", "KIND", "links: all errors of the arm; joints: zeros of the joints only.")
+    ] = "links",
+) -> Outcome:
+    """Calibrate UR10e cells with factory-size errors of the arm from 20 planned scans, plain and refined, and judge both on new scans."""
+    from weldcal.tools.studies.flange.tables import arm_table
+    from weldcal.tools.studies.flange.wrong_arm import run_wrong_arm
+
+    return _figures(call, arm_table(run_wrong_arm(worlds, call.seed, kind, call.progress)))
+
+
+COMMANDS = (speed, frames, hidden, parts, honesty, live, ingredients, few, holes, imperfect, held_out, arm)
 
 
 def _figures(call: Call, table: "Table") -> Outcome:

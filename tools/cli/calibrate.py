@@ -40,6 +40,22 @@ def calibrate(
         str | None,
         option("--poses", "FROM:TO", "Of a dataset: use only the scans from one id to another, such as p09: or :p08."),
     ] = None,
+    refine: Annotated[
+        str | None,
+        option(
+            "--refine",
+            "KIND",
+            "Of a dataset: local (a field of what the calibration leaves), joints or links (errors of the arm; needs its joint angles).",
+        ),
+    ] = None,
+    kinematics: Annotated[
+        Path | None,
+        option(
+            "--kinematics",
+            "FILE",
+            "With --refine joints or links: the arm's factory calibration, which the controller uses.",
+        ),
+    ] = None,
     axis_turn: Annotated[
         float | None,
         option(
@@ -56,9 +72,9 @@ def calibrate(
         from weldcal.calibration.data.motion_dataset import is_motion
 
         if is_motion(dataset):
-            if poses is not None or axis_turn is not None:
+            if poses is not None or axis_turn is not None or refine is not None:
                 raise typer.BadParameter(
-                    "--poses and --axis-turn are for scans at rest; omit them with a recording in motion"
+                    "--poses, --refine and --axis-turn are for scans at rest; omit them with a recording in motion"
                 )
             from weldcal.tools.commands.calibrate_motion import calibrate_motion
 
@@ -80,18 +96,24 @@ def calibrate(
             correct_scanner=scanner_correction,
             axis_turn_deg=axis_turn,
             poses=poses,
+            refine=refine,
+            kinematics=kinematics,
         )
         algorithm1 = report.algorithm1
         rows = {} if algorithm1 is None else {"Algorithm 1": algorithm1.sentence}
+        if report.refinement is not None:
+            rows["refinement"] = str(report.refinement["sentence"])
         interval = report.held_out_interval_mm
         if interval is not None:
+            rows |= report.interval_rows
             rows["mean error of as many new scans"] = f"{interval[0]:.3f} to {interval[1]:.3f} mm (95 %)"
         summary = report.summary()
+        rows["error budget"] = report.budget.sentence
         return Outcome(summary, rows=rows | pose_rows(report.result.X_BC) | work_rows(summary["work_point"]))
     if scenario is None or dataset is not None:
         raise typer.BadParameter("give either a dataset folder or --scenario NAME")
-    if poses is not None:
-        raise typer.BadParameter("--poses selects scans of a dataset; omit it with --scenario")
+    if poses is not None or refine is not None or kinematics is not None:
+        raise typer.BadParameter("--poses, --refine and --kinematics are for a dataset; omit them with --scenario")
     from weldcal.tools.commands.procedures import calibrate_live
 
     found = calibrate_live(run_options(call, "calibrate", scenario, robot=robot), call.progress)

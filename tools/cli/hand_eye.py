@@ -59,10 +59,23 @@ def ax_yb(
         str | None,
         option("--refine", "KIND", "joints or links: estimate errors of the robot (needs --robot and joint angles q)."),
     ] = None,
+    kinematics: Annotated[
+        Path | None,
+        option("--kinematics", "FILE", "With --robot: the arm's own kinematics, such as calibrate --refine writes."),
+    ] = None,
 ) -> Outcome:
     """Solve AX = YB for the poses of camera and target together, and propose the next pose to add."""
     return _solve(
-        "ax-yb", call, file, mounting=mounting, unit=unit, corners=corners, robot=robot, camera=camera, refine=refine
+        "ax-yb",
+        call,
+        file,
+        mounting=mounting,
+        unit=unit,
+        corners=corners,
+        robot=robot,
+        camera=camera,
+        refine=refine,
+        kinematics=kinematics,
     )
 
 

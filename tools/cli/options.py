@@ -6,12 +6,15 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from weldcal.models.errors import InputError
 from weldcal.tools import console
+
+if TYPE_CHECKING:
+    from weldcal.tools.farm.run import Farm
 
 
 def option(name: str, metavar: str, help: str, **settings: Any) -> Any:
@@ -46,6 +49,8 @@ _ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
 _PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
 _SLOWER = "Slow the arm's moves down: 0.05 to 1. The welding speed does not change."
 _RECORD = "Also write recording.mcap, which weldcal replay plays back."
+_WORKERS = "Processes on this computer."
+_SCHEDULER = "Address of a Dask scheduler; its workers compute, with the same numbers."
 _OUT = "Output folder; default: a new one in weldcal-out."
 COMMON: dict[str, tuple[Any, object]] = {
     "browser": (Annotated[bool, switch("--browser/--no-browser", _BROWSER)], True),
@@ -56,6 +61,11 @@ COMMON: dict[str, tuple[Any, object]] = {
     "pace": (Annotated[float | None, option("--pace", "P", _PACE)], None),
     "speed_factor": (Annotated[float | None, option("--speed-factor", "X", _SLOWER)], None),
     "address": (Annotated[str | None, option("--address", "ADDRESS", _ADDRESS, show_default="a free one")], None),
+    "workers": (
+        Annotated[int | None, option("--workers", "N", _WORKERS, min=1, show_default="all cores, as memory allows")],
+        None,
+    ),
+    "scheduler": (Annotated[str | None, option("--scheduler", "ADDRESS", _SCHEDULER)], None),
     "out": (Annotated[Path | None, option("--out", "FOLDER", _OUT)], None),
     "seed": (Annotated[int, option("--seed", "N", "Seed of all random numbers; the first of several.", min=0)], 0),
     "json": (Annotated[bool, switch("--json", "Print the result as one JSON object, the last line of stdout.")], False),
@@ -65,9 +75,10 @@ COMMON: dict[str, tuple[Any, object]] = {
 
 MOTION = ("dry_run", "pace", "speed_factor")
 LIVE = ("browser", "realtime", "robot", *MOTION)
+FARM = ("workers", "scheduler")
 RESULT = ("out", "seed", "json", "debug")
 LOOK = ("json", "debug")
-"""Groups of common options: of arm motion, of a live run, of a command that writes a result, of one that only reads."""
+"""Groups of common options: of arm motion, of a live run, of a study of many tasks, of a command that writes a result, of one that only reads."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +127,12 @@ class Call:
         self.written = self.out or fresh_folder(command, name, self.seed)
         check_writable(self.written)
         return self.written
+
+    def farm(self, folder: Path) -> "Farm":
+        """Where the tasks of a study run whose results are written to ``folder``."""
+        from weldcal.tools.farm.run import Farm
+
+        return Farm(folder, self.given.get("workers"), self.given.get("scheduler"), self.progress)
 
     def progress(self, stage: str, fraction: float) -> None:
         """Shows the stage and the completed fraction (0 to 1); the first call opens the progress bar."""

@@ -47,6 +47,6 @@ def verify(
     return Outcome(
         summary,
         values={"verdict": verdict.verdict, "because": verdict.reason, **summary},
-        rows=pose_rows(report.result.X_BC),
+        rows=report.interval_rows | pose_rows(report.result.X_BC),
         problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )

@@ -16,6 +16,7 @@ from weldcal.calibration.eye_on_base.few_poses import ENOUGH, axis_turn, calibra
 from weldcal.calibration.eye_on_base.nested import calibrate_by_choice
 from weldcal.calibration.eye_on_base.observations import see_flanges
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate, SolveConfig
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
@@ -24,6 +25,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.contradictions import estimate_consistent
+from weldcal.tools.commands.refine import KINEMATICS_FILE, REFINEMENTS, Refinable, Refined, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.report.calibration import calibration_report
@@ -45,19 +47,25 @@ def calibrate_dataset(
     correct_scanner: bool = True,
     axis_turn_deg: float | None = None,
     poses: str | None = None,
+    refine: str | None = None,
+    kinematics: Path | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
     ``robot`` and ``flange`` override dataset.yaml. ``centres`` also writes centres.csv (camera frame, metres, uncorrected).
     ``correct_scanner``: estimate and apply a scanner correction. ``axis_turn_deg``: rotation of the hole pattern about the
     flange axis; with it, one to three scans that show the holes are enough. ``poses`` ("FROM:TO", ids, either may be left
-    out) takes the scans from one id to another, in the order of the dataset. A cloud that cannot be used is refused and
+    out) takes the scans from one id to another, in the order of the dataset. ``refine``: "local" adds a field of what the calibration
+    leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
+    errors fall. A cloud that cannot be used is refused and
     reported, as long as enough remain. Nothing is written unless the calibration succeeded.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
     """
     started = time.monotonic()
+    if refine is not None and refine not in REFINEMENTS:
+        raise InputError(f"There is no refinement '{refine}'. Choose one of {', '.join(REFINEMENTS)}.")
     tell: Progress = progress or (lambda stage, fraction: None)
     if Path(out).exists() and not Path(out).is_dir():
         raise InputError(f"'{out}' is a file. Give a folder for the result.")
@@ -81,8 +89,27 @@ def calibrate_dataset(
     tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
-        observations, rigid, seen.patterns, seed=seed, wanted=correct_scanner and not few
+        observations, rigid, seen.patterns, seed=seed, wanted=correct_scanner and not few, nested=refine is None
     )
+    refined: Refined | None = None
+    if refine is not None:
+        tell("refining", 0.73)
+        refined = refine_calibration(
+            refine,
+            Refinable(
+                data,
+                observations,
+                seen.patterns,
+                estimate,
+                tuple(corrected),
+                scanner,
+                robot or data.header.robot,
+                kinematics,
+            ),
+            correct_scanner=correct_scanner and not few,
+            seed=seed,
+        )
+        estimate, corrected = refined.estimate, list(refined.observations)
     outliers = tuple(o.id for o, keep in zip(observations, estimate.inliers, strict=True) if not keep)
     errors = dict(zip((o.id for o in observations), estimate.position_residuals_m, strict=True))
     refused += [
@@ -116,8 +143,12 @@ def calibrate_dataset(
             "The poses hardly differ in orientation, so they cannot show a TCP that is set at the robot: it would shift X_BC by its own "
             "length, and no figure here would tell. Check that the TCP is zero, or tilt the flange in some poses."
         )
+    if refined is not None:
+        warnings.append(refined.sentence)
     if scanner is not None and scanner.worth_saying:
         warnings.append(scanner.sentence)
+    if refined is not None and refined.correction is not None:
+        accepted = refined.correction
     correction = None if accepted is None else accepted.document()
     result = CalibrationResult(
         X_BC=estimate.X_BC,
@@ -138,6 +169,10 @@ def calibrate_dataset(
         scanner_correction=correction,
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
+        local_field=None if refined is None or refined.field is None else refined.field.document(),
+        orientations=orientations_of(inliers) if not data.pairs or all(p.has_orientation for p in data.pairs) else None,
+        arm_errors=None if refined is None else refined.arm,
+        kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
     )
     report = CalibrationReport(
@@ -156,11 +191,14 @@ def calibrate_dataset(
         sampling_advice(estimate, corrected),
         seen.patterns,
         data.notes,
+        None if refined is None else refined.document(refine or ""),
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)
     write_atomic(Path(out) / "report.html", html)
     export_all(result, Path(out))
+    if refined is not None and refined.kinematics:
+        write_atomic(Path(out) / KINEMATICS_FILE, refined.kinematics)
     if centres:
         write_atomic(Path(out) / "centres.csv", _centres_csv(observations))
     # last, so that its presence means that everything else is there

@@ -14,7 +14,7 @@ from weldcal.calibration.hand_eye.corners import CornerRefinement, poses_from_co
 from weldcal.calibration.hand_eye.determinacy import check_poses
 from weldcal.calibration.hand_eye.exports import Provenance, export_hand_eye
 from weldcal.calibration.hand_eye.files import PosePairs, read_pairs
-from weldcal.calibration.hand_eye.joints import refine_joints
+from weldcal.calibration.hand_eye.joints import poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.mistakes import likely_mistake, scale_warning
 from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, MOST_COMPARED, opencv_held_out
@@ -43,6 +43,7 @@ def run_hand_eye(
     robot: str | None = None,
     camera: str | None = None,
     refine: str | None = None,
+    kinematics: Path | None = None,
     seed: int = 0,
     say: Callable[[str], None] = lambda _: None,
 ) -> HandEyeReport:
@@ -50,7 +51,8 @@ def run_hand_eye(
 
     ``corners``: use those of the file (None: where it holds some). ``robot``, ``camera``: names of the arm and the scanner, for
     the next pose; ``refine``: "joints" or "links", errors of that robot to look for (one of corners and robot errors is applied:
-    the robot's errors are sought in the poses that the corners left).
+    the robot's errors are sought in the poses that the corners left); ``kinematics``: file of that robot's own kinematics, whose poses
+    at the joint angles replace the stated ones.
 
     Raises:
         InputError, WeldcalError: the file or the options cannot be used. Where the poses contradict each other, the
@@ -59,7 +61,9 @@ def run_hand_eye(
     begin = time.perf_counter()
     if equation not in EQUATIONS:
         raise InputError(f"There is no equation '{equation}'. Choose one of {', '.join(EQUATIONS)}.")
-    arm = None if robot is None else load_chain(robot)
+    if kinematics is not None and robot is None:
+        raise InputError("A kinematics file (--kinematics) needs the robot's name. Add --robot, for example ur10e.")
+    arm = None if robot is None else load_chain(robot, kinematics)
     scanner = None if camera is None else get_scanner(camera)
     if refine is not None and arm is None:
         raise InputError("Robot errors (--refine) need the robot's name. Add --robot, for example ur10e.")
@@ -71,6 +75,8 @@ def run_hand_eye(
         say(streams.sentence)
     pairs = read_pairs(file, mounting=mounting, length=unit) if streams is None else streams.pairs
     found = get_mounting(pairs.mode)
+    if kinematics is not None and arm is not None:
+        pairs = poses_of_arm(pairs, arm)
     if (equation == "axb-ycz") != (found.name == "co_manipulation"):
         right = "axb-ycz" if found.name == "co_manipulation" else "ax-yb"
         raise InputError(f"'{file.name}' is {found.name}. Solve it with 'weldcal hand-eye {right}'.")

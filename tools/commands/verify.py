@@ -1,18 +1,25 @@
 """`weldcal verify RESULT DATASET`: judges a calibration by its errors at the flange on scans that it did not use."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pydrake.math import RigidTransform
 
 from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, load_result
-from weldcal.calibration.data.scanner_correction import correction_from_document
+from weldcal.calibration.data.scanner_correction import ScannerCorrection, correction_from_document
 from weldcal.calibration.eye_on_base.observations import corrected_observation, see_flanges
-from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, stated_median_limit
+from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, scatter_elsewhere, stated_median_limit
 from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.joint_angles import joint_angles
+from weldcal.calibration.refinement.local_field import field_from_document
+from weldcal.calibration.refinement.stated_arm import shared_error
+from weldcal.models.arms.kinematics import forward_kinematics, load_arm
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.console import Progress
@@ -75,14 +82,24 @@ def verify_dataset(
     if not seen.observations:
         first, reason = seen.refused[0]
         raise InputError(f"None of the {len(seen.refused)} scans can be used. Reason for the first, {first}: {reason}")
+    arm_used, moved, shared = _with_kinematics(Path(result), calibration, data, seen.observations, correction)
+    seen = replace(seen, observations=moved)
     observations = tuple(o if correction is None else corrected_observation(correction, o) for o in seen.observations)
+    local = field_from_document(calibration.local_field) if correct_scanner else None
+    scatter = scatter_elsewhere(calibration, observations) if shared is None else None
+    if local is not None:
+        scatter = local.at([o.X_BR for o in observations])[1]
+        observations = tuple(local.applied(calibration.X_BC, observations))
     poses = _judge(calibration, data, observations)
-    uncorrected = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
+    uncorrected: tuple[str, ...] = () if correct_scanner or calibration.scanner_correction is None else (_UNCORRECTED,)
+    uncorrected += arm_used
     differences = _differences(calibration, data, standard.designation)
     gross = _gross(calibration, poses)
     new = [k for k, p in enumerate(poses) if not p.used_before]
     if limit_mm is None:
-        limit_mm = stated_median_limit(calibration, [observations[k] for k in new], correction)
+        spread = None if scatter is None else scatter[new]
+        ours = None if shared is None else (shared[0][new], shared[1])
+        limit_mm = stated_median_limit(calibration, [observations[k] for k in new], correction, spread, ours)
         source = f"which {100 * FALSE_ALARM:.0f} % of verifications of a calibration as good as it states exceed"
     else:
         source = "as given"
@@ -112,6 +129,37 @@ def verify_dataset(
     write_atomic(Path(out) / "verification.json", json.dumps(report.summary(), indent=2, allow_nan=False) + "\n")
     tell("done", 1.0)
     return report
+
+
+def _with_kinematics(
+    file: Path,
+    result: CalibrationResult,
+    data: Dataset,
+    observations: tuple[Observation, ...],
+    correction: ScannerCorrection | None,
+) -> tuple[tuple[str, ...], tuple[Observation, ...], tuple[Array, Array] | None]:
+    """The observations with the poses that the arm of the result's kinematics file reaches, and what it states of their errors (see
+    shared_error), or a sentence where the scans have no joint angles."""
+    if not result.kinematics_file:
+        return (), observations, None
+    q = joint_angles(data, [o.id for o in observations], 6)
+    if q is None:
+        return (
+            (
+                f"The result belongs to the arm of {result.kinematics_file}, and these scans have no joint angles (q1 to q6): the stated poses "
+                "are used.",
+            ),
+            observations,
+            None,
+        )
+    folder = file if file.is_dir() else file.parent
+    arm = load_arm(result.robot, folder / result.kinematics_file)
+    X_FR = RigidTransform() if data.pairs else data.X_FR
+    poses = (forward_kinematics(arm, each) @ X_FR for each in q)
+    moved = tuple(replace(o, X_BR=X) for o, X in zip(observations, poses, strict=True))
+    if correction is None and result.scanner_correction is not None:
+        return (), moved, None  # what is stated is that of corrected scans
+    return (), moved, shared_error(result, folder / result.kinematics_file, correction, moved, q)
 
 
 def _judge(result: CalibrationResult, data: Dataset, observations: tuple[Observation, ...]) -> tuple[PoseError, ...]:

@@ -9,14 +9,18 @@ import numpy as np
 
 from weldcal.calibration.data.results import CalibrationResult, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
-from weldcal.calibration.eye_on_base.nested import mean_interval
+from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.calibration.eye_on_base.validation import Algorithm1Run, Convergence
 from weldcal.calibration.flange.fit import FlangeFit
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.refinement.budget import USUAL_SCALE, ErrorBudget, error_budget
 from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import get_flange
+from weldcal.models.robots import get_robot
 from weldcal.tools.outcomes.poses import WorkPoint, work_point_error
 
 
@@ -81,12 +85,37 @@ class CalibrationReport:
     advice: tuple[str, ...] = ()
     patterns: dict[str, HolePattern] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    refinement: dict[str, Any] | None = None
 
     @property
     def work_point(self) -> WorkPoint:
         """The expected error at the middle of the flange centres that were used."""
         used = [o.p_BR for o, keep in zip(self.observations, self.estimate.inliers, strict=True) if keep]
         return work_point_error(self.estimate, np.mean(used, axis=0))
+
+    @property
+    def budget(self) -> ErrorBudget:
+        """What contributes to the error at the work point."""
+        try:
+            repeatability_m = get_robot(self.result.robot).repeatability_m
+        except InputError:
+            repeatability_m = None  # an arm of the user's own
+        refinement = self.refinement or {}
+        motion = None if self.scanner is None else self.scanner.motion
+        scale = None if motion is None else float(np.hypot(motion.values[0] - 1.0, motion.sigma[0]))
+        return error_budget(
+            self.estimate,
+            self.observations,
+            repeatability_m=repeatability_m,
+            scale_error=scale if scale is not None and scale < USUAL_SCALE else None,
+            flange_m=get_flange(self.result.flange).outer_m,
+            refined=str(refinement["kind"]) if refinement.get("accepted") else "",
+        )
+
+    @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: the held-out figures, each with its bootstrap interval."""
+        return interval_rows("held-out error", 1e3 * self.estimate.held_out.position_m[self.estimate.inliers])
 
     @property
     def held_out_interval_mm(self) -> tuple[float, float] | None:
@@ -117,7 +146,9 @@ class CalibrationReport:
             "advice": list(self.advice),
             "notes": list(self.notes),
             "work_point": self.work_point.document(),
+            "error_budget": self.budget.document(),
             "features": feature_residuals(self.fits, self.patterns),
+            **({} if self.refinement is None else {"refinement": self.refinement}),
             "algorithm1": None
             if a is None
             else {
@@ -129,6 +160,17 @@ class CalibrationReport:
                 "unseen": list(a.unseen),
             },
         }
+
+
+def interval_rows(what: str, errors_mm: Array) -> dict[str, str]:
+    """Median and 95 % of errors (n,) mm, each beside the interval of as many new ones; {} for fewer than four."""
+    rows = {}
+    for name, share in (("median", 0.5), ("95 %", 0.95)):
+        interval = bootstrap_interval(errors_mm, share)
+        if interval is not None:
+            reported = float(np.nanquantile(errors_mm, share))
+            rows[f"{what}, {name}"] = f"{reported:.3f} mm (bootstrap 95 %: {interval[0]:.3f} to {interval[1]:.3f})"
+    return rows
 
 
 @dataclass(frozen=True)
@@ -179,6 +221,11 @@ class VerifyReport:
     def position_error_mm(self) -> dict[str, float]:
         """Median, mean, 95th percentile and largest position error, mm."""
         return error_summary(np.array([p.error_mm for p in self.poses]))
+
+    @property
+    def interval_rows(self) -> dict[str, str]:
+        """Rows for the terminal: median and 95 % of the errors, each with its bootstrap interval."""
+        return interval_rows("error", np.array([p.error_mm for p in self.poses]))
 
     @property
     def tilt_deg(self) -> dict[str, float | None]:

@@ -24,6 +24,7 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
     middle, held_out = p_B.mean(axis=0), 1e3 * report.estimate.held_out.position_m
     work_sigma = 1e3 * float(np.sqrt(np.trace(point_error_covariance(report.estimate, middle))))
     sigma = np.sqrt(np.diag(r.covariance))
+    budget = report.budget
     return render(
         "calibration.html.j2",
         dataset=dataset,
@@ -48,6 +49,11 @@ def calibration_report(report: CalibrationReport, *, dataset: str) -> str:
             *_axis_turn(r.axis_turn_deg),
             ("ROS 2", export_ros2(r.X_BC).strip()),
             ("URScript", export_ur_pose(r.X_BC).strip()),
+        ],
+        budget=budget,
+        budget_rows=[
+            *((c.source, fixed(c.mm, 3), c.basis, c.remedy) for c in budget.rows),
+            ("total", fixed(budget.total_mm, 3), "", ""),
         ],
         scanner_sentence=None if report.scanner is None else report.scanner.sentence,
         scanner_rows=_scanner_rows(report),

@@ -11,11 +11,16 @@ from weldcal.models.arms.urdf import Capsule
 from weldcal.models.errors import WeldcalError
 from weldcal.models.mesh import TriMesh
 from weldcal.welding.numerics import Array, unit
-from weldcal.welding.seam.curve import SeamCurve
+from weldcal.welding.seam.curve import SeamCurve, SeamFrame
 
 CLEARANCE_M = 0.001
 NEAR_TIP_M = 0.030  # finger and wire are in the joint by design: only what lies farther from the tip is checked
+AHEAD_STEP_M = 0.002
 ACROSS_COS = 0.5  # a wall within 60 degrees of square to the way stops the tool
+ASIDE_M = 0.003  # what the leaning tip still yields sideways before its mechanical limit
+CLIMB_M = 0.010  # the wall of a groove, met at a slant, lifts the tip out over so much
+BESIDE_M = 1e-7 * np.array([3.7, 6.1, 7.1])  # keeps rays off the edges between triangles, which would count twice
+ASIDE_RAD = np.radians(np.arange(0.0, 181.0, 15.0))
 SAMPLES = 20_000
 STEP_M = 0.02
 
@@ -61,16 +66,18 @@ def check_room(
 def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: float, tip_radius_m: float) -> None:
     """Check that nothing of the part stands in the way of the tip beyond the seam's end and of the torch before its start.
 
-    The tip runs `chord_m` ahead of the torch, straight on where the seam ends; the torch comes from as far behind its start.
+    The tip runs `chord_m` ahead of the torch, straight on where the seam ends; the torch comes from as far behind its start. A wall
+    met at a slant, as that of a curved groove cut short, leads the tip aside, or up and out of the groove. Where it is too high for
+    that, as a web that the seam follows on its hollow side, it stops the tip.
 
     Raises:
         NoRoom: with how much of the seam to cut off.
     """
     triangles = mesh.transformed(X_BP).vertices[mesh.triangles]
+    needed = chord_m + tip_radius_m
     for name, s, sign, who in (("end", seam.length, 1.0, "tip"), ("start", 0.0, -1.0, "torch")):
         frame = seam.frame(s)
-        free = _free_length(triangles, np.asarray(frame.position), sign * np.asarray(frame.tangent))
-        needed = chord_m + tip_radius_m
+        free = _free_length(triangles, frame, sign, needed, tip_radius_m)
         if free < needed:
             raise NoRoom(
                 f"The part stands across the seam {1e3 * free:.0f} mm beyond its {name}, and the {who} needs {1e3 * needed:.0f} mm there: "
@@ -78,8 +85,43 @@ def check_ends(mesh: TriMesh, X_BP: RigidTransform, seam: SeamCurve, chord_m: fl
             )
 
 
-def _free_length(triangles: NDArray[np.float64], origin: Array, direction: Array) -> float:
-    """Distance m from a point along a unit vector to the first of the triangles (M,3,3); infinite without one.
+def _free_length(triangles: NDArray[np.float64], frame: SeamFrame, sign: float, needed: float, ball_m: float) -> float:
+    """Distance m from a seam's end along its tangent to the first wall that stops the tool; infinite without one."""
+    origin, direction = np.asarray(frame.position), sign * np.asarray(frame.tangent)
+    reach = needed + CLIMB_M
+    near = triangles[(np.abs(triangles - origin).min(axis=1) < reach).all(axis=1) | _large(triangles, reach)]
+    t, cosine = _crossings(near, origin, direction)
+    t, cosine = t[t > 0.0], cosine[t > 0.0]
+    across = t[cosine > ACROSS_COS]
+    first = float(across.min()) if len(across) else math.inf
+    aside = np.outer(np.cos(ASIDE_RAD), frame.normal) + np.outer(np.sin(ASIDE_RAD), frame.up)
+    for s in np.arange(AHEAD_STEP_M, min(needed, first), AHEAD_STEP_M):
+        inside = int(np.sum(np.sign(cosine[t <= s])))
+        if inside > 0 and not any(_yields(near, origin + s * direction, d, inside, ball_m, frame) for d in aside):
+            return float(t[(t <= s) & (cosine > 0.0)].max())
+    return first
+
+
+def _large(triangles: NDArray[np.float64], reach: float) -> NDArray[np.bool_]:
+    """(M,) whether a triangle is so large that its corners do not tell where it passes."""
+    return np.asarray(np.ptp(triangles, axis=1).max(axis=1) > 0.5 * reach)
+
+
+def _yields(
+    triangles: NDArray[np.float64], p: Array, direction: Array, inside: int, ball_m: float, frame: SeamFrame
+) -> bool:
+    """Whether the tip, at a point p inside `inside` bodies, can be pushed out of them in a direction."""
+    t, cosine = _crossings(triangles, p, direction)
+    for k in np.argsort(t)[np.count_nonzero(t <= 0.0) :]:
+        inside += 1 if cosine[k] > 0.0 else -1
+        if inside == 0:
+            push = (float(t[k]) + ball_m) * direction
+            return bool(abs(push @ frame.normal) < ASIDE_M and push @ frame.up < CLIMB_M)
+    return False
+
+
+def _crossings(triangles: NDArray[np.float64], origin: Array, direction: Array) -> tuple[Array, Array]:
+    """Distances (K,) m along a unit vector at which its line crosses triangles (M,3,3), and its cosines with their inward normals.
 
     Source: Moeller and Trumbore, Fast, minimum storage ray/triangle intersection, 1997.
     """
@@ -87,16 +129,13 @@ def _free_length(triangles: NDArray[np.float64], origin: Array, direction: Array
     p = np.cross(direction, ac)
     det = np.sum(ab * p, axis=1)
     safe = np.where(np.abs(det) > 1e-15, det, np.inf)
-    to = origin - a
+    to = origin + BESIDE_M - a
     u = np.sum(to * p, axis=1) / safe
     q = np.cross(to, ab)
     v = (q @ direction) / safe
-    t = np.sum(ac * q, axis=1) / safe
-    # A wall that is met at a slant, as that of a curved groove, leads the tip on.
-    normal = np.cross(ab, ac)
-    across = np.abs(normal @ direction) > ACROSS_COS * np.linalg.norm(normal, axis=1)
-    hit = across & np.isfinite(safe) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
-    return float(t[hit].min()) if hit.any() else math.inf
+    hit = np.isfinite(safe) & (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+    cosine = det[hit] / np.linalg.norm(np.cross(ab[hit], ac[hit]), axis=1)
+    return np.asarray((np.sum(ac * q, axis=1) / safe)[hit]), np.asarray(cosine)
 
 
 def _above_tip(capsule: Capsule, X_FT: RigidTransform) -> tuple[Array, Array, float] | None:

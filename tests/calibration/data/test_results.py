@@ -98,6 +98,15 @@ def test_the_urdf_is_one_xml_document_with_its_note_inside(result: CalibrationRe
         assert ("multiply every point" in (tmp_path / str(k) / "scanner.urdf.xacro").read_text()) == (one is corrected)
 
 
+def test_every_export_says_what_of_a_refinement_it_cannot_hold(result: CalibrationResult, tmp_path: Path) -> None:
+    refined = replace(result, local_field={"length_m": 0.1}, kinematics_file="kinematics.yaml")
+    for path in export_all(refined, tmp_path):
+        text = path.read_text()
+        assert "cannot hold the local field" in text, path.name
+        assert "the kinematics of kinematics.yaml" in text, path.name
+    assert load_result(save_result(refined, tmp_path)).local_field == {"length_m": 0.1}
+
+
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [("schema: 1", "schema: 9", "schema 1"), ("X_BC:", "X_BD:", "not a calibration result")],

@@ -8,14 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from typer.testing import CliRunner
 
 from tests.calibration.eye_on_base.test_solve import make_observations
 from tests.calibration.eye_on_base.test_tcp import _pairs
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_ur_pose, load_result, save_result
 from weldcal.calibration.eye_on_base.solve import SolveConfig, estimate_eye_on_base
-from weldcal.calibration.eye_on_base.stated_error import FALSE_ALARM, stated_median_limit
+from weldcal.calibration.eye_on_base.stated_error import (
+    FALSE_ALARM,
+    orientations_of,
+    scatter_elsewhere,
+    stated_median_limit,
+)
 from weldcal.calibration.eye_on_base.validation import position_errors
 from weldcal.models.errors import InputError
 from weldcal.tools.cli.app import app
@@ -67,6 +72,31 @@ def test_a_wider_stated_percentile_counts_and_nothing_stated_gives_no_limit() ->
         stated_median_limit(replace(result, held_out_mm={"p95": float("nan")}, sigma_position_mm=0.0), fresh, None)
         is None
     )
+
+
+def test_the_region_grows_where_the_flange_is_turned_beyond_the_calibration() -> None:
+    """An arm that errs by 0.15 mm per axis and orientation: the limit of one scan holds at the orientation of the calibration and at others."""
+    rng, over = np.random.default_rng(3), []
+    for seed in range(60):
+        scans = make_observations(14, seed, sigma=1e-4, turn=0.0)
+        estimate = estimate_eye_on_base(scans, SolveConfig(leave_one_out=False, hypotheses=40))
+        result = CalibrationResult(
+            estimate.X_BC, estimate.covariance, {}, {}, tuple(PoseRecord(str(k), True) for k in range(14)),
+            sigma_position_mm=1e3 * estimate.sigma_position_m, orientations=orientations_of(scans),
+        )  # fmt: skip
+        (new,) = make_observations(1, 10_000 + seed, sigma=1e-4, turn=0.0)
+        same = scatter_elsewhere(result, [new])
+        assert same == pytest.approx(estimate.sigma_position_m, rel=1e-6)
+        turn = RigidTransform(RotationMatrix.MakeZRotation(np.radians(50.0)), np.zeros(3))
+        shift = np.asarray(result.X_BC.rotation().matrix().T @ (1.5e-4 * rng.standard_normal(3)))
+        turned = replace(new, X_BR=new.X_BR @ turn, p_CR=new.p_CR + shift)
+        limit = stated_median_limit(result, [turned], None, scatter_elsewhere(result, [turned]))
+        assert limit is not None
+        over.append(1e3 * float(position_errors(result.X_BC, [turned])[0]) > limit)
+    assert sum(over) <= 3
+    assert scatter_elsewhere(replace(result, orientations=None), [turned]) is None
+    with pytest.raises(InputError, match="orientations in the result"):
+        scatter_elsewhere(replace(result, orientations={"wxyz": [1.0]}), [turned])
 
 
 def verified(tmp_path: Path, result: CalibrationResult, seed: int = 5, n: int = 8) -> tuple[Path, Path]:

@@ -10,9 +10,9 @@ from pydrake.math import RigidTransform
 
 from tests.calibration.hand_eye.poses import Array, noise, random_poses
 from weldcal.calibration.errors import DatasetError
-from weldcal.calibration.geometry.se3 import inverse, pose
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose
 from weldcal.calibration.hand_eye.files import PosePairs
-from weldcal.calibration.hand_eye.joints import JointRefinement, flange_poses, refine_joints
+from weldcal.calibration.hand_eye.joints import JointRefinement, flange_poses, poses_of_arm, refine_joints
 from weldcal.calibration.hand_eye.problem import full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeResult, solve_problem
 from weldcal.models.arms.chain import Chain, chain_forward, load_chain
@@ -108,3 +108,17 @@ def test_joint_angles_of_another_robot_are_told() -> None:
     still = pose(np.eye(3), np.zeros(3))
     with pytest.raises(InputError, match="eye_in_hand or eye_on_base"):
         refine_joints(replace(pairs, mode="eye_on_arm_target_on_base", link=still), plain, arm)
+
+
+def test_poses_of_a_corrected_arm_replace_the_stated_ones() -> None:
+    pairs, arm, X = cell("eye_in_hand", OFFSET_RAD)
+    errors = np.zeros((6, 6))
+    errors[:, 2] = OFFSET_RAD
+    real = replace(
+        arm,
+        stack=np.array([joint @ pose(exp_rotation(e[:3]), e[3:]) for joint, e in zip(arm.stack, errors, strict=True)]),
+    )
+    moved = poses_of_arm(pairs, real)
+    np.testing.assert_allclose(moved.robot, flange_poses(arm, pairs.q, errors), atol=1e-12)  # type: ignore[arg-type]
+    off = [np.linalg.norm(solve_problem(full_problem(p.F, p.G)).X.translation() - X[:3, 3]) for p in (pairs, moved)]
+    assert off[1] < 0.3 * off[0]

@@ -52,3 +52,40 @@ def test_a_wall_across_an_end_is_refused_with_what_to_cut(x: float, says: str) -
         check_ends(part, X_BP, seam(low=-0.08, high=0.08), TOOL.chord_m, TOOL.tip_radius_m)
     # 62.5 mm are needed, and 10 mm are free.
     check_ends(part, X_BP, seam(low=-0.026, high=0.026), TOOL.chord_m, TOOL.tip_radius_m)
+
+
+def ring(inner: float, outer: float, low: float, high: float, turn: tuple[float, float]) -> TriMesh:
+    """A bent wall about the z axis."""
+    a = np.linspace(*turn, 60)
+    rim = np.column_stack([np.cos(a), np.sin(a)])
+    return extrude(np.vstack([inner * rim[::-1], outer * rim])[::-1], low, high)
+
+
+def along_ring(radius: float, lean: float, turn: tuple[float, float]) -> SeamCurve:
+    a = np.linspace(*turn, 60)
+    out = np.column_stack([np.cos(a), np.sin(a), 0.0 * a])
+    up = lean * out + np.array([0.0, 0.0, 1.0])
+    return SeamCurve.from_points(radius * out + 0.0025 * up, up=up)
+
+
+@pytest.mark.parametrize(("height", "fits"), [(0.05, False), (0.006, True)])
+def test_a_wall_met_at_a_slant_leads_the_tip_on_only_where_it_can_climb_it(height: float, fits: bool) -> None:
+    """The seam on the hollow side of a bent web, cut off 90 mm before the web's end: straight on, the tip meets the web."""
+    web = ring(0.2, 0.21, 0.0, height, (-0.6, 0.6))
+    path = along_ring(0.2, -1.0, (-0.5, 0.15))
+    if fits:
+        return check_ends(web, RigidTransform(), path, TOOL.chord_m, TOOL.tip_radius_m)
+    with pytest.raises(NoRoom, match="beyond its end"):
+        check_ends(web, RigidTransform(), path, TOOL.chord_m, TOOL.tip_radius_m)
+    return None
+
+
+def test_a_wall_that_bends_away_is_no_obstacle() -> None:
+    web = ring(0.19, 0.2, 0.0, 0.05, (-0.6, 0.6))
+    check_ends(web, RigidTransform(), along_ring(0.2, 1.0, (-0.5, 0.15)), TOOL.chord_m, TOOL.tip_radius_m)
+
+
+def test_the_end_of_a_low_wall_that_the_tip_has_climbed_is_no_obstacle() -> None:
+    """The bent rail is left through its end face 50 mm further on: that face is met from within."""
+    rail = ring(0.2, 0.26, 0.0, 0.006, (-0.6, 0.52))
+    check_ends(rail, RigidTransform(), along_ring(0.2, -1.0, (-0.5, 0.27)), TOOL.chord_m, TOOL.tip_radius_m)

@@ -1,13 +1,14 @@
 """Runs the scaled demo on each arm and tabulates the errors of calibration and torch."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from weldcal.models.errors import WeldcalError
-from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.demo import run_demo
+from weldcal.tools.farm.journal import Result
+from weldcal.tools.farm.run import Farm
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
@@ -20,38 +21,42 @@ COLUMNS = (
 )  # fmt: skip
 
 
+def run_arm(arm: str, folder: str, seed: int, seam_mm: float, robot: str | None) -> Mapping[str, object]:
+    """Write an arm's scenario into its folder and run the demo there; its row of COLUMNS."""
+    scenario = Path(folder) / f"{arm}.yaml"
+    write_atomic(scenario, arm_scenario(arm, seam_mm))
+    options = RunOptions(str(scenario), Path(folder), seed, recording=False, robot=robot)
+    try:
+        found = run_demo(options).summary()
+    except WeldcalError as error:
+        found = {"state": "refused", "reason": str(error)}
+    return {name: found[name] for name in COLUMNS if name in found} | {"arm": arm}
+
+
 def run_arms(
-    out: Path, arms: Sequence[str], seed: int, seam_mm: float, robot: str | None, progress: Progress = no_progress
+    farm: Farm, arms: Sequence[str], seed: int, seam_mm: float, robot: str | None
 ) -> tuple[dict[str, object], list[dict[str, object]]]:
     """Write each arm's scenario into its own folder and run the demo there; arms.csv grows row by row.
 
     Args:
-        out: folder of the results.
+        farm: where the demos run and their results go.
         arms: names of arms.
         seed: of everything random.
         seam_mm: how much of the seam is welded.
         robot: as the demo's --robot; None: simulated.
-        progress: told the arm and the share done.
 
     Returns:
         Summary with the worst torch error, and a row for each arm in the units of the demo's JSON object.
     """
-    rows: list[dict[str, object]] = []
-    for k, arm in enumerate(arms):
-        folder = out / arm
-        scenario = folder / f"{arm}.yaml"
-        write_atomic(scenario, arm_scenario(arm, seam_mm))
-        options = RunOptions(str(scenario), folder, seed, recording=False, robot=robot)
+    folder = farm.folder.absolute()
 
-        def tell(stage: str, share: float, arm: str = arm, k: int = k) -> None:
-            progress(f"{arm}: {stage}", (k + share) / len(arms))
+    def table(found: dict[str, Result]) -> None:
+        text = csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in found.values()))
+        write_atomic(folder / "arms.csv", text)
 
-        try:
-            found = run_demo(options, tell).summary()
-        except WeldcalError as error:
-            found = {"state": "refused", "reason": str(error)}
-        rows.append({name: found[name] for name in COLUMNS if name in found} | {"arm": arm})
-        write_atomic(out / "arms.csv", csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows)))
+    given = {"seed": seed, "seam_mm": seam_mm, "robot": robot}
+    tasks = {arm: {"arm": arm, "folder": str(folder / arm), **given} for arm in arms}
+    rows = list(farm.run(run_arm, tasks, table).values())
     done = [row for row in rows if row["state"] == "done"]
     worst = {
         f"worst_{name}": float(np.max([float(str(row[name])) for row in done], initial=0.0))

@@ -1,12 +1,13 @@
 """Runs the demo over many seeds: how many runs end done, and the worst errors of calibration and torch."""
 
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.commands.demo import run_demo
+from weldcal.tools.farm.journal import Result
+from weldcal.tools.farm.run import Farm
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
@@ -18,19 +19,32 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def run_seeds(scenario: str, out: Path, seeds: range, progress: Progress = no_progress) -> dict[str, object]:
+def run_seed(scenario: str, folder: str, seed: int) -> Mapping[str, object]:
+    """One demo in its own folder, without a recording; its JSON object."""
+    return run_demo(RunOptions(scenario, Path(folder), seed, recording=False)).summary()
+
+
+def run_seeds(scenario: str, farm: Farm, seeds: range) -> dict[str, object]:
     """Run the demo once per seed, each into its own folder without a recording; seeds.csv grows row by row.
 
     Worst and mean figures over the seeds, in the units of the demo's own JSON object.
     """
-    rows: list[dict[str, object]] = []
-    for k, seed in enumerate(seeds):
-        folder = out / f"seed{seed:02d}"
-        options = replace(RunOptions(scenario, folder, seed), recording=False)
-        rows.append(run_demo(options, lambda stage, share, k=k: progress(stage, (k + share) / len(seeds))).summary())  # type: ignore[misc]
-        write_atomic(out / "seeds.csv", csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows)))
+    folder = farm.folder.absolute()
+
+    def table(found: dict[str, Result]) -> None:
+        rows = ({"seed": int(name.split()[-1]), **row} for name, row in found.items())
+        text = csv_text(COLUMNS, ([row.get(name, "") for name in COLUMNS] for row in rows))
+        write_atomic(folder / "seeds.csv", text)
+
+    tasks = {
+        f"seed {seed}": {"scenario": scenario, "folder": str(folder / f"seed{seed:02d}"), "seed": seed}
+        for seed in seeds
+    }
+    rows = list(farm.run(run_seed, tasks, table).values())
     worst = {
-        f"worst_{name}": float(np.max([float(row[name]) for row in rows if name in row], initial=0.0))  # type: ignore[arg-type]
+        f"worst_{name}": float(
+            np.max([row[name] for row in rows if isinstance(row.get(name), int | float)], initial=0.0)
+        )
         for name in COLUMNS[2:-1]
     }
     done = sum(row["state"] == "done" for row in rows)

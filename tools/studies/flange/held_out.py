@@ -8,6 +8,7 @@ import numpy as np
 from weldcal.calibration.eye_on_base.nested import calibrate_by_choice, mean_interval, nested_errors
 from weldcal.calibration.eye_on_base.observations import corrected_observation
 from weldcal.calibration.eye_on_base.validation import position_errors
+from weldcal.calibration.refinement.local_choice import choose_local
 from weldcal.models.errors import InputError
 from weldcal.systems.runner import Progress, no_progress
 from weldcal.tools.studies.flange.recorded import usable_scans
@@ -29,25 +30,35 @@ class Halves:
     skipped: int
 
 
-def study_halves(folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress) -> Halves:
+def study_halves(
+    folder: Path, draws: int = 20, seed: int = 0, progress: Progress = no_progress, *, local: bool = False
+) -> Halves:
     """Calibrate from ``draws`` random halves of a dataset, choices included, and measure on the others. Deterministic for ``seed``.
+
+    ``local``: from two thirds, with the choice of a local field (--refine local).
 
     Raises InputError for a folder that is none, TooFewPoses for fewer than sixteen usable scans.
     """
     good, patterns, _ = usable_scans(folder, LEAST, f"Halves need {LEAST} usable scans and more", seed, progress, 0.1)
-    half, rows, skipped = len(good) // 2, [], 0
+    half, rows, skipped = 2 * len(good) // 3 if local else len(good) // 2, [], 0
     for k in range(draws):
         progress("halves", 0.1 + 0.9 * k / draws)
         order = np.random.default_rng([seed, k]).permutation(len(good))
         ours, others = ([good[i] for i in part] for part in (order[:half], order[half:]))
         try:
-            errors, _ = nested_errors(ours, patterns, seed=seed)
             X_BC, correction = calibrate_by_choice(ours, patterns, seed=seed)
+            new_scans = [corrected_observation(correction, o) for o in others]
+            if local:
+                choice = choose_local(ours, patterns, X_BC, correction, seed=seed)
+                errors = choice.local_m if choice.accepted else choice.plain_m
+                new_scans = choice.field.applied(X_BC, new_scans) if choice.accepted else new_scans
+            else:
+                errors, _ = nested_errors(ours, patterns, seed=seed)
         except InputError:
             skipped += 1
             continue
         interval = mean_interval(errors)
-        new = float(np.mean(position_errors(X_BC, [corrected_observation(correction, o) for o in others])))
+        new = float(np.mean(position_errors(X_BC, new_scans)))
         inside = interval is not None and interval[0] < new < interval[1]
         rows.append((float(np.nanmean(errors)), new, float(inside)))
     table = np.array(rows).reshape(-1, 3)

@@ -83,6 +83,17 @@ def halves_table(found: Halves) -> Table:
     return {"state": "done", **vars(found)}, lines
 
 
+def arm_table(found: dict[str, object]) -> Table:
+    """Errors at new scans with and without errors of the arm, and whether what is stated of them holds."""
+    lines = {
+        "error at new scans, plain": f"{found['plain_mm']:.3f} mm mean",
+        "error at new scans, refined": f"{found['refined_mm']:.3f} mm mean (ratio {found['ratio']:.2f})",
+        "in the stated 95 % region": f"{found['inside_95_percent']:.1f} %",
+        "joint offsets within 3 sigma": f"{found['offsets_within_3_sigma_percent']:.1f} %",
+    }
+    return found, lines
+
+
 def light_runs_table(found: LightRuns) -> Table:
     """Errors of light calibrations in the imperfect world, and their coverage."""
     low, high = found.chance()

@@ -46,6 +46,13 @@ class Agreement:
         """Met less twice the passed share and what goes on, times the square root of what is seen."""
         return max(0.0, self.met - 2.0 * self.passed - self.goes_on) * math.sqrt(self.seen)
 
+    @property
+    def score_of_rest(self) -> float:
+        """The score by the rays that nothing keeps from the part."""
+        return max(0.0, self.met / max(1e-9, 1.0 - self.hidden) - 2.0 * self.passed - self.goes_on) * math.sqrt(
+            self.seen
+        )
+
 
 def rays_near(scan: PreparedScan, model: PartModel, X_BP: RigidTransform, reach_m: float = 0.01) -> Floats:
     """The scan's points (N,3) whose rays may meet the part at X_BP or near it."""

@@ -24,11 +24,14 @@ SAME_SIDE_COS = math.cos(math.radians(38.0))
 HIDDEN_COS = math.cos(math.radians(77.0))  # a face seen at a larger angle is not measured
 INSET, INSET_SIGMA = 0.35, 0.2  # of the outermost points of a face, in point distances
 RIM_SIGMA = 0.40  # of one of them, in point distances
-RIM_FLOOR = 0.10  # error common to the points of one edge, in point distances
+RIM_GATE, STILL_M = 4.5, 2e-5  # in point distances; a step smaller than this is the last with one gate
+LEAST_OWN, BEHIND_M = 0.15, 0.002  # share of the rims with something behind them; how far behind
+SHARED_M = 0.08
+RIM_FLOOR = 0.15  # error common to the points of one edge, in point distances
 SURFACE_RATIO = 6.0  # neighbouring points per independent one, in the balance against the rims
 PATCHES = 14.0  # size of a patch whose points share their error, in point distances
-SIGMA_FLOOR_M, CREEP_M = 2e-5, 2e-5
-MOST_POINTS, COARSE_POINTS = 15_000, 1200
+SIGMA_FLOOR_M, CREEP_M, SLOW_M = 2e-5, 2e-5, 3e-5
+MOST_POINTS, EARLY_POINTS, COARSE_POINTS = 15_000, 4000, 1200
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +101,15 @@ def contour(model: PartModel, eye: Floats) -> SharpEdges:
     )
 
 
-def rim_rows(p: Floats, edges: SharpEdges, gate: float, band: float, pitch: float) -> Equations | None:
-    """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them."""
+def rim_rows(
+    p: Floats, edges: SharpEdges, gate: float, band: float, scan: PreparedScan, X_BP: RigidTransform
+) -> Equations | None:
+    """Equations of the outermost points of the faces among p (N,3) in P against the edges that end them.
+
+    A face may also end where something hides it, or where nothing was measured. So just beyond its outermost point the scan has to
+    show something behind it; where no edge does, for nothing lies in the scanner's range behind the part, all edges are used.
+    """
+    pitch = scan.pitch_m
     if len(edges.point) < 4 or not len(p):
         return None
     away, k = (
@@ -119,9 +129,41 @@ def rim_rows(p: Floats, edges: SharpEdges, gate: float, band: float, pitch: floa
     good = np.flatnonzero((count >= 3) & (last > -gate + 2.0 * pitch) & (last < gate - 1.5 * pitch))
     if len(good) < 4:
         return None
+    beyond = edges.point[good] + (last[good] + 1.5 * pitch)[:, None] * edges.outward[good]
+    own = _ends_itself(beyond, edges.normal[good], scan, X_BP)
+    if np.count_nonzero(own) > max(4, LEAST_OWN * len(good)):
+        good = good[own]
     m, at = edges.outward[good], edges.point[good]
     r = last[good] + INSET * pitch
-    return Equations(-np.hstack([np.cross(at, m), m]), r, np.ones(len(r)), edges.chain[good])
+    return Equations(-np.hstack([np.cross(at, m), m]), r, np.ones(len(r)), _shared(edges, good))
+
+
+def _ends_itself(beyond: Floats, normal: Floats, scan: PreparedScan, X_BP: RigidTransform) -> npt.NDArray[np.bool_]:
+    """Whether around points (N,3) of P, just beyond the rims of faces with normals (N,3), the scan shows something behind the
+    faces and nothing before them."""
+    tree = scan.rays
+    R = X_BP.rotation().matrix()
+    at = beyond @ R.T + X_BP.translation()
+    d = at - scan.eye
+    away = np.linalg.norm(d, axis=1)
+    _, k = tree.query(d / away[:, None], k=9, distance_upper_bound=2.5 * scan.pitch_m / float(np.median(away)))
+    found = np.asarray(k) < len(scan.measured)
+    height = np.einsum("ijk,ik->ij", scan.measured[np.where(found, k, 0)] - at[:, None], normal @ R.T)
+    return np.asarray((found & (height < -BEHIND_M)).any(axis=1) & ~(found & (height > BEHIND_M)).any(axis=1))
+
+
+def _shared(edges: SharpEdges, index: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Numbers (N,) of the groups of edge samples that share their error: the same direction, nearly the same place."""
+    key = np.hstack([np.round(2.0 * edges.outward[index]), np.round(edges.point[index] / SHARED_M)]).astype(np.int64)
+    return np.asarray(np.unique(key, axis=0, return_inverse=True)[1]).ravel()
+
+
+def _beside(p: Floats, edges: SharpEdges, reach: float) -> npt.NDArray[np.bool_]:
+    """Which points (N,3) in P lie near an edge."""
+    if not len(edges.point):
+        return np.zeros(len(p), dtype=bool)
+    away = cKDTree(edges.point).query(p, distance_upper_bound=reach + 0.002)[0]
+    return np.asarray(np.isfinite(away))
 
 
 def tukey(r: Floats, c: float) -> Floats:
@@ -177,24 +219,28 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
     points, normals = scan.points[near], scan.normals[near]
     stride = max(1.0, len(points) / MOST_POINTS)
     few = (np.arange(int(len(points) / stride)) * stride).astype(int)
+    every = scan.measured[np.linalg.norm(scan.measured - X.multiply(model.center), axis=1) < model.radius + 0.02]
     sigma = 0.5e-3
-    gates = (gate, gate, 0.5 * gate, 0.004, 0.003, 0.002, 0.002, 0.002)
-    edges, surface, rims = None, None, None
-    for k, g in enumerate(gates):
-        g = max(g, 3.5 * pitch if k < 4 else 2.5 * pitch)
-        p, n = into(X, points), normals @ X.rotation().matrix()
-        surface = surface_rows(p[few], n[few], model, min(g, max(0.001, 8.0 * sigma)) if k > 3 else g)
-        if len(surface.residual) < 30:
-            return None
-        sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(surface.residual))))
-        if k in (0, 2, 4):
-            edges = contour(model, into(X, scan.eye[None])[0])
-        assert edges is not None
-        rims = rim_rows(p, edges, g, max(4.0 * sigma, 0.0004), pitch)
-        xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch)
-        if xi is None:
-            return None
-        X = moved(X, xi)
+    surface, rims = None, None
+    for g, steps in ((gate, 3), (0.5 * gate, 3), (0.004, 3), (0.002, 6)):
+        edges = contour(model, into(X, scan.eye[None])[0])
+        rim_gate = max(g, RIM_GATE * pitch)
+        beside = _beside(into(X, every), edges, 2.0 * rim_gate)
+        some = few if g <= 0.002 else few[:: max(1, len(few) // EARLY_POINTS)]
+        for _ in range(steps):
+            near_m = max(g, 3.5 * pitch) if g > 0.002 else max(0.001, 8.0 * sigma)
+            surface = surface_rows(into(X, points[some]), normals[some] @ X.rotation().matrix(), model, near_m)
+            if len(surface.residual) < 30:
+                return None
+            sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(surface.residual))))
+            # A narrower gate would only let through the rims that agree with the pose already.
+            rims = rim_rows(into(X, every[beside]), edges, rim_gate, max(4.0 * sigma, 0.0004), scan, X)
+            xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch)
+            if xi is None:
+                return None
+            X = moved(X, xi)
+            if math.hypot(model.radius * float(np.linalg.norm(xi[:3])), float(np.linalg.norm(xi[3:]))) < STILL_M:
+                break
     assert surface is not None
     return Fit(
         X,
@@ -205,28 +251,38 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
     )
 
 
+def _acts_at(equations: Equations) -> Floats:
+    """Where equations act (N,3) in P: the foot of the origin on each one's line of action."""
+    return np.cross(equations.rows[:, 3:], equations.rows[:, :3])
+
+
+def _patches(equations: Equations, size: float) -> npt.NDArray[np.int64]:
+    """Numbers (N,) of the patches that equations belong to, told apart by place and by direction."""
+    key = np.hstack([np.floor(_acts_at(equations) / size), np.round(-2.0 * equations.rows[:, 3:])]).astype(np.int64)
+    return np.asarray(np.unique(key, axis=0, return_inverse=True)[1]).ravel()
+
+
 def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: float) -> Floats:
     """(6,6) of the pose by the sandwich of the normal equations, with errors that points of a patch, or of an edge, share.
 
-    The points of a patch of PATCHES point distances are one cluster, those of an edge another (Liang and Zeger 1986); an edge
-    has at least an error of RIM_FLOOR, and the surface one of CREEP_M in every patch.
+    The points of a patch of PATCHES point distances are one cluster, those of a piece of an edge another (Liang and Zeger 1986).
+    Added are errors that a patch or a side has in common: CREEP_M in a patch, SLOW_M in one of SHARED_M, RIM_FLOOR on a side.
     """
     w = tukey(surface.residual, max(4.0 * sigma, 0.0004)) / (SURFACE_RATIO * sigma**2)
     A = np.zeros((7, 7))
     A[:6, :6] = (surface.rows * w[:, None]).T @ surface.rows
     A[6, 6] = 1.0 / (INSET_SIGMA * pitch) ** 2
     G = np.hstack([surface.rows, np.zeros((len(w), 1))]) * w[:, None]
-    # Where a point acts: its foot on the normal's line, told apart by place and by direction.
-    normal = -surface.rows[:, 3:]
-    place = np.cross(normal, -surface.rows[:, :3])
-    key = np.hstack([np.floor(place / (PATCHES * pitch)), np.round(2.0 * normal)]).astype(np.int64)
-    _, patch = np.unique(key, axis=0, return_inverse=True)
-    patch = patch.ravel()
+    patch = _patches(surface, PATCHES * pitch)
     score = np.zeros((int(patch.max()) + 1, 7))
-    lean = np.zeros_like(score)
     np.add.at(score, patch, G * surface.residual[:, None])
-    np.add.at(lean, patch, G)
-    middle = score.T @ score + CREEP_M**2 * (lean.T @ lean) + np.diag([0.0] * 6 + [A[6, 6]])
+    middle = score.T @ score + np.diag([0.0] * 6 + [A[6, 6]])
+    # Errors of the surface and the scanner that the residuals do not show, for the pose follows them.
+    for size, error in ((PATCHES * pitch, CREEP_M), (SHARED_M, SLOW_M)):
+        patch = _patches(surface, size)
+        lean = np.zeros((int(patch.max()) + 1, 7))
+        np.add.at(lean, patch, G)
+        middle += error**2 * (lean.T @ lean)
     if rims is not None:
         J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
         v = (
@@ -235,8 +291,13 @@ def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: 
         )
         H = J * v[:, None]
         A += H.T @ J
-        r = np.minimum(np.abs(rims.residual), 2.0 * pitch)
-        middle += (H * np.square(np.maximum(r, 0.15 * pitch))[:, None]).T @ H
+        r = np.clip(rims.residual, -2.0 * pitch, 2.0 * pitch)
+        piece = np.unique(
+            np.column_stack([rims.cluster, np.floor(_acts_at(rims) / (PATCHES * pitch))]), axis=0, return_inverse=True
+        )[1].ravel()
+        pieces = np.zeros((int(piece.max()) + 1, 7))
+        np.add.at(pieces, piece, H * r[:, None])
+        middle += pieces.T @ pieces + (H * (0.15 * pitch) ** 2).T @ H
         for chain in np.unique(rims.cluster):
             total = H[rims.cluster == chain].sum(axis=0)
             middle += np.outer(total, total) * (RIM_FLOOR * pitch) ** 2

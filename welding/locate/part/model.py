@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 
 from weldcal.models.mesh import TriMesh
 
@@ -20,6 +20,7 @@ SAMPLES = 30_000
 EDGE_STEP_M = 0.003
 SHARP_COS = math.cos(math.radians(35.0))
 MOST_DIRECTIONS = 14
+SMOOTHED, SMOOTHED_M, SMOOTHED_COS = 32, 0.010, (math.cos(math.radians(40.0)), math.cos(math.radians(20.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +61,27 @@ class PartModel:
         found = self._scene.compute_closest_points(self._tensor(p.astype(np.float32)))
         return (
             found["points"].numpy().astype(np.float64),
-            self.mesh.normals[found["primitive_ids"].numpy().astype(np.int64)],
+            self.smooth_normals[found["primitive_ids"].numpy().astype(np.int64)],
         )
+
+    @cached_property
+    def smooth_normals(self) -> Floats:
+        """(M,3) unit normals of the triangles, averaged over near ones of nearly the same direction.
+
+        The small triangles of a mesh from a scan are tilted by its noise. Taken as they are, they would keep a flat face from
+        sliding along itself.
+        """
+        tree = cKDTree(self.mesh.vertices[self.mesh.triangles].mean(axis=1))
+        away, k = tree.query(tree.data, k=min(SMOOTHED, tree.n), distance_upper_bound=SMOOTHED_M)
+        found = np.isfinite(away)
+        k = np.where(found, k, 0)
+        vector, normals = self.mesh.area_vectors, self.mesh.normals
+        for cosine in SMOOTHED_COS:
+            same = found & (np.einsum("ijk,ik->ij", normals[k], normals) > cosine)
+            total = np.einsum("ij,ijk->ik", same, vector[k])
+            size = np.linalg.norm(total, axis=1, keepdims=True)
+            normals = np.where(size > 0.0, total / np.maximum(size, 1e-30), normals)
+        return np.asarray(normals)
 
     def ranges(self, eye: Floats, directions: Floats) -> tuple[Floats, Floats]:
         """Distances (N,) m from the eye (3,) along unit directions (N,3), inf where the part is missed, and the normals there."""

@@ -125,10 +125,15 @@ def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Ri
     """Poses from the search, fitted to the coarse points, best first."""
     scored: list[tuple[float, RigidTransform]] = []
     for place in rough_places(scan, model, config):
-        X = coarse_fit(scan, model, place.X_BP, COARSE_GATES)
-        if X is None or any(same_pose(X, Y, model) for _, Y in scored):
-            continue
-        scored.append((agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X))
+        # A flat part may slide along itself in the coarse fit, so the pose before it is compared too.
+        tried = (place.X_BP, coarse_fit(scan, model, place.X_BP, COARSE_GATES))
+        some = [
+            (agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X)
+            for X in tried
+            if X is not None and not any(same_pose(X, Y, model) for _, Y in scored)
+        ]
+        if some:
+            scored.append(max(some, key=lambda one: one[0]))
     scored.sort(key=lambda s: -s[0])
     return [X for _, X in scored]
 
@@ -159,7 +164,7 @@ def _screened(
 
 
 def _fine(
-    scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 3
+    scan: PreparedScan, model: PartModel, starts: list[RigidTransform], most: int, enough: int | None = 5
 ) -> list[_Judged]:
     """Fine fits of the best starts, different ones only, best first; after more than `enough` a good one ends the search."""
     judged: list[_Judged] = []
@@ -252,7 +257,11 @@ def _decided(
         share = for_rival / max(1, for_best)
         runner_up = max(runner_up, min(1.0, rival.agreement.score / max(best.agreement.score, 1e-9)))
         apart = float(np.linalg.norm(best.X_BP.multiply(model.center) - rival.X_BP.multiply(model.center)))
-        if apart > 0.5 * model.radius and rival.agreement.score < ELSEWHERE * best.agreement.score:
+        # Another part of the kind is as good where something hides a share of it.
+        if apart > 0.5 * model.radius and (
+            rival.agreement.met < config.min_met
+            or rival.agreement.score_of_rest < ELSEWHERE * best.agreement.score_of_rest
+        ):
             continue
         if for_best - for_rival < max(30, 0.008 * met) or share > config.rival:
             alike.append(rival)

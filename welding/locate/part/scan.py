@@ -34,7 +34,7 @@ class Plane:
 class PreparedScan:
     """Points (N,3) m in base with normals towards the scanner, a coarse copy, the planes in it, and the scanner's position.
 
-    planes: the largest, largest first; pitch_m: distance between neighbouring points as measured.
+    planes: the largest, largest first; pitch_m: distance between neighbouring points as measured; measured (M,3): all points.
     """
 
     points: Floats
@@ -44,11 +44,18 @@ class PreparedScan:
     planes: list[Plane]
     eye: Floats
     pitch_m: float
+    measured: Floats
 
     @cached_property
     def tree(self) -> cKDTree:
         """The points' tree."""
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    @cached_property
+    def rays(self) -> cKDTree:
+        """The tree of the unit directions from the scanner to the measured points."""
+        d = self.measured - self.eye
+        return cKDTree(d / np.linalg.norm(d, axis=1)[:, None], balanced_tree=False, compact_nodes=False)
 
 
 def finite_points(points_B: npt.NDArray[np.floating]) -> Floats:
@@ -71,7 +78,7 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
     if len(points) < least:
         raise PartNotFound(f"The scan has only {len(points)} points: move the part into view.")
     rng = np.random.default_rng(seed)
-    pitch = _pitch(points, rng)
+    pitch, measured = _pitch(points, rng), points
     if len(points) > FINE_POINTS:
         points = points[np.sort(rng.choice(len(points), FINE_POINTS, replace=False))]
     cloud: Any = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
@@ -93,7 +100,7 @@ def prepare(points: Floats, eye_B: npt.ArrayLike | None, least: int, seed: int) 
 
     p, n = turned(cloud)
     q, m = turned(few)
-    return PreparedScan(p, n, q, m, planes, eye, pitch)
+    return PreparedScan(p, n, q, m, planes, eye, pitch, measured)
 
 
 def _planes(points: Floats, normals: Floats, rng: np.random.Generator) -> list[Plane]:

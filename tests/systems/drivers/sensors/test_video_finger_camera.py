@@ -162,7 +162,7 @@ def test_a_wrong_key_is_refused_before_anything_is_opened(start: Start, keys: di
 )
 def test_a_camera_that_is_not_there_is_a_sentence(start: Start, source: str, said: str) -> None:
     with pytest.raises(DeviceFault, match=said):
-        start(source, wait_s=0.3)
+        start(source, wait_s=20.0)
 
 
 def test_pictures_of_another_size_are_a_sentence(camera: MjpegCamera, start: Start) -> None:

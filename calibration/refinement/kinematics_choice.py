@@ -1,0 +1,225 @@
+"""Decides on errors of the arm by nested held-out errors, and writes the kinematics that follow from them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from pydrake.common.yaml import yaml_dump
+from pydrake.math import RollPitchYaw, RotationMatrix
+
+from weldcal.calibration.data.scanner_correction import ScannerCorrection
+from weldcal.calibration.errors import TooFewPoses
+from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, HeldOut, with_scanner
+from weldcal.calibration.eye_on_base.observations import corrected_observation
+from weldcal.calibration.eye_on_base.scanner_fit import from_holes
+from weldcal.calibration.eye_on_base.validation import position_errors, tilt_errors
+from weldcal.calibration.flange.holes import HolePattern
+from weldcal.calibration.flange.observation import Observation
+from weldcal.calibration.geometry.se3 import exp_rotation, pose
+from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.kinematics_fit import (
+    KINDS,
+    FactoryPrior,
+    KinematicsFit,
+    arm_errors,
+    fit_kinematics,
+    unsought,
+)
+from weldcal.calibration.refinement.local_choice import GAIN, calibrate_plain
+from weldcal.models.arms.chain import Chain
+from weldcal.models.arms.kinematics import LINKS
+from weldcal.models.arrays import Array
+from weldcal.models.errors import InputError
+
+LEAST = 12
+"""Poses from which on errors of an arm are sought."""
+LEAST_TURN_DEG = 20.0
+"""Turn between poses from which on they show in more than one orientation."""
+WRONG_FILE = 8.0
+"""Times a factory's errors: the prior of an arm whose kinematics are those of another robot, or nominal."""
+_FOLDS = 10
+_MIXED = (
+    1.5  # growth of a standard deviation by the scanner's factors at which an error counts as not separable from them
+)
+_NAMED = 6  # errors in a sentence; the JSON object has all
+_SHOWN = 0.8  # of the prior: below it the poses have said something
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicsChoice:
+    """A fit and the errors of poses (n,) that neither it nor the plain calibration saw: ``plain_m`` and ``refined_m``, ``tilt_rad`` with the
+    fit, NaN where the others fix none. ``accepted``: the fit is applied; ``sentence``: why, and what it found."""
+
+    fit: KinematicsFit
+    plain_m: Array
+    refined_m: Array
+    tilt_rad: Array
+    accepted: bool
+    sentence: str
+
+
+def choose_kinematics(
+    observations: Sequence[Observation],
+    q: Array,
+    arm: Chain,
+    kind: str,
+    patterns: Mapping[str, HolePattern],
+    estimate: CalibrationEstimate,
+    *,
+    correct_scanner: bool = True,
+    seed: int = 0,
+) -> KinematicsChoice:
+    """Fit errors of the arm to n inlier observations at joint angles q (n, joints), from their plain estimate, and decide on them.
+
+    In ten folds both calibrations, choices included, are repeated without the held-out poses; the errors are applied if the mean falls by
+    5 %, beside that of the plain calibration and that of the same fit without errors of the arm. The prior
+    is a factory's, or the wider one of a wrong kinematics file where that lets the mean fall by 5 % more.
+
+    Raises TooFewPoses below twelve, InputError for poses of one orientation or an unknown ``kind``.
+    """
+    if kind not in KINDS:
+        raise InputError(f"There is no refinement '{kind}' of an arm; choose one of {', '.join(KINDS)}.")
+    n = len(observations)
+    if n < LEAST:
+        raise TooFewPoses(
+            f"Errors of the arm (--refine {kind}) need {LEAST} usable poses, and there are {n}; add poses."
+        )
+    turned = turn_deg([o.X_BR for o in observations])
+    if turned < LEAST_TURN_DEG:
+        raise InputError(
+            f"The orientation varies by {turned:.1f} degrees only: errors of the arm (--refine {kind}) cannot be told from the scanner's; turn "
+            f"and tilt the flange by {LEAST_TURN_DEG:.0f} degrees and more, or use --refine local."
+        )
+    factory = arm_errors(arm, kind)
+    none = replace(factory, which=factory.which[:0], scale=factory.scale[:0], names=())
+    candidates = [none, factory, arm_errors(arm, kind, FactoryPrior().times(WRONG_FILE))]
+    plain = np.full(n, np.nan)
+    new_m, new_tilt = np.full((2, len(candidates), n), np.nan)
+    place = np.random.default_rng(seed).permutation(n)
+    for f in range(_FOLDS):
+        test = np.sort(place[f::_FOLDS])
+        rest = np.setdiff1d(np.arange(n), test)
+        train, new = [observations[i] for i in rest], [observations[i] for i in test]
+        try:
+            X, c = calibrate_plain(train, patterns, correct_scanner, seed)
+        except InputError:
+            continue
+        plain[test] = position_errors(X, [corrected_observation(c, o) for o in new])
+        for k, sought in enumerate(candidates):
+            holes = from_holes(train, patterns)
+            without = fit_kinematics(train, q[rest], sought, X, c, holes=holes, fixed_scanner=not correct_scanner)
+            seen = without.applied(new, q[test])
+            new_m[k, test], new_tilt[k, test] = position_errors(without.X_BC, seen), tilt_errors(without.X_BC, seen)
+    known = np.isfinite(plain)
+    before, *means = (1e3 * float(np.mean(e[known])) if known.any() else float("nan") for e in (plain, *new_m))
+    large = means[2] < GAIN * means[1]
+    used = 2 if large else 1
+    refined, tilt, after = new_m[used], new_tilt[used], means[used]
+    holes = from_holes(observations, patterns)
+    start = estimate.scanner or ScannerCorrection()
+    fit = fit_kinematics(
+        observations,
+        q,
+        candidates[used],
+        estimate.X_BC,
+        start,
+        holes=holes,
+        fixed_scanner=not correct_scanner,
+        considered=unsought(arm, kind),
+    )
+    # the same fit without errors of the arm: what the scanner's part of it gains is not theirs
+    scanner = means[0]
+    accepted = bool(after < GAIN * min(before, scanner))
+    said = f"mean held-out error {before:.3f} mm without, {after:.3f} mm with them ({scanner:.3f} mm with the scanner's part alone)"
+    if not accepted:
+        return KinematicsChoice(
+            fit,
+            plain,
+            refined,
+            tilt,
+            False,
+            f"Errors of the arm ({kind}) do not help: {said}. The plain calibration is used.",
+        )
+    mixed = _mixed(observations, q, fit) if correct_scanner else []
+    why = f" Not separable from the scanner's distortion: {', '.join(mixed)}." if mixed else ""
+    if large:
+        why += (
+            f" They are larger than a factory calibration leaves (a prior {WRONG_FILE:.0f} times as wide predicts the held-out poses better): the "
+            "kinematics are probably those of another robot."
+        )
+    sentence = f"Errors of the arm are applied ({_told(fit)}): {said}.{why} X_BC belongs to the arm with the kinematics of the file written beside it."
+    return KinematicsChoice(fit, plain, refined, tilt, True, sentence)
+
+
+def with_kinematics(
+    estimate: CalibrationEstimate, choice: KinematicsChoice, observations: Sequence[Observation], q: Array
+) -> tuple[CalibrationEstimate, list[Observation]]:
+    """The estimate of the accepted fit, and all observations as corrected by it."""
+    f = choice.fit
+    size = 6 + len(f.correction.values)
+    moved = f.applied(observations, q)
+    position, tilt = estimate.held_out.position_m.copy(), estimate.held_out.tilt_rad.copy()
+    position[estimate.inliers], tilt[estimate.inliers] = choice.refined_m, choice.tilt_rad
+    refined = with_scanner(estimate, f.correction, f.X_BC, f.covariance[:size, :size], f.redundancy)
+    return (
+        CalibrationEstimate(
+            refined.X_BC,
+            refined.covariance,
+            estimate.inliers,
+            position_errors(f.X_BC, moved),
+            tilt_errors(f.X_BC, moved),
+            HeldOut(position, tilt),
+            f.sigma_position_m,
+            f.sigma_normal_rad,
+            estimate.unobservable,
+            estimate.warnings,
+            refined.scanner,
+            refined.joint,
+        ),
+        moved,
+    )
+
+
+def kinematics_text(fit: KinematicsFit, note: str) -> str:
+    """The arm's link transforms with the errors found, as a file of Universal Robots' schema (m, rad; load_arm reads it)."""
+    errors = fit.errors.errors(fit.u)
+    links = {}
+    for link, X, e in zip(LINKS, fit.errors.arm.stack, errors, strict=True):
+        moved = X @ pose(exp_rotation(e[:3]), e[3:])
+        rpy = RollPitchYaw(RotationMatrix.ProjectToRotationMatrix(moved[:3, :3])).vector()
+        links[link] = dict(
+            zip(("x", "y", "z", "roll", "pitch", "yaw"), (*map(float, moved[:3, 3]), *map(float, rpy)), strict=True)
+        )
+    return f"# {note}\n{yaml_dump({'kinematics': links})}"
+
+
+def _mixed(observations: Sequence[Observation], q: Array, fit: KinematicsFit) -> list[str]:
+    """Errors that would be known much better if the scanner were known."""
+    fit = replace(fit, sigma_considered=None)
+    sure = fit_kinematics(observations, q, fit.errors, fit.X_BC, fit.correction, fixed_scanner=True)
+    # at the same scatter: only what the scanner leaves open counts
+    better = sure.sigma * fit.sigma_position_m / sure.sigma_position_m
+    shown = fit.sigma < _SHOWN * fit.errors.scale
+    return [
+        name
+        for name, s, b, seen in zip(fit.errors.names, fit.sigma, better, shown, strict=True)
+        if seen and s > _MIXED * b
+    ]
+
+
+def _told(fit: KinematicsFit) -> str:
+    """The errors that differ from zero by two sigma, the surest first."""
+    rows = sorted(
+        zip(fit.errors.names, fit.values, fit.sigma, strict=True), key=lambda row: -abs(float(row[1] / row[2]))
+    )
+    found = [
+        f"{name} {1e3 * v:+.2f} +- {1e3 * s:.2f} mm"
+        if "shift" in name
+        else f"{name} {np.degrees(v):+.3f} +- {np.degrees(s):.3f} deg"
+        for name, v, s in rows
+        if abs(v) > 2.0 * s
+    ]
+    return (
+        ", ".join(found[:_NAMED]) + (f" and {len(found) - _NAMED} more" if len(found) > _NAMED else "")
+        or "none beyond two sigma"
+    )

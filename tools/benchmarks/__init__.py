@@ -1,1 +1,0 @@
-"""Speed and accuracy tables that anyone can run again."""

@@ -1,0 +1,1 @@
+"""Runs independent tasks of a study on all cores or on a Dask cluster, and resumes after a kill."""
