@@ -71,7 +71,7 @@ class CommandLine:
     @property
     def elsewhere(self) -> str:
         """By what else it is executed; empty: by a check of the pages."""
-        return ELSEWHERE.get(self.words[0], "")
+        return "the tests of a Dask cluster" if "--scheduler" in self.words else ELSEWHERE.get(self.words[0], "")
 
     @property
     def server(self) -> bool:
@@ -84,7 +84,7 @@ class CommandLine:
         if self.begins("new"):
             return "--dataset" not in self.words
         if self.begins("calibrate"):
-            return "--scenario" not in self.words
+            return not {"--scenario", "--refine"} & set(self.words)
         return self.begins(*CHEAP) and not self.elsewhere
 
     @property
