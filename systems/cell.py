@@ -14,11 +14,13 @@ from weldcal.systems.jobs.discovery import job_of
 from weldcal.systems.jobs.job import AddedJob, Job
 from weldcal.systems.motion.clear_moves import check_way_home
 from weldcal.systems.motion.spine import add_spine
+from weldcal.systems.person import Person
 from weldcal.systems.recording.answers import NotedBackground
 from weldcal.systems.recording.player import Playback
 from weldcal.systems.recording.tap import OpenSink, add_recorder
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station, make_station
+from weldcal.systems.viewer.live import LiveView, add_live_view
 from weldcal.systems.wiring import Wiring
 
 LOG_PERIOD_S = 0.008  # a row per servo tick
@@ -28,13 +30,14 @@ JobOf = TypeVar("JobOf", bound=AddedJob, covariant=True)
 
 @dataclass(frozen=True, eq=False)
 class Cell(Generic[JobOf]):
-    """The Diagram and its named parts. The caller that builds a cell must close its station."""
+    """The Diagram and its named parts; `person` may hold and end its run. The caller that builds a cell must close its station."""
 
     diagram: Diagram
     station: Station
     scenario: Scenario
     job: JobOf
     logs: dict[str, VectorLogSink]
+    person: Person = dc.field(default_factory=Person)
 
 
 def build_cell(
@@ -44,6 +47,8 @@ def build_cell(
     robot: PreparedRobot | None = None,
     played: Playback | None = None,
     open_sink: OpenSink | None = None,
+    person: Person | None = None,
+    live: LiveView | None = None,
 ) -> Cell[Any]:
     """Build the cell of a scenario. The caller must close its station.
 
@@ -55,6 +60,8 @@ def build_cell(
         meshcat: viewer of the cell, with the operator's controls; None: no viewer.
         robot, played: see make_station.
         open_sink: opens the sink that takes what enters and leaves the cell; None: nothing is recorded.
+        person: who may hold and end the run; None: a new one, the cell's `person`.
+        live: takes what the dashboard shows; None: no dashboard.
 
     Raises:
         InputError, UnreachableScanner: the scenario cannot be run; nothing has been written or moved.
@@ -66,14 +73,23 @@ def build_cell(
         station = dc.replace(station, background=noted)
     try:
         check_way_home(scenario, station)
-        wiring = Wiring(DiagramBuilder(), station, scenario, seed, meshcat)
-        return _build(job, job.plan(scenario, station, seed), wiring, noted, open_sink)
+        person = person or Person()
+        wiring = Wiring(DiagramBuilder(), station, scenario, seed, meshcat, person if played is None else None)
+        cell = _build(job, job.plan(scenario, station, seed), wiring, noted, open_sink, live)
+        return dc.replace(cell, person=person)
     except BaseException:
         station.close()
         raise
 
 
-def _build(job: Job[Any], plan: Any, wiring: Wiring, noted: NotedBackground, open_sink: OpenSink | None) -> Cell[Any]:
+def _build(
+    job: Job[Any],
+    plan: Any,
+    wiring: Wiring,
+    noted: NotedBackground,
+    open_sink: OpenSink | None,
+    live: LiveView | None,
+) -> Cell[Any]:
     builder, station, scenario = wiring.builder, wiring.station, wiring.scenario
     builder.AddSystem(station.diagram)
     arms = [(FIRST, station.arm)] + ([] if station.second is None else [(SECOND, station.second)])
@@ -83,6 +99,8 @@ def _build(job: Job[Any], plan: Any, wiring: Wiring, noted: NotedBackground, ope
     spine.connect(added.ports)
     if open_sink is not None:
         noted.note = add_recorder(wiring, added.ports.results, open_sink)
+    if live is not None:
+        add_live_view(wiring, added.ports, live)
     if wiring.meshcat is not None:
         period_s = 1.0 / scenario.visualization.recording_fps
         params = MeshcatVisualizerParams(role=Role.kIllustration, prefix="cell", publish_period=period_s)

@@ -114,6 +114,7 @@ class JobCommand(Message):
     held: bool = False
     reason: str | None = None
     speed_share: float = 1.0  # of the mover's speed, 0 to 1
+    seam: int = 0  # number of the seam that is planned and welded, from 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Holds a run, and lets it go on, when a person at this computer's terminal says so."""
+"""What a person asks of a run: to hold, to go on, to end, to keep a pace; from the terminal, the dashboard or the 3D view."""
 
 import sys
 import threading
@@ -8,26 +8,57 @@ from typing import TextIO
 
 HOLD, GO_ON = "h", "g"
 KEYS = f"Type {HOLD} and Enter to hold the arm, {GO_ON} and Enter to go on, Ctrl-C to end."
+SLOWEST, FASTEST = 0.0, 3.0
+"""Real-time rates of a simulation that may be asked for; 0 is as fast as it goes."""
 
 
 class Person:
-    """What the person wants. Only the terminal sets it: any page of this computer's browsers can reach the viewer."""
+    """The wishes of a person; thread-safe. The Diagram reads them in its OperatorPanel, which makes them an input of the run.
+
+    `stands`: the run loop keeps the arm at rest now. `held_by`, `ended_by`: from where that was asked for.
+    """
 
     def __init__(self) -> None:
-        self._holds = threading.Event()
+        self._holds, self._ends = threading.Event(), threading.Event()
+        self._pace: float | None = None
+        self.held_by, self.ended_by = "", ""
+        self.stands = False
 
     @property
     def holds(self) -> bool:
         """Whether the run is to stand still."""
         return self._holds.is_set()
 
-    def hold(self) -> None:
-        """Bring the arm to rest on its path and stop the job's time."""
+    @property
+    def ends(self) -> bool:
+        """Whether the run is to end; never taken back."""
+        return self._ends.is_set()
+
+    @property
+    def pace(self) -> float | None:
+        """The real-time rate that was asked for last; None: nobody asked."""
+        return self._pace
+
+    def hold(self, by: str = "the terminal") -> None:
+        """Turn the process off, bring the arm to rest on its path and stop the job's time."""
+        if not self.holds:
+            self.held_by = by
         self._holds.set()
 
     def go_on(self) -> None:
-        """Go on along the same path, from where the arm stands."""
+        """Go on along the same path, from where the arm stands; a weld goes back a little first."""
         self._holds.clear()
+
+    def end(self, by: str = "the terminal") -> None:
+        """End the run: the process goes off and the arm comes to rest."""
+        if not self.ends:
+            self.ended_by = by
+        self._ends.set()
+
+    def ask_pace(self, pace: float) -> None:
+        """Ask for a real-time rate of a simulation; a number that is no such rate is ignored."""
+        if SLOWEST <= pace <= FASTEST:
+            self._pace = float(pace)
 
     def says(self, line: str) -> None:
         """Take a line of the terminal; lines other than HOLD and GO_ON are ignored."""

@@ -17,9 +17,8 @@ from weldcal.systems.cell import Cell, JobOf
 from weldcal.systems.drivers.simulated.second_arm import FIRST
 from weldcal.systems.host_timing import HostTiming, measure_host, require_timely_host
 from weldcal.systems.messages import JobCommand, Scan
-from weldcal.systems.motion.operator_panel import PACE_SLIDER
 from weldcal.systems.pacing import no_long_garbage_collections, real_time_priority, short_turns
-from weldcal.systems.person import KEYS, Person
+from weldcal.systems.person import KEYS
 from weldcal.systems.wall_clock import WallClock
 
 Progress = Callable[[str, float], None]
@@ -105,21 +104,25 @@ class Run(Generic[JobOf]):
         return found
 
 
+def _nothing(run: Run[JobOf]) -> None:
+    """Do nothing at the end of a run."""
+
+
 def run_cell(
     cell: Cell[JobOf],
     progress: Progress = no_progress,
     meshcat: Meshcat | None = None,
     realtime: bool = False,
-    person: Person | None = None,
+    ended: Callable[[Run[JobOf]], None] = _nothing,
 ) -> Run[JobOf]:
     """Advance until the job is done or held (or its time limit holds it) and the arm is at rest.
 
     Records into `meshcat` where one is given. A station with a pace runs at that pace of the wall clock. The station is
     always closed, also on Ctrl-C, which stops its arm. Before the first motion of a robot the computer's timing is measured.
 
-    A `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so that the job goes on
-    along the same path when the person says so. Under a burning process holding ends the run as Ctrl-C does: the process is
-    turned off first, and a seam cannot be taken up again where it was left.
+    The cell's `person` may hold the run in any phase. The path is slowed to rest, and the job's time stands still, so that the job
+    goes on along the same path when the person says so. During a weld the process is turned off first and the servo brings the tool to
+    rest; it goes on from a little before that place. `ended` is called before the recording is shown.
 
     Raises:
         HostTooLate: the computer cannot keep the robot's rate; nothing has moved.
@@ -128,12 +131,11 @@ def run_cell(
     run = Run(cell, simulator, clock=station.robot.clock)
     if realtime and run.clock is None:
         simulator.set_target_realtime_rate(1.0)
-        if meshcat is not None:
-            meshcat.SetSliderValue(PACE_SLIDER, 1.0)
+        cell.person.ask_pace(1.0)
     start = time.perf_counter()
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=cell.scenario.visualization.recording_fps)
-    finished_at, has_panel = np.inf, cell.diagram.HasSubsystemNamed("operator_panel")
+    finished_at, has_panel, person = np.inf, cell.diagram.HasSubsystemNamed("operator_panel"), cell.person
     next_at = dict.fromkeys(LOOKS, 0.0)
 
     def due(what: str, now: float) -> bool:
@@ -144,12 +146,9 @@ def run_cell(
 
     def watch(root: Context) -> EventStatus:
         nonlocal finished_at
-        if person is not None and person.holds:
-            if _process_on(cell, root):
-                run.interrupted = f"A person held the job while the process was on, in the phase '{run.command.phase}'."
-                return EventStatus.ReachedTermination(cell.diagram, "held")
+        if person.holds and not person.ends and not _process_on(cell, root) and cell.job.can_stand(root):
             if run.clock is None or run.clock.stands or not _commanded(cell, root):
-                _stand(run, person, progress)
+                _stand(run, progress)
             else:
                 run.clock.held = True
         if run.clock is not None:
@@ -197,23 +196,30 @@ def run_cell(
     finally:
         station.close()
     run.wall_seconds = time.perf_counter() - start
+    ended(run)
     if meshcat is not None:
         meshcat.StopRecording()
         meshcat.PublishRecording()
     return run
 
 
-def _stand(run: Run[JobOf], person: Person, progress: Progress) -> None:
-    """Keep the arm at rest and the Diagram's time where it is until the person lets the job go on."""
+def _stand(run: Run[JobOf], progress: Progress) -> None:
+    """Keep the arm at rest and the Diagram's time where it is until the person lets the job go on, or ends it."""
+    person = run.cell.person
     phase, share = run.cell.job.stage(run.root, run.phases)
     progress(f"held by a person ({phase}). {KEYS}", share)
     run.held_by_person += 1
-    while person.holds:
-        run.cell.station.robot.rest()
-        time.sleep(PERSON_CHECK_S)
+    person.stands = True
+    try:
+        while person.holds and not person.ends:
+            run.cell.station.robot.rest()
+            time.sleep(PERSON_CHECK_S)
+    finally:
+        person.stands = False
     progress(phase, share)
     if run.clock is not None:
         run.clock.go_on()
+    run.simulator.ResetStatistics()  # or a simulation in real time would make up for the time that it stood
 
 
 def _process_on(cell: Cell[JobOf], root: Context) -> bool:
@@ -249,6 +255,7 @@ def _keep_pace(run: Run[JobOf], root: Context) -> None:
     pace = float(panel.GetOutputPort("pace").Eval(panel.GetMyContextFromRoot(root))[0])
     if pace != run.simulator.get_target_realtime_rate():
         run.simulator.set_target_realtime_rate(pace)
+        run.simulator.ResetStatistics()  # the new rate counts from here on
 
 
 def _keep_scan(run: Run[JobOf], root: Context) -> None:

@@ -9,6 +9,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import DiagramBuilder, LeafSystem, OutputPort
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
+from weldcal.systems.person import Person
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.systems.station import Station
 
@@ -17,7 +18,8 @@ AnySystem = TypeVar("AnySystem", bound=LeafSystem)
 
 @dataclass(frozen=True, eq=False)
 class Wiring:
-    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers.
+    """A cell under construction; `meshcat` is the viewer, or None; `seed` seeds all random numbers; `person` may hold and end
+    the run (None: a recording is played back).
 
     `read` and `driven` are the ports of the station that the cell reads, and the sources of those that it drives, by name.
     """
@@ -27,6 +29,7 @@ class Wiring:
     scenario: Scenario
     seed: int = 0
     meshcat: Meshcat | None = None
+    person: Person | None = None
     read: dict[str, OutputPort] = field(default_factory=dict)
     driven: dict[str, OutputPort] = field(default_factory=dict)
 

@@ -118,6 +118,11 @@ def emit_warning(text: str) -> None:
     typer.secho(f"weldcal: {text}", err=True, fg=typer.colors.YELLOW)
 
 
+def emit_address(name: str, url: str) -> None:
+    """Writes the address of a page on stderr; the command continues."""
+    typer.secho(f"{name}  {url}", err=True, bold=True)
+
+
 @contextmanager
 def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
     """Turns every failure inside the block into one sentence on stderr and exit code 1; with --json, into JSON too.

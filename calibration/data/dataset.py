@@ -95,11 +95,14 @@ class Dataset:
 
     def guess(self, id: str) -> RigidTransform | None:
         """Pose X_CR of the feature in the camera frame from the header's guess of X_BC; None without a guess."""
+        X_BC = self.X_BC_guess
+        return None if X_BC is None else X_BC.InvertAndCompose(self.poses[id] @ self.X_FR)
+
+    @property
+    def X_BC_guess(self) -> RigidTransform | None:
+        """The header's guess of X_BC; None without one."""
         g = self.header.scanner_guess
-        if g is None:
-            return None
-        X_BC = RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
-        return X_BC.InvertAndCompose(self.poses[id] @ self.X_FR)
+        return None if g is None else RigidTransform(unit_quaternion(g.wxyz, "scanner_guess"), g.xyz)
 
     def cloud(self, id: str) -> Array:
         """Points of one cloud in metres, (N, 3) or organised (H, W, 3). Raises CloudError with the reason."""

@@ -18,7 +18,8 @@ class Case:
     (NaN: unknown), ``coverage`` (n,) share of the edge that was seen.
 
     ``robot`` names the arm; ``guess`` is X_BC (4, 4) as somebody measured it, good to ``guess_radius`` m at the feature. ``flange`` is
-    the stated designation, ``fits_flange`` the one that was found (empty: the stated one). ``refused`` lists (id, reason).
+    the stated designation, ``fits_flange`` the one that was found (empty: the stated one). ``refused`` lists (id, reason);
+    ``near_far`` is the scanner's range, m; ``oriented`` is false for pairs that have positions only.
     """
 
     ids: tuple[str, ...]
@@ -36,6 +37,7 @@ class Case:
     fits_flange: str = ""
     refused: tuple[tuple[str, str], ...] = ()
     near_far: tuple[float, float] | None = None
+    oriented: bool = True
 
     @property
     def n(self) -> int:
@@ -71,11 +73,17 @@ class Case:
     def pick(self, which: Which) -> Self:
         """Some of the scans."""
         kept = np.arange(self.n)[which]
+
+        def some(v: Array | None) -> Array | None:
+            return None if v is None else np.asarray(v[kept])
+
         return replace(
             self,
             ids=tuple(self.ids[k] for k in kept),
             X_BF=self.X_BF[kept],
             c=self.c[kept],
             m=self.m[kept],
-            **{k: None if (v := getattr(self, k)) is None else v[kept] for k in ("time", "noise", "coverage")},
+            time=some(self.time),
+            noise=some(self.noise),
+            coverage=some(self.coverage),
         )

@@ -12,8 +12,15 @@ import numpy as np
 from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.fit import Fit, fit
 from weldcal.calibration.doctor.models import Explained, explanations
-from weldcal.calibration.doctor.quality import installation, noise_growth, outliers, partial_views, too_alike
-from weldcal.calibration.doctor.readings import best_reading, mixed_units
+from weldcal.calibration.doctor.quality import (
+    installation,
+    noise_growth,
+    outliers,
+    partial_views,
+    sure_outliers,
+    too_alike,
+)
+from weldcal.calibration.doctor.readings import FEWEST, best_reading, mixed_units
 
 THRESHOLDS = {
     "scanner moved": 20.0,
@@ -33,7 +40,6 @@ LEAST_EFFECT_M = {
     "outlier scans or partial views": 1e-3,
 }
 """Smaller ones are what arms and scanners are off anyway."""
-FEWEST = 5
 _LOOKS_WRONG_M, _LOOKS_WRONG_RAD = 3e-3, 0.03
 
 
@@ -63,10 +69,10 @@ def diagnose(case: Case) -> Diagnosis:
     """The causes of a case, likeliest first; none where the scans are as good as scans are. Deterministic."""
     causes: list[Cause] = []
     if case.fits_flange and case.fits_flange != case.flange:
-        causes.append(Cause("wrong flange size", 0.99, 500.0, {}, (), case.fits_flange))
+        causes.append(Cause("wrong flange size", 0.99, 1e8, {}, (), case.fits_flange))
     if case.n >= FEWEST and (mixed := mixed_units(case)) is not None:
         case, factor, where = mixed
-        causes.append(Cause("unit mix", 0.99, 1000.0, {"factor": factor}, where))
+        causes.append(Cause("unit mix", 0.99, 1e9, {"factor": factor}, where))
     partial = partial_views(case)
     if case.n < FEWEST:
         if partial is not None:
@@ -83,7 +89,14 @@ def diagnose(case: Case) -> Diagnosis:
         rival = winner.bic if winner is not None else null.bic
         if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
             causes.append(
-                Cause(reading.cause, 0.99, null.bic - reading.fit.bic, _residuals(null, reading.fit), (), reading.words)
+                Cause(
+                    reading.cause,
+                    0.99,
+                    1e6 + null.bic - reading.fit.bic,
+                    _residuals(null, reading.fit),
+                    (),
+                    reading.words,
+                )
             )
             case, null = reading.case, reading.fit
             models = _ranked(case, null)
@@ -94,12 +107,16 @@ def diagnose(case: Case) -> Diagnosis:
         causes.append(Cause(winner.cause, _weight(winner, models, null), null.bic - winner.bic, numbers, winner.where))
     named = {c.name for c in causes}
     alone = winner is None or winner.cause != "scanner moved"
-    findings = [partial, noise_growth(case), too_alike(case), installation(case, best) if alone else None]
+    single = sure_outliers(case, null) if winner is None else None
+    findings = [partial, single, noise_growth(case), too_alike(case), installation(case, best) if alone else None]
     for found in findings:
         if found is not None and found.cause not in named:
+            named.add(found.cause)
             causes.append(
                 Cause(found.cause, float(1.0 - np.exp(-found.score / 20.0)), found.score, found.numbers, found.where)
             )
+    if wrong and not causes:
+        causes.append(Cause("unexplained", 0.5, 0.0, {"rms_mm": 1e3 * null.rms, "usual_mm": 0.3}))
     causes.sort(key=lambda c: -c.score)
     return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))))
 

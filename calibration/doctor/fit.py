@@ -28,7 +28,11 @@ _BEST = 0.6  # share of the scans that the start must explain
 @dataclass(frozen=True, eq=False)
 class Fit:
     """A fitted model: camera poses R (G, 3, 3), p (G, 3); scanner terms; the cause's numbers a (p,); residuals of centres e (n, 3) m and of
-    normals (n,) rad; spreads per axis; log-likelihood; ``size`` the count of free numbers (the scanner's not: they are held)."""
+    normals (n,) rad; spreads per axis; log-likelihood.
+
+    ``size`` counts the free numbers, not those that a prior holds (the scanner's, the arm's); ``occam`` is what numbers with a prior cost:
+    the logarithm of how much the scans narrow them (Laplace's approximation of the evidence).
+    """
 
     R: Array
     p: Array
@@ -41,6 +45,7 @@ class Fit:
     loglik: float
     size: int
     n: int
+    occam: float = 0.0
 
     @property
     def rms(self) -> float:
@@ -52,7 +57,7 @@ class Fit:
         """The criterion; less is better."""
         count = 3.0 * self.n
         few = count / max(count - self.size - 1.0, 1.0)
-        return -2.0 * self.loglik + self.size * np.log(count) * few
+        return float(-2.0 * self.loglik + self.size * np.log(count) * few + self.occam)
 
 
 def start_pose(b: Array, c: Array, seed: int = 0) -> tuple[Array, Array]:
@@ -84,14 +89,22 @@ def fit(
     columns: Array | None = None,
     start: Fit | None = None,
     normals: bool = True,
+    turning: Array | None = None,
+    prior: Array | None = None,
 ) -> Fit:
-    """The best numbers of a model; ``columns`` (n, 3, p) of the cause, ``groups`` (n,) the camera pose of each scan."""
+    """The best numbers of a model; ``columns`` (n, 3, p) of the cause, ``groups`` (n,) the camera pose of each scan.
+
+    ``turning`` (n, 3, p) is what the cause does to the normals z; ``prior`` (p,) one sigma of its numbers about zero.
+    """
     n, b, c = case.n, case.b, case.c
     g = np.zeros(n, dtype=int) if groups is None else groups
     G, p = int(g.max()) + 1, 0 if columns is None else columns.shape[2]
     D = np.zeros((n, 3, 0)) if columns is None else columns
-    has = np.isfinite(case.m).all(axis=1) & normals
-    m, z = np.where(has[:, None], case.m, 0.0), case.z
+    T = np.zeros((n, 3, p)) if turning is None else turning
+    weak = np.zeros(p) if prior is None else 1.0 / prior
+    has: NDArray[np.bool_] = np.isfinite(case.m).all(axis=1) & np.full(n, normals)
+    m = np.where(has[:, None], case.m, 0.0)
+    z = stated = case.z
     terms = np.column_stack([np.ones(n), c - c.mean(axis=0)])
     if start is not None and len(start.R) == G:
         R, t = start.R.copy(), start.p.copy()
@@ -102,9 +115,12 @@ def fit(
     sigma, sigma_n = 1e-3, 3e-3
     size = 6 * G + 4 + p
     e, en = np.zeros((n, 3)), np.zeros((n, 3))
+    rows = np.zeros((0, size))
     for step in range(_STEPS):
         q = np.einsum("kij,kj->ki", R[g], c * (1.0 + terms @ s)[:, None])
         u = np.einsum("kij,kj->ki", R[g], m)
+        z = stated + T @ a
+        z = z / np.linalg.norm(z, axis=1)[:, None]
         e, en = q + t[g] - b + D @ a, np.where(has[:, None], np.cross(u, z), 0.0)
         backward = has & ((u * z).sum(axis=1) < 0.0)
         en[backward] /= np.maximum(np.linalg.norm(en[backward], axis=1), 1e-9)[:, None]
@@ -129,13 +145,16 @@ def fit(
         at = 6 * G
         J[:, :, at : at + 4] = np.einsum("kij,kj->ki", R[g], c)[:, :, None] * terms[:, None]
         J[:, :, at + 4 :] = D
+        Jn[:, :, at + 4 :] = np.einsum("kij,kjp->kip", skew(u), T)
         rows = np.concatenate([
             (J * (np.sqrt(w) / sigma)[:, None, None]).reshape(-1, size),
             (Jn * (np.sqrt(wn) / sigma_n)[:, None, None]).reshape(-1, size)[np.repeat(has, 3)],
             np.eye(size)[at : at + 4] / _USUAL[:, None],
+            np.eye(size)[at + 4 :] * weak[:, None],
         ])  # fmt: skip
         left = np.concatenate([
             (e * (np.sqrt(w) / sigma)[:, None]).ravel(), (en * (np.sqrt(wn) / sigma_n)[:, None]).ravel()[np.repeat(has, 3)], s / _USUAL,
+            a * weak,
         ])  # fmt: skip
         unit = np.maximum(np.linalg.norm(rows, axis=0), 1e-12)
         x = -np.linalg.lstsq(rows / unit, left, rcond=1e-7)[0] / unit
@@ -147,7 +166,14 @@ def fit(
     loglik = student(np.sqrt((e**2).sum(axis=1)), sigma, 3) - 0.5 * float(((s / _USUAL) ** 2).sum())
     if has.any():
         loglik += student(tilt[has], sigma_n, 2)
-    return Fit(R, t, s, a, e, tilt, sigma, sigma_n, loglik, 6 * G + p, n)
+    if prior is None:
+        return Fit(R, t, s, a, e, tilt, sigma, sigma_n, loglik, 6 * G + p, n)
+    loglik -= 0.5 * float(((a * weak) ** 2).sum())
+    H = rows.T @ rows
+    at = 6 * G + 4
+    kept = H[at:, at:] - H[at:, :at] @ np.linalg.lstsq(H[:at, :at], H[:at, at:], rcond=1e-12)[0]
+    occam = float(np.linalg.slogdet(kept * np.outer(prior, prior))[1])
+    return Fit(R, t, s, a, e, tilt, sigma, sigma_n, loglik, 6 * G, n, occam)
 
 
 def _cross_change(u: Array, z: Array) -> Array:

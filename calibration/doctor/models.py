@@ -19,7 +19,10 @@ LEAST_PART = 3  # scans before and after a move
 _LEAST_SHARE = 0.2  # of the scans in the smaller of two states
 _STATES = 12  # reassignments of the scans to two states
 _TURNED = 0.03  # rad from which on a face is turned by the TCP and not by noise
-_TURNS = 1e-4  # rad, of a numerical derivative
+_STEP_RAD, _STEP_M = 1e-4, 1e-3  # of numerical derivatives
+_ANOTHER_ARM_M = 1e-3  # residuals below which the arm is the right one
+_SIBLING_M = 0.1  # that arms may differ by in the same joints
+_ZERO_RAD, _LENGTH_M = 5e-3, 4e-3  # what joint zeros and link lengths of two arms' files differ by, one sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +122,19 @@ def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
     x = np.linalg.lstsq(A.reshape(-1, 15), case.b.ravel(), rcond=1e-9)[0]
     U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    yield Fit(R[None], x[9:12][None], null.scanner, x[12:], null.e, null.tilt, 0.0, 0.0, 0.0, 0, n)
+    yield Fit(
+        np.asarray(R[None]),
+        np.asarray(x[9:12][None]),
+        null.scanner,
+        np.asarray(x[12:]),
+        null.e,
+        null.tilt,
+        0.0,
+        0.0,
+        0.0,
+        0,
+        n,
+    )
 
 
 def drift(case: Case, null: Fit) -> Explained | None:
@@ -166,7 +181,7 @@ def loose(case: Case, null: Fit) -> Explained | None:
     if best is None:
         return None
     bic, one, state, frame = best
-    few = state if state.sum() <= n / 2 else ~state
+    few = state if state.sum() <= n / 2 else np.logical_not(state)
     ids = tuple(np.array(case.ids)[few])
     numbers = {"jump_mm": 1e3 * float(np.linalg.norm(one.a)), "in_flange": float(frame == "flange")}
     return Explained("slack flange or loose mount", bic, one, float(np.linalg.norm(one.a)), numbers, ids)
@@ -205,10 +220,10 @@ def kinematics(case: Case, null: Fit) -> Explained | None:
         arm = load_chain(case.robot)
     except InputError:
         return None
-    best: Explained | None = None
+    best = another_arm(case, null, arm)
     for q in joint_angles(case, arm):
-        D, names = _arm_columns(case, arm, q)
-        one = fit(case, columns=D, start=null)
+        D, T, prior, names = _arm_columns(case, arm, q)
+        one = fit(case, columns=D, turning=T, prior=prior, start=null)
         if best is None or one.bic < best.bic:
             made = np.linalg.norm(D @ one.a - (D @ one.a).mean(axis=0), axis=1)
             worst = int(np.argmax(np.abs(one.a) * np.linalg.norm(D, axis=(0, 1))))
@@ -216,6 +231,26 @@ def kinematics(case: Case, null: Fit) -> Explained | None:
             best = Explained(
                 "wrong kinematics file", one.bic, one, float(np.sqrt((made**2).mean())), numbers, (names[worst],)
             )
+    return best
+
+
+def another_arm(case: Case, null: Fit, arm: Chain) -> Explained | None:
+    """The poses as another arm makes them from the same joint angles; None where no other arm explains the scans better."""
+    best: Explained | None = None
+    if null.rms < _ANOTHER_ARM_M or arm.name not in known_arms():
+        return None
+    others = [name for name in known_arms() if name != arm.name]
+    for q in joint_angles(case, arm):
+        for name in others:
+            X_BF = chain_poses(load_chain(name), q)
+            moved_m = float(np.median(np.linalg.norm(X_BF[:, :3, 3] - case.X_BF[:, :3, 3], axis=1)))
+            if moved_m > _SIBLING_M:
+                continue
+            one = fit(case.with_poses(X_BF))
+            bic = one.bic + 2.0 * np.log(8.0 * len(others))
+            if bic < null.bic and (best is None or bic < best.bic):
+                numbers = {"largest_mm": 1e3 * moved_m, "worst": 0.0}
+                best = Explained("wrong kinematics file", bic, one, moved_m, numbers, (f"as of a {name.upper()}",))
     return best
 
 
@@ -241,34 +276,31 @@ def joint_angles(case: Case, arm: Chain) -> Iterator[Array]:
     yield np.array(found)
 
 
-def _arm_columns(case: Case, arm: Chain, q: Array) -> tuple[Array, tuple[str, ...]]:
-    """Change (n, 3, p) of the feature's centre by joint zeros and link lengths, but those that only move base or flange."""
-    at = case.X_FR[:3, 3]
+def _arm_columns(case: Case, arm: Chain, q: Array) -> tuple[Array, Array, Array, tuple[str, ...]]:
+    """Change (n, 3, p) of the feature's centre and of its normal by joint zeros and link lengths (but those that only move base or
+    flange), and one sigma (p,) of those numbers between two files of one arm."""
+    poses = chain_poses(arm, q)
+    made: list[Array] = []
+    sigma: list[float] = []
+    names: list[str] = []
 
-    def centres(chain: Chain, angles: Array) -> Array:
-        X = chain_poses(chain, angles)
-        return np.asarray(X[:, :3, :3] @ at + X[:, :3, 3])
+    def add(changed: Array, step: float, usual: float, name: str) -> None:
+        made.append((changed - poses) / step)
+        sigma.append(usual)
+        names.append(name)
 
-    zero = centres(arm, q)
-    made, names = [], []
     for j in range(1, arm.n - 1):
         step = np.zeros(arm.n)
-        step[j] = _TURNS
-        made.append((centres(arm, q + step) - zero) / _TURNS)
-        names.append(f"zero of joint {j + 1}")
+        step[j] = _STEP_RAD
+        add(chain_poses(arm, q + step), _STEP_RAD, _ZERO_RAD, f"the zero of joint {j + 1}")
     for j in range(1, arm.n):
         along = arm.stack[j, :3, 3]
         length = float(np.linalg.norm(along))
-        if length < 1e-3:
-            continue
-        along = along / length
-        if j == arm.n - 1 and abs(float(along @ arm.stack[j, :3, 2])) > 0.99:
+        if length < 1e-3 or (j == arm.n - 1 and abs(float(along @ arm.stack[j, :3, 2])) > 0.99 * length):
             continue  # along the last axis: a TCP
         stack = arm.stack.copy()
-        stack[j, :3, 3] += 1e-3 * along
-        other = Chain(
-            arm.name, arm.joint_names, stack, arm.X_LF, arm.position_lower, arm.position_upper, arm.velocity_limit
-        )
-        made.append((centres(other, q) - zero) / 1e-3)
-        names.append(f"length of link {j}")
-    return -np.stack(made, axis=2), tuple(names)
+        stack[j, :3, 3] += _STEP_M * along / length
+        add(chain_poses(replace(arm, stack=stack), q), _STEP_M, _LENGTH_M, f"the length of link {j}")
+    change = np.stack(made, axis=-1) @ np.eye(len(made))
+    D = np.einsum("kijp,j->kip", change[:, :3, :3], case.X_FR[:3, 3]) + change[:, :3, 3]
+    return -D, np.einsum("kijp,j->kip", change[:, :3, :3], case.X_FR[:3, 2]), np.array(sigma), tuple(names)

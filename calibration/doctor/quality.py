@@ -6,16 +6,18 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from weldcal.calibration.doctor.case import Case
-from weldcal.calibration.doctor.fit import Fit, fit
+from weldcal.calibration.doctor.fit import NU, Fit, fit
 from weldcal.calibration.doctor.models import Explained
 from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.models.arrays import Array
 
 _GROSS = 6.0  # spreads of a scan's distance beyond which it disagrees
+_ODD, _GROSS_M = 1e-3, 1e-3  # false alarms a set, and the least error that matters
 _MOST = 0.34  # of the scans that may be single bad ones
 _LEAST_SEEN = 0.55  # of the edge; less is a partial view
 _REFUSED = 0.2  # of the scans without a flange
-_FLAT_M, _SAME_DEG = 0.02, 2.0  # poses within a ball and orientations within an angle that are too much alike
+_FLAT_M = 0.02  # rms of the centres across their longest direction that does not fix the camera
+_NEAR_M, _SAME_DEG = 0.03, 2.0  # the same, where all orientations are one
 _NOISE_FACTOR = 2.0  # between the noisiest and the quietest third, the usual growth taken off
 _NOISE_CHANCE = 1e-5
 
@@ -56,6 +58,19 @@ def outliers(case: Case, null: Fit) -> Explained | None:
     )
 
 
+def sure_outliers(case: Case, null: Fit) -> Finding | None:
+    """Single scans whose errors scans that agree would show once in a thousand sets, by Student's t of the residuals."""
+    r = np.linalg.norm(null.e, axis=1)
+    chance = f_distribution.sf((r / null.sigma_m) ** 2 / 3.0, 3, NU)
+    bad = (chance * case.n < _ODD) & (r > _GROSS_M)
+    m = int(bad.sum())
+    if m == 0 or m > _MOST * case.n or case.n - m < 5:
+        return None
+    numbers = {"worst_mm": 1e3 * float(r[bad].max()), "others_mm": 1e3 * float(np.median(r[~bad]))}
+    score = float(-2.0 * np.log(chance[bad] * case.n).sum())
+    return Finding("outlier scans or partial views", score, numbers, tuple(np.array(case.ids)[bad]))
+
+
 def _centre_errors(case: Case, one: Fit) -> Array:
     q = case.c @ one.R[0].T + one.p[0] - case.b
     return np.asarray(np.linalg.norm(q, axis=1))
@@ -75,22 +90,8 @@ def partial_views(case: Case) -> Finding | None:
 
 
 def noise_growth(case: Case) -> Finding | None:
-    """Noise of the faces that grows away from a distance faster than triangulation's square law; or a range that is left."""
+    """Noise of the faces that grows away from a distance faster than triangulation's square law."""
     z = np.linalg.norm(case.c, axis=1)
-    if case.near_far is not None:
-        outside = (z < case.near_far[0]) | (z > case.near_far[1])
-        if outside.mean() >= _REFUSED:
-            numbers = {
-                "outside": float(outside.mean()),
-                "near_mm": 1e3 * case.near_far[0],
-                "far_mm": 1e3 * case.near_far[1],
-            }
-            return Finding(
-                "scanner out of focus or range",
-                200.0 * float(outside.mean()),
-                numbers,
-                tuple(np.array(case.ids)[outside]),
-            )
     if case.noise is None or case.n < 8:
         return None
     known = np.isfinite(case.noise) & (case.noise > 0.0)
@@ -115,17 +116,19 @@ def noise_growth(case: Case) -> Finding | None:
     score = len(x) * np.log(total / max(inside, 1e-12)) - 2.0 * np.log(len(x))
     at = float(np.median(z[known][order[-third:]]))
     numbers = {"factor": factor, "at_mm": 1e3 * at, "chance": chance}
+    if case.near_far is not None:
+        numbers |= {"near_mm": 1e3 * case.near_far[0], "far_mm": 1e3 * case.near_far[1]}
     return Finding("scanner out of focus or range", float(score), numbers, tuple(worst))
 
 
 def too_alike(case: Case) -> Finding | None:
-    """Poses that differ too little in place, or in orientation, to fix the camera or to show a TCP."""
+    """Poses that differ too little to fix the camera. One orientation alone is no fault where the places differ enough."""
     b = case.b - case.b.mean(axis=0)
     width = np.linalg.svd(b, compute_uv=False) / np.sqrt(case.n)
     R = case.X_BF[:, :3, :3]
     turn = np.degrees(np.linalg.norm(log_rotation(np.swapaxes(R[:1], 1, 2) @ R), axis=1))
     middle = float(np.max(turn))
-    flat, same = width[1] < _FLAT_M, middle < _SAME_DEG
+    flat, same = width[1] < _FLAT_M, case.oriented and middle < _SAME_DEG and width[1] < _NEAR_M
     if not flat and not same:
         return None
     numbers = {"spread_mm": 1e3 * float(width[0]), "second_mm": 1e3 * float(width[1]), "turn_deg": middle}
@@ -151,4 +154,4 @@ def installation(case: Case, one: Fit) -> Finding | None:
         "shift_mm": 1e3 * float(np.linalg.norm(shift)),
         "stated_mm": 1e3 * case.guess_radius,
     }
-    return Finding("robot in another installation", 10.0 * (off / case.guess_radius) ** 2, numbers)
+    return Finding("robot in another installation", float(min(10.0 * (off / case.guess_radius) ** 2, 400.0)), numbers)

@@ -12,7 +12,10 @@ from weldcal.calibration.geometry.se3 import inverse, pose
 from weldcal.models.arrays import Array
 
 UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
-_WITHIN = 0.08  # of a unit's factor
+"""Millimetres, inches, decimetres and centimetres for metres, and the reverse."""
+_WITHIN = 0.5  # of the logarithm of a unit's factor: a TCP or a quaternion's order changes spreads, too
+_REACH_M = (0.02, 9.0)
+FEWEST = 5
 _LEAST_GAIN = 3.0  # a reading must bring the residuals down by this factor: nothing less is a misreading
 
 
@@ -90,22 +93,21 @@ def best_reading(case: Case, null: Fit) -> Reading | None:
 def mixed_units(case: Case) -> tuple[Case, float, tuple[str, ...]] | None:
     """The case in one unit, the factor and the scans that were in another one; None where all are in one.
 
-    Positions of single poses, or distances of single scans, that are a unit's factor away from the median of the others; else one
-    factor between the spreads of both sides.
+    Distances of poses from the base, or of scans from the camera, in two groups that a unit's factor separates: those within the reach of
+    an arm are in metres. Else one factor between the spreads of both sides.
     """
     for name, points in (("poses", case.X_BF[:, :3, 3]), ("scans", case.c)):
         size = np.linalg.norm(points, axis=1)
-        ratio = size / max(float(np.median(size)), 1e-12)
-        for unit in UNITS[:4]:
-            off = np.abs(ratio / unit - 1.0) < (0.8 if unit > 100.0 or unit < 0.01 else 0.5)
-            if off.any() and off.sum() <= 0.5 * case.n:
-                factor = np.where(off, 1.0 / unit, 1.0)
-                return _scaled(case, name, factor), unit, tuple(np.array(case.ids)[off])
-    if case.n >= 4:
-        spreads = [float(np.median(np.linalg.norm(v - np.median(v, axis=0), axis=1))) for v in (case.b, case.c)]
-        ratio_all = spreads[0] / max(spreads[1], 1e-12)
+        near = (size > _REACH_M[0]) & (size < _REACH_M[1])
+        for unit in (1e3, 1e-3):
+            off = ~near & (size / unit > _REACH_M[0]) & (size / unit < _REACH_M[1])
+            if off.any() and (near | off).all():
+                return _scaled(case, name, np.where(off, 1.0 / unit, 1.0)), unit, tuple(np.array(case.ids)[off])
+    if case.n >= FEWEST:
+        spreads = [float(np.sqrt(((v - v.mean(axis=0)) ** 2).sum(axis=1).mean())) for v in (case.b, case.c)]
+        ratio = spreads[0] / max(spreads[1], 1e-12)
         for unit in UNITS:
-            if abs(ratio_all / unit - 1.0) < max(_WITHIN, 0.3):
+            if abs(np.log(ratio / unit)) < _WITHIN:
                 other = _scaled(case, "poses", np.full(case.n, 1.0 / unit))
                 if fit(other).rms < 0.05 * spreads[1]:
                     return other, unit, case.ids

@@ -72,10 +72,11 @@ class WeldPart(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part in its frame P (that of its file) with one seam, m. See WeldPart."""
+    """A part in its frame P (that of its file) with a seam, and others that are welded before or after it, m. See WeldPart."""
 
     shape: PartShape
     seam: DrawnSeam
+    others: tuple[DrawnSeam, ...] = ()
 
     @property
     def name(self) -> str:
@@ -89,8 +90,9 @@ class Part:
 
     @cached_property
     def groove_mesh(self) -> TriMesh:
-        """The surface about the seam."""
-        return about(self.shape.mesh, self.seam.points_P, FELT_ABOUT_SEAM_M)
+        """The surface about the seams."""
+        points = np.concatenate([seam.points_P for seam in (self.seam, *self.others)])
+        return about(self.shape.mesh, points, FELT_ABOUT_SEAM_M)
 
     @property
     def seam_P(self) -> Floats:
@@ -163,6 +165,19 @@ class Part:
         return Entry(-(mouth + BESIDE_M), self.depth_m + tip.tip_radius_m - seated.above_m)
 
 
+def seam_count(part: WeldPart) -> int:
+    """How many seams are drawn on a part."""
+    return 1 + len(part.others) if isinstance(part, Part) else 1
+
+
+def numbered(part: WeldPart, seam: int) -> WeldPart:
+    """The part with its seam of this number, counted from 0 in the order of welding; a plate has one."""
+    if not isinstance(part, Part) or seam == 0:
+        return part
+    seams = (part.seam, *part.others)
+    return Part(part.shape, seams[seam], (*seams[:seam], *seams[seam + 1 :]))
+
+
 def about(mesh: TriMesh, points: Floats, reach_m: float) -> TriMesh:
     """The triangles of a mesh whose boxes come within reach of a line (N,3)."""
     corners = mesh.vertices[mesh.triangles]
@@ -198,7 +213,13 @@ def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
         return np.asarray(points + amplitude_m * np.cos(math.pi * x)[:, None] * direction)
 
     mesh = _divided_along(part.mesh, e, BOWED_EDGE_M)
-    points = moved(seam)
+    first, *others = (_moved_seam(s, moved) for s in (part.seam, *part.others))
+    return Part(replace(part.shape, mesh=TriMesh(moved(mesh.vertices), mesh.triangles)), first, tuple(others))
+
+
+def _moved_seam(s: DrawnSeam, moved: Callable[[Floats], Floats]) -> DrawnSeam:
+    """The seam on a moved surface, its directions square to it."""
+    points = moved(s.points_P)
     t = np.gradient(points, axis=0)
     t /= np.linalg.norm(t, axis=1, keepdims=True)
 
@@ -206,12 +227,9 @@ def bowed(part: Part, amplitude_m: float, direction: Floats) -> Part:
         v = v - np.sum(v * t, axis=1, keepdims=True) * t
         return np.asarray(v / np.linalg.norm(v, axis=1, keepdims=True))
 
-    s = part.seam
-    walls: Callable[[Floats], Floats] = square
-    drawn = replace(
-        s, points_P=points, up_P=walls(s.up_P), wall_left_P=walls(s.wall_left_P), wall_right_P=walls(s.wall_right_P)
+    return replace(
+        s, points_P=points, up_P=square(s.up_P), wall_left_P=square(s.wall_left_P), wall_right_P=square(s.wall_right_P)
     )
-    return Part(replace(part.shape, mesh=TriMesh(moved(mesh.vertices), mesh.triangles)), drawn)
 
 
 def _divided_along(mesh: TriMesh, e: Floats, edge_m: float) -> TriMesh:

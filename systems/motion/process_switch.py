@@ -25,8 +25,9 @@ class ProcessSwitch(LeafSystem):
     `torch_wanted` (1) of the servo; `margin` (2) of the SingularityGuard, whose second number is 1 while it stops the arm;
     `hold` (1) of the operator. `process_on` (1) follows all inputs without delay. The arm's command passes through the
     arbiter and the slew limiter, so the torch is off no later than the first tick in which the arm is commanded to stop.
-    A burning torch that was turned off here stays off for the rest of that weld. `arm_stopped` (1): the guard turned it
-    off; the JobSequencer then holds the job.
+    A burning torch that the robot's status or the guard turned off stays off for the rest of that weld; after a person's hold
+    the servo asks for it anew, when it is let go and has gone back. `arm_stopped` (1): the guard turned it off; the JobSequencer
+    then holds the job.
     """
 
     def __init__(self, period_s: float = 0.002) -> None:
@@ -45,9 +46,8 @@ class ProcessSwitch(LeafSystem):
         return bool(self._margin.Eval(context)[1] > 0.5)
 
     def _free(self, context: Context) -> bool:
-        """Whether robot, guard and operator all allow the process."""
-        ready = self._status.Eval(context).ready
-        return bool(ready and not self._stopped(context) and self._hold.Eval(context)[0] < 0.5)
+        """Whether robot and guard both allow the process."""
+        return bool(self._status.Eval(context).ready and not self._stopped(context))
 
     def _latch(self, context: Context, discrete: DiscreteValues) -> None:
         off, stopped = context.get_discrete_state_vector().value()
@@ -61,7 +61,8 @@ class ProcessSwitch(LeafSystem):
         job: JobCommand = self._job.Eval(context)
         off = context.get_discrete_state_vector().value()[0] > 0.5
         consent = job.process_on and not job.held and self._wanted.Eval(context)[0] > 0.5
-        output.SetAtIndex(0, float(consent and not off and self._free(context)))
+        held = self._hold.Eval(context)[0] > 0.5
+        output.SetAtIndex(0, float(consent and not off and not held and self._free(context)))
 
     def _arm_stopped(self, context: Context, output: BasicVector) -> None:
         output.SetAtIndex(0, context.get_discrete_state_vector().value()[1])

@@ -18,7 +18,7 @@ from weldcal.welding.servo.guards import SlewLimits
 
 MOVE_SPEED, MOVE_ACCELERATION = 1.0, 2.5  # rad/s and rad/s^2 of the fastest joint, at speed_factor 1
 MOVE_TIMEOUT_S = 20.0  # at speed_factor 1
-HOLD = "operator.hold"  # in a recording
+HOLD, END = "operator.hold", "operator.end"  # in a recording
 JERK_LIMIT = 150.0  # rad/s^3: 100 ms to the acceleration limit of the large joints
 SPEED_SHARE, ACCELERATION_SHARE = 0.6, 0.5  # of the arm's own limits
 
@@ -29,7 +29,7 @@ class JobPorts:
 
     `commands`: a JobCommand for each arm. `velocity` (6) rad/s drives the first arm while its command's mode is `weld`.
     `torch_wanted` (1) and `margin` (2) go to the ProcessSwitch. `logged`: vector ports by their name in the log. `results`:
-    ports whose values a recording keeps, by name.
+    ports whose values a recording keeps, by name. `shown`: ports with messages that the dashboard shows, by name.
     """
 
     commands: tuple[OutputPort, ...]
@@ -39,6 +39,7 @@ class JobPorts:
     margin: OutputPort | None = None
     logged: dict[str, OutputPort] = field(default_factory=dict)
     results: dict[str, OutputPort] = field(default_factory=dict)
+    shown: dict[str, OutputPort] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +62,13 @@ class SpineArm:
 
 @dataclass(frozen=True, eq=False)
 class Spine:
-    """The shared systems: `hold` (1) is the operator's stop request; `switch` outputs `process_on` and `arm_stopped`."""
+    """The shared systems: `hold` (1) is 1.0 while a person holds the run, `end` (1) once a person has ended it; `switch` outputs
+    `process_on` and `arm_stopped`."""
 
     wiring: Wiring
     arms: tuple[SpineArm, ...]
     hold: OutputPort
+    end: OutputPort
     switch: ProcessSwitch
 
     @property
@@ -139,16 +142,16 @@ def add_spine(
         w.connect(limiter, velocity_wanted=arbiter.GetOutputPort("velocity_wanted"))
         w.feed(f"{prefix}.velocity_command", limiter.get_output_port())
         made.append(SpineArm(prefix, measured, status, recorder.GetOutputPort("history"), mover, arbiter, own_error))
-    hold = _hold(w)
-    return Spine(w, tuple(made), hold, w.add("process_switch", ProcessSwitch()))
+    hold, end = _person(w)
+    return Spine(w, tuple(made), hold, end, w.add("process_switch", ProcessSwitch()))
 
 
-def _hold(w: Wiring) -> OutputPort:
-    """The operator's stop request: of the viewer, or of a recording that is played back."""
-    if w.station.diagram.HasOutputPort(HOLD):
-        return w.out(HOLD)
-    if w.meshcat is None:
-        return w.zeros("nobody_holds", 1)
-    hold = w.add("operator_panel", OperatorPanel(w.meshcat)).GetOutputPort("hold")
-    w.read[HOLD] = hold
-    return hold
+def _person(w: Wiring) -> tuple[OutputPort, OutputPort]:
+    """What a person asks for, or asked for in a recording that is played back: to hold, to end."""
+    if all(w.station.diagram.HasOutputPort(name) for name in (HOLD, END)):
+        return w.out(HOLD), w.out(END)
+    if w.person is None:
+        return w.zeros("nobody_holds", 1), w.zeros("nobody_ends", 1)
+    panel = w.add("operator_panel", OperatorPanel(w.person, w.meshcat))
+    w.read[HOLD], w.read[END] = panel.GetOutputPort("hold"), panel.GetOutputPort("end")
+    return w.read[HOLD], w.read[END]

@@ -42,8 +42,6 @@ def check_workpiece(spec: WorkpieceConfig) -> None:
             f"workpiece.seams is missing: write seams: [{{edges: [1]}}] with a number from weldcal part {Path(spec.file).name}, or "
             "seams: [{polyline: seam.csv}]."
         )
-    if len(spec.seams) > 1:
-        raise InputError(f"workpiece.seams has {len(spec.seams)} seams, and a run welds one: keep one of them.")
     for seam in spec.seams:
         source(seam)
         if seam.polyline is not None and not Path(seam.polyline).is_file():
@@ -60,7 +58,7 @@ def source(seam: SeamConfig) -> SeamSource:
 
 
 def part_of(spec: WorkpieceConfig) -> Part:
-    """The part as drawn, with its seam.
+    """The part as drawn, with its seams: the first one, and the others in the order of welding.
 
     Raises:
         InputError: its file or its seam cannot be used.
@@ -69,7 +67,8 @@ def part_of(spec: WorkpieceConfig) -> Part:
     assert spec.file is not None
     assert spec.joint is not None
     shape = read_shape(Path(spec.file), spec.units)
-    return Part(shape, seam_of(shape, source(spec.seams[0]), spec.joint))
+    first, *others = (seam_of(shape, source(seam), spec.joint) for seam in spec.seams)
+    return Part(shape, first, tuple(others))
 
 
 def made(part: Part, spec: WorkpieceConfig, rng: np.random.Generator) -> Part:

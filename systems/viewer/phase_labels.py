@@ -30,6 +30,27 @@ TEXT = {
     "done": "done",
     "held": "HELD: see the report",
 }
+STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
+    (
+        "Calibrate",
+        "calibrate",
+        (
+            "start",
+            "move_home",
+            "move_to_verification_cloud",
+            "scan_verification_cloud",
+            "move_to_pose",
+            "scan_pose",
+        ),
+    ),
+    ("Verify", "calibrate", ("move_to_verify", "scan_verify")),
+    ("Park", None, ("start", "move_home", "park")),
+    ("Scan the part", "weld", ("scan_workpiece",)),
+    ("Approach", "weld", ("approach_above", "approach")),
+    ("Weld", "weld", ("weld",)),
+    ("Go home", "weld", ("retract", "home")),
+)
+"""Steps of the weld job: name, the part of the job that it belongs to (None: both), and its phases."""
 
 
 def label_image(text: str) -> NDArray[np.uint8]:

@@ -19,6 +19,7 @@ from weldcal.systems.viewer.weld_gauge import HEIGHT_PX, WIDTH_PX, gauge_picture
 
 PLANNED, REFINED, TORCH = Rgba(0.55, 0.55, 0.60, 1.0), Rgba(0.15, 0.45, 0.90, 1.0), Rgba(0.95, 0.45, 0.10, 1.0)
 TIP, CAD, ARROW = Rgba(0.35, 0.80, 0.95, 1.0), Rgba(0.05, 0.50, 0.42, 1.0), Rgba(0.80, 0.10, 0.45, 1.0)
+WAY_BACK = Rgba(0.48, 0.20, 0.80, 1.0)
 SHOWN_ABOVE_M = 0.008  # paths are raised above the groove to be visible
 DEFLECTION_SCALE = 10.0
 _OVER_THE_HEAD = np.array([0.0, 0.0, 0.016])
@@ -38,6 +39,7 @@ class WeldView:
         self._gauge: list[tuple[float, float, float]] = []
         self._last: tuple[float, Array] | None = None
         self._arrow = False
+        self._ways_back, self._way_shown = 0, False
 
     def draw(self, planned: PlannedSeam, servo: ServoReport, time: float) -> None:
         """Update the viewer with the newest plan and servo report."""
@@ -51,6 +53,7 @@ class WeldView:
                 self._arrow = False
                 self._meshcat.SetProperty(f"{self._root}/deflection", "visible", False, time)
             return
+        self._draw_way_back(servo, time)
         self._collect(servo)
         self._draw_arrow(servo, time)
         if time >= self._next and len(self._gauge) > 1:
@@ -93,6 +96,19 @@ class WeldView:
             self._meshcat.SetProperty(f"{self._root}/gauge/{piece - 1:03d}", "visible", False, time)
         self._torch, self._tip = self._torch[-1:], self._tip[-1:]
         self._points, self._pieces = len(refined), piece + 1
+
+    def _draw_way_back(self, servo: ServoReport, time: float) -> None:
+        """While a person holds the weld, and until it goes on: the torch's way back to where it goes on."""
+        way = servo.interruption.way_back
+        if bool(way) == self._way_shown:
+            return
+        self._way_shown = bool(way)
+        if not way:
+            self._meshcat.SetProperty(f"{self._root}/seam/way_back/{self._ways_back:02d}", "visible", False, time)
+            return
+        self._ways_back += 1
+        line = np.array([point.X_BT @ self._tool.p_TW for point in way])
+        self._path(f"seam/way_back/{self._ways_back:02d}", line, SHOWN_ABOVE_M + 0.008, WAY_BACK, time)
 
     def _draw_arrow(self, servo: ServoReport, time: float) -> None:
         """Draw the tip's deflection from rest as an arrow magnified ten times, with a label of the scale."""

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from tests.held_weld import held_weld, short_weld
 from weldcal.systems.cell import build_cell
 from weldcal.systems.drivers.ur.rtde import UrRtde
 from weldcal.systems.person import Person
@@ -60,7 +61,7 @@ def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(contro
             seen["begun"] = {}
             threading.Thread(target=hold_for_a_while, daemon=True).start()
 
-    run = run_cell(build_cell(described), watch, person=person)
+    run = run_cell(build_cell(described, person=person), watch)
     assert run.reason is None
     assert run.held_by_person == 1
     assert [name for name, _, _ in run.phases] == ["start", "move_home", "park", "done"]
@@ -74,3 +75,15 @@ def test_the_arm_rests_on_its_path_while_it_is_held_and_then_ends_its_way(contro
     assert np.abs(np.array(controller.state()["q"]) - Q_HOME).max() < 1e-3
     assert run.clock is not None
     assert run.clock.reanchored == 0
+
+
+def test_a_held_weld_is_finished_over_the_join() -> None:
+    described = short_weld()
+    with emulator_process(q=np.deg2rad(described.home_deg).tolist(), lockstep=LOCKSTEP_S) as controller:
+        described.robot = UrRtde(host=controller.host, lockstep=True, process_output=3)
+        found = held_weld(described)
+    assert found.run.reason is None
+    assert found.run.held_by_person == 1
+    assert found.still_ms < 100.0
+    assert found.mean_m <= 0.15e-3
+    assert found.left_out_m < 0.3e-3

@@ -159,7 +159,7 @@ def test_a_person_holds_it(alone: Alone) -> None:
     alone.tell(hold=[1.0])
     alone.run(0.04)
     assert alone.state.phase == "held"
-    assert alone.state.reason.startswith("A person held the job")
+    assert alone.state.reason.startswith("A person ended the job")
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,13 @@ job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -
 HELD_S = 0.3
 
 
-def made() -> Cell[Any]:
+def made(person: Person) -> Cell[Any]:
     """A cell whose arm goes home from a little beside it, and then parks."""
     scenario = load_scenario("straight_groove", TOLD)
     scenario.job.weld = False
-    return build_cell(scenario, robot=PreparedRobot(load_arm("ur10e"), np.deg2rad(scenario.home_deg) + 0.05))
+    return build_cell(
+        scenario, robot=PreparedRobot(load_arm("ur10e"), np.deg2rad(scenario.home_deg) + 0.05), person=person
+    )
 
 
 def test_the_terminals_lines_hold_and_let_go_on() -> None:
@@ -58,7 +60,7 @@ def test_a_job_that_was_held_goes_on_as_if_nothing_had_been(phase: str) -> None:
                 person.hold()
                 threading.Timer(HELD_S, person.go_on).start()
 
-        run = run_cell(made(), watch, person=person)
+        run = run_cell(made(person), watch)
         assert run.reason is None
         assert run.held_by_person == int(hold)
         assert any(stage.startswith("held by a person") for stage in told) == hold
@@ -66,11 +68,28 @@ def test_a_job_that_was_held_goes_on_as_if_nothing_had_been(phase: str) -> None:
     assert ends[0] == ends[1]
 
 
-def test_under_a_burning_torch_holding_ends_the_job(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("weldcal.systems.runner._process_on", lambda cell, root: True)
+@pytest.mark.parametrize("held", [False, True])
+def test_a_person_ends_the_job_also_while_it_is_held(held: bool) -> None:
     person = Person()
-    person.hold()
-    run = run_cell(made(), person=person)
+    if held:
+        person.hold()
+
+    def watch(stage: str, _: float) -> None:
+        if stage.startswith("held by a person"):
+            threading.Timer(HELD_S, person.end).start()
+        elif not held:
+            person.end()
+
+    run = run_cell(made(person), watch)
     assert run.held
-    assert "while the process was on" in (run.reason or "")
-    assert np.isfinite(run.seconds)
+    assert (run.reason or "").startswith("A person ended the job, in the phase")
+    assert run.held_by_person == int(held)
+
+
+def test_a_pace_that_does_not_exist_is_not_asked_for() -> None:
+    person = Person()
+    for pace in (float("nan"), -0.1, 3.1, float("inf")):
+        person.ask_pace(pace)
+        assert person.pace is None
+    person.ask_pace(3.0)
+    assert person.pace == 3.0

@@ -97,6 +97,7 @@ from weldcal.systems.motion.pose_recorder import PoseHistory, PoseRecorder
 from weldcal.systems.motion.process_switch import ProcessSwitch
 from weldcal.systems.motion.singularity_guard import SingularityGuard
 from weldcal.systems.motion.slew_limiter import SlewLimiter
+from weldcal.systems.person import Person
 from weldcal.systems.recording.player import PortPlayer
 from weldcal.systems.recording.port_recorder import PortRecorder, PortSink
 from weldcal.systems.scenario.loading import load_scenario
@@ -104,6 +105,7 @@ from weldcal.systems.scenario.schema import VisualizationConfig
 from weldcal.systems.station import CheatPoses
 from weldcal.systems.viewer.cell_visualizer import CellVisualizer
 from weldcal.systems.viewer.drift_view import DriftView
+from weldcal.systems.viewer.live import LiveView, LiveWriter
 from weldcal.systems.wall_clock import WallClock
 from weldcal.welding.servo.guards import SlewLimits
 from weldcal.welding.servo.settings import ServoConfig
@@ -175,7 +177,8 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     ),
     PortRecorder: lambda: PortRecorder((6, 2), {}, {}, cast("PortSink", None)),
     PortPlayer: lambda: PortPlayer({}, {}),
-    OperatorPanel: lambda: OperatorPanel(Meshcat(MeshcatParams(host="localhost", port=0))),
+    OperatorPanel: lambda: OperatorPanel(Person(), Meshcat(MeshcatParams(host="localhost", port=0))),
+    LiveWriter: lambda: LiveWriter(LiveView(), {}, None),
     CheatPoses: lambda: CheatPoses(plain_station().world, TOOL),
     TabletProcedure: lambda: TabletProcedure(the_arm(), plan_tablet(load_scenario("tablet"), the_arm())),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
@@ -340,6 +343,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "sample_time": 1,
         "job": JobCommand,
         "arc_established": 1,
+        "hold": 1,
         "V_BT": 6,
         "servo_report": ServoReport,
         "telemetry": len(TELEMETRY),
@@ -406,7 +410,8 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     PortRecorder: {"entered": 6, "left": 2},
     PortPlayer: {},
-    OperatorPanel: {"hold": 1, "pace": 1},
+    LiveWriter: {"job": JobCommand, "margin": 2},
+    OperatorPanel: {"hold": 1, "end": 1, "pace": 1},
     CheatPoses: {"body_poses": list, "contact": 6, "torch": 3},
 }
 

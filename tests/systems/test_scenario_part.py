@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.models.workpieces.part import Part
-from weldcal.systems.jobs.weld.settings import seated_tip, servo_config
+from weldcal.models.workpieces.part import Part, numbered, seam_count
+from weldcal.systems.jobs.weld.settings import job_plan, seated_tip, servo_config
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.workpiece import part_of
 from weldcal.systems.station import make_station
@@ -42,7 +42,6 @@ def test_its_paths_are_relative_to_the_scenarios_file(
         ("joint: fillet", "joint: dovetail", "cannot be 'dovetail'"),
         ("  joint: fillet\n", "", "joint is missing"),
         ("seams: [{polyline: straight_web.csv}]", "seams: []", "seams is missing: .*weldcal part straight_web.step"),
-        ("seams: [{polyline: straight_web.csv}]", "seams: [{edges: [1]}, {edges: [2]}]", "2 seams"),
         ("polyline: straight_web.csv", "polyline: none.csv", "no file '.*none.csv'"),
         ("polyline: straight_web.csv", "polyline: straight_web.csv, edges: [1]", "either polyline"),
         ("polyline: straight_web.csv", "edges: [1], start_mm: -1", "0 or more"),
@@ -77,6 +76,38 @@ def test_the_station_has_the_part_as_drawn_and_the_true_one_apart(cell: Path) ->
         assert servo.deflection.delta_d_m < 0.0011  # a wide joint: 2 mm would climb its wall
         assert servo.deflection.axial_d_m == pytest.approx(0.004)
         assert servo.touch.offset_m == 0.0
+    finally:
+        station.close()
+
+
+def test_several_seams_lie_on_one_part_in_their_order(cell: Path) -> None:
+    (cell.parent / "far.csv").write_text("-100,5,0\n100,5,0\n")
+    text = cell.read_text().replace(
+        "{polyline: straight_web.csv}",
+        "{polyline: straight_web.csv, end_mm: 60}, {polyline: far.csv, direction: reverse, start_mm: 50}",
+    )
+    two = cell.with_name("two.yaml")
+    two.write_text(text)
+    scenario = load_scenario(str(two))
+    assert job_plan(scenario).seams == 2
+    station = make_station(scenario, seed=3)
+    try:
+        cad, true = station.cad, station.truth.workpiece
+        assert isinstance(cad, Part)
+        assert true is not None
+        assert seam_count(cad) == 2
+        first, second = numbered(cad, 0), numbered(cad, 1)
+        assert 1e3 * first.seam_P[[0, -1], :2] == pytest.approx(np.array([[-100.0, -5.0], [40.0, -5.0]]), abs=0.1)
+        # Of the reversed seam the start that is cut off is that of the travel.
+        assert 1e3 * second.seam_P[[0, -1], :2] == pytest.approx(np.array([[50.0, 5.0], [-100.0, 5.0]]), abs=0.1)
+        # One bow of the part moves both, and the tip feels both.
+        bow = [numbered(true, k).seam_P[70] - numbered(cad, k).seam_P[70] for k in (0, 1)]
+        assert min(float(np.linalg.norm(b)) for b in bow) > 1e-4
+        assert bow[0] @ bow[1] > 0.9 * float(np.linalg.norm(bow[0]) * np.linalg.norm(bow[1]))
+        assert np.ptp(true.groove_mesh.vertices[:, 1]) > 0.02
+        # The first ends where the joint goes on, the second with the part.
+        ends = [servo_config(scenario, station, k).gap.end_window_m for k in (0, 1)]
+        assert ends[0] < ends[1]
     finally:
         station.close()
 

@@ -183,6 +183,19 @@ def replays(
     return Outcome(summary, text=table)
 
 
+@command("benchmark doctor", options=FARM)
+def doctor(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Sets with each cause.", min=1)] = 20,
+    cleans: Annotated[int, option("--clean", "N", "Sets without a cause.", min=0)] = 200,
+) -> Outcome:
+    """Inject each cause into simulated sets of scans, and count which one `weldcal doctor` names first."""
+    from weldcal.tools.studies.doctor.study import run_doctor_study
+
+    summary, table = run_doctor_study(call.farm(call.folder("benchmark", "doctor")), runs, cleans, call.seed)
+    return Outcome(summary, text=table)
+
+
 @command("benchmark arms", options=FARM)
 def arms(
     call: Call,
@@ -294,6 +307,7 @@ COMMANDS = (
     profiler,
     cell,
     seeds,
+    doctor,
     fleet,
     replays,
     arms,

@@ -43,7 +43,8 @@ FlangeOption = Annotated[
     str | None, option("--flange", "NAME", "Flange standard, if the dataset does not name it: iso9409-1-50-4-m6.")
 ]
 
-_BROWSER = "Open the live 3D view in the web browser, or do not."
+_BROWSER = "Open the dashboard with the live 3D view in the web browser, or do not."
+_SHARE = "Show the dashboard, read-only, to the network too, at an address with a token."
 _ROBOT = "simulated, emulated (a controller on loopback), or the address of a controller."
 _ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
 _PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
@@ -54,6 +55,7 @@ _SCHEDULER = "Address of a Dask scheduler; its workers compute, with the same nu
 _OUT = "Output folder; default: a new one in weldcal-out."
 COMMON: dict[str, tuple[Any, object]] = {
     "browser": (Annotated[bool, switch("--browser/--no-browser", _BROWSER)], True),
+    "share": (Annotated[bool, switch("--share", _SHARE)], False),
     "realtime": (Annotated[bool, switch("--realtime", "Do not run faster than real time.")], False),
     "record": (Annotated[bool, switch("--record", _RECORD)], False),
     "robot": (Annotated[str | None, option("--robot", "ROBOT", _ROBOT, show_default="as in the scenario")], None),
@@ -74,7 +76,7 @@ COMMON: dict[str, tuple[Any, object]] = {
 """Every common option with its default, by the name of its parameter."""
 
 MOTION = ("dry_run", "pace", "speed_factor")
-LIVE = ("browser", "realtime", "robot", *MOTION)
+LIVE = ("browser", "share", "realtime", "robot", *MOTION)
 FARM = ("workers", "scheduler")
 RESULT = ("out", "seed", "json", "debug")
 LOOK = ("json", "debug")

@@ -25,6 +25,7 @@ from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.contradictions import estimate_consistent
+from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
 from weldcal.tools.commands.refine import KINEMATICS_FILE, REFINEMENTS, Refinable, Refined, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
@@ -58,7 +59,7 @@ def calibrate_dataset(
     out) takes the scans from one id to another, in the order of the dataset. ``refine``: "local" adds a field of what the calibration
     leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
     errors fall. A cloud that cannot be used is refused and
-    reported, as long as enough remain. Nothing is written unless the calibration succeeded.
+    reported, as long as enough remain. Without a calibration only observations.csv is written, for `weldcal doctor`.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
@@ -75,17 +76,18 @@ def calibrate_dataset(
     standard = get_flange(flange or data.header.flange)
     seen = see_flanges(data, standard, seed=seed, tell=lambda fraction: tell("fitting flanges", 0.7 * fraction))
     observations, fits, clouds, refused = list(seen.observations), seen.fits, seen.clouds, list(seen.refused)
-    _enough(observations, refused)
-    tell("solving", 0.7)
     few = len(observations) < ENOUGH
-    X_FR = None if data.pairs else data.X_FR
     tcp: tuple[str, ...] = ()
-    if few:
-        turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
-        estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
-    else:
-        config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
-        estimate, tcp = estimate_consistent(observations, config, X_FR, 0.5 * standard.outer_m)
+    with examined_where_refused(Path(out), data, seen, standard, seed):
+        _enough(observations, refused)
+        tell("solving", 0.7)
+        if few:
+            turn = None if axis_turn_deg is None else float(np.radians(axis_turn_deg))
+            estimate = calibrate_from_few(observations, seen.patterns, turn, seed=seed)
+        else:
+            config = SolveConfig(seed=seed, allow_coplanar=bool(fits))
+            X_FR = None if data.pairs else data.X_FR
+            estimate, tcp = estimate_consistent(observations, config, X_FR, 0.5 * standard.outer_m)
     tell("estimating the scanner correction", 0.72)
     rigid = estimate
     scanner, corrected, estimate = apply_self_calibration(
@@ -201,6 +203,7 @@ def calibrate_dataset(
         write_atomic(Path(out) / KINEMATICS_FILE, refined.kinematics)
     if centres:
         write_atomic(Path(out) / "centres.csv", _centres_csv(observations))
+    write_case(Path(out), dataset_case(data, seen, standard, standard))
     # last, so that its presence means that everything else is there
     save_result(result, Path(out))
     report = replace(report, seconds=time.monotonic() - started)

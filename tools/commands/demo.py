@@ -7,11 +7,12 @@ from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import PoseConfig, Scenario
 from weldcal.tools.commands.run import JobRun, run_job
-from weldcal.tools.commands.run_files import weld_record, write_calibration, write_scans, write_weld_log
+from weldcal.tools.commands.run_files import SCANS, SUMMARY, weld_record, write_calibration, write_scans, write_weld_log
 from weldcal.tools.outcomes.demo import DemoResult
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.weld import live_calibration_error, weld_outcome
 from weldcal.tools.report.demo import demo_pictures, demo_report
+from weldcal.tools.report.files import write_json
 from weldcal.tools.report.render import write_atomic
 
 
@@ -72,11 +73,11 @@ def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") ->
 
 
 def write_result(result: DemoResult, finished: JobRun) -> None:
-    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, report.html, each atomically."""
+    """Write calibration.yaml and its exports, scans/, weld.csv with weld.json, plots/, recording.html, summary.json, report.html."""
     folder, run = result.folder, result.run
     folder.mkdir(parents=True, exist_ok=True)
     write_calibration(run.cell, result.status, result.options.seed, folder)
-    write_scans(run, result.status, folder / "scans", result.robot)
+    write_scans(run, result.status, folder / SCANS, result.robot)
     if result.weld is not None:
         record = weld_record(run, result.weld, result.options.seed, result.options.scenario, result.robot)
         write_weld_log(record, folder)
@@ -84,4 +85,5 @@ def write_result(result: DemoResult, finished: JobRun) -> None:
     pictures = demo_pictures(result)
     for name, picture in pictures.items():
         write_atomic(folder / "plots" / f"{name}.svg", picture)
+    write_json(folder / SUMMARY, result.summary())
     write_atomic(folder / "report.html", demo_report(result, pictures, recording=finished.meshcat is not None))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,8 +64,10 @@ class Replay:
         return found
 
 
-def replay(path: Path, progress: Progress = no_progress) -> Replay:
-    """Replay a recording.
+def replay(
+    path: Path, progress: Progress = no_progress, look: Callable[[Cell[Any], Context], None] | None = None
+) -> Replay:
+    """Replay a recording; ``look`` is shown the cell and its Context at the end.
 
     Raises:
         InputError: it is no recording, of another format, or holds too little to replay.
@@ -84,7 +87,7 @@ def replay(path: Path, progress: Progress = no_progress) -> Replay:
         scenario = unpacked(recording.files, Path(folder))
         cell = build_cell(scenario, int(about["seed"]), None, robot, played, lambda station, layout: comparison)
         with closing(cell.station):
-            phase, X_BC = _run(cell, recording.end_tick * PERIOD_S, progress)
+            phase, X_BC = _run(cell, recording.end_tick * PERIOD_S, progress, look)
     comparison.finish()
     return Replay(
         recording.end_tick * PERIOD_S,
@@ -98,7 +101,9 @@ def replay(path: Path, progress: Progress = no_progress) -> Replay:
     )
 
 
-def _run(cell: Cell[Any], end_s: float, progress: Progress) -> tuple[str, list[list[float]] | None]:
+def _run(
+    cell: Cell[Any], end_s: float, progress: Progress, look: Callable[[Cell[Any], Context], None] | None
+) -> tuple[str, list[list[float]] | None]:
     """Advance to the end of the recording; the phase there, and the calibration."""
     simulator = Simulator(cell.diagram)
     due = 0.0
@@ -115,6 +120,8 @@ def _run(cell: Cell[Any], end_s: float, progress: Progress) -> tuple[str, list[l
     simulator.AdvanceTo(end_s)
     simulator.AdvancePendingEvents()
     root = simulator.get_context()
+    if look is not None:
+        look(cell, root)
     status = getattr(cell.job, "calibration_status", None)
     estimate = None if status is None else status(root).estimate
     X_BC = None if estimate is None else estimate.X_BC.GetAsMatrix4().tolist()

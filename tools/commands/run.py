@@ -2,7 +2,8 @@
 
 import time
 import webbrowser
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,16 @@ from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.systems.cell import Cell, build_cell
 from weldcal.systems.jobs.discovery import job_of
-from weldcal.systems.person import person_at
+from weldcal.systems.person import Person, person_at
 from weldcal.systems.runner import Progress, Run, run_cell
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.systems.scenario.schema import Scenario
+from weldcal.systems.viewer.live import LiveView
+from weldcal.tools import console
 from weldcal.tools.commands.record import RunRecorder
 from weldcal.tools.commands.robots import chosen_robot
+from weldcal.tools.dashboard.facts import facts_of
+from weldcal.tools.dashboard.source import DashboardSource
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.render import write_atomic
 
@@ -57,26 +62,65 @@ def run_job(scenario: Scenario, options: RunOptions, progress: Progress, key: st
     if options.speed_factor is not None:
         scenario.job.speed_factor = options.speed_factor
         check_scenario(scenario)
-    progress("build the cell", 0.0)
     meshcat = None
-    with chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot:
+    with (
+        chosen_robot(options.robot, scenario, dry_run=options.dry_run, pace=options.pace) as robot,
+        person_at() as person,
+    ):
         if options.recording or options.browser:
-            meshcat = Meshcat(MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}"))
+            meshcat = Meshcat(
+                MeshcatParams(host="localhost", web_url_pattern="http://{host}:{port}", show_stats_plot=False)
+            )
         recorder = RunRecorder(scenario, options, robot.title) if options.record else None
         open_sink = None if recorder is None else recorder.open_sink
-        cell = build_cell(scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink)
-        with closing(cell.station):
-            if meshcat is not None:
-                camera, target = cell.job.view()
-                _set_the_scene(meshcat, camera, target, scenario.base.pose())
-                if options.browser:
-                    webbrowser.open(meshcat.web_url())
-                    time.sleep(2.0 if options.realtime else 0.5)  # the page needs a moment to load
-            with person_at() as person:
-                run = run_cell(cell, progress, meshcat, options.realtime, person)
-            if recorder is not None:
-                recorder.close(run)
+        with _dashboard(person, meshcat, options) as source:
+
+            def told(stage: str, share: float) -> None:
+                progress(stage, share)
+                if source is not None:
+                    source.stage(stage, share)
+
+            def ended(finished: Run[Any]) -> None:
+                if source is not None:
+                    source.end(finished.held, finished.reason, replays=True)
+
+            told("build the cell", 0.0)
+            live = None if source is None else source.live
+            cell = build_cell(
+                scenario, options.seed, meshcat, robot.prepared, open_sink=open_sink, person=person, live=live
+            )
+            with closing(cell.station):
+                if meshcat is not None:
+                    camera, target = cell.job.view()
+                    _set_the_scene(meshcat, camera, target, scenario.base.pose())
+                if source is not None:
+                    source.facts = facts_of(cell, options.scenario, robot.title)
+                run = run_cell(cell, told, meshcat, options.realtime, ended)
+                if recorder is not None:
+                    recorder.close(run)
     return JobRun(run, meshcat, robot.title)
+
+
+@contextmanager
+def _dashboard(person: Person, meshcat: Meshcat | None, options: RunOptions) -> Iterator[DashboardSource | None]:
+    """Serve the run's page for the duration of the block, and open it in the browser; None where no viewer is wanted."""
+    if meshcat is None or not options.browser:
+        yield None
+        return
+    from weldcal.tools.dashboard.server import Dashboard  # Flask takes a moment to load
+
+    source = DashboardSource(LiveView(), person)
+    with closing(Dashboard(source, meshcat.web_url(), options.share)) as dashboard:
+        console.emit_address("dashboard", dashboard.url)
+        if dashboard.shared_url is not None:
+            console.emit_address("read-only for the network", dashboard.shared_url)
+        webbrowser.open(dashboard.url)
+        time.sleep(2.0 if options.realtime else 0.5)  # the page needs a moment to load
+        try:
+            yield source
+        finally:
+            if not source.ended:
+                source.end(held=True, reason="The run has failed: the reason is in the terminal.", replays=False)
 
 
 def _set_the_scene(meshcat: Meshcat, camera: Array, target: Array, X_WB: RigidTransform) -> None:

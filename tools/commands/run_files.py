@@ -1,12 +1,16 @@
 """Writes the files of a run: calibration.yaml, the weld log and the scans as a dataset for `weldcal calibrate`."""
 
 from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
+from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, Feature, ScannerGuess
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.record import case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
@@ -21,6 +25,8 @@ from weldcal.welding.record.process import speed_along, torch_angles
 from weldcal.welding.record.weld_log import CSV_NAME, HEADER_NAME, WeldRecord, weld_log_texts
 from weldcal.welding.servo.state import Phase
 
+SCANS: Final = "scans"
+SUMMARY: Final = "summary.json"
 PHASE_NAMES = [str(phase) for phase in Phase]
 
 
@@ -107,6 +113,27 @@ def write_scans(run: Run[WeldJob], status: CalibrationStatus, folder: Path, robo
         intrinsics=(preset.fx, preset.fy, preset.cx, preset.cy),
     )
     return folder
+
+
+def live_case(cell: Cell[Any], root: Context) -> Case | None:
+    """What a live calibration has seen of its feature, as the doctor examines it; None where the job does not calibrate by it."""
+    status = getattr(cell.job, "calibration_status", None)
+    seen = None if status is None else status(root)
+    if seen is None or not seen.observations:
+        return None
+    c, scanner = cell.scenario.calibration, cell.scenario.scanner_config()
+    preset = None if scanner is None else scanner.scanner()
+    return case_of(
+        seen.observations,
+        {},
+        cell.job.X_FR.GetAsMatrix4(),
+        robot=cell.scenario.arm,
+        flange=feature_standard(cell.scenario).designation,
+        refused=seen.refused,
+        guess=c.mounting_guess.pose().GetAsMatrix4(),
+        guess_radius=1e-3 * c.guess_radius_mm,
+        near_far=None if preset is None else (preset.near_m, preset.far_m),
+    )
 
 
 def _numbers(values: np.ndarray) -> list[float]:

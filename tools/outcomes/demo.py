@@ -15,6 +15,7 @@ from weldcal.tools.outcomes.monitor import drift_document
 from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.outcomes.poses import work_point_error
 from weldcal.tools.outcomes.weld import CalibrationError, WeldOutcome, heat_input_kJ_mm
+from weldcal.welding.record.process import PathError
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +85,8 @@ class DemoResult:
         if self.weld is not None and self.weld.error is not None:
             distance = 1e3 * np.hypot(self.weld.error.lateral, self.weld.error.height)
             found["torch_mean_mm"], found["torch_max_mm"] = float(distance.mean()), float(distance.max())
+            if len(self.weld.seams) > 1:
+                found["seams"] = [seam_document(error) for error in self.weld.seams]
             found["torch_lateral_mean_mm"] = 1e3 * self.weld.error.mean_m
             found["torch_lateral_max_mm"] = 1e3 * self.weld.error.max_m
         if self.weld is not None and self.weld.speed is not None:
@@ -121,6 +124,12 @@ class DemoResult:
         advice = next_scan(self.status, self.run.cell.job.poses, work_point(self.run.cell.scenario))
         found["next_pose"] = None if advice is None else advice.sentence()
         return found
+
+
+def seam_document(error: PathError) -> dict[str, float]:
+    """The torch's error on one seam, mm."""
+    distance = 1e3 * np.hypot(error.lateral, error.height)
+    return {"torch_mean_mm": float(distance.mean()), "torch_max_mm": float(distance.max())}
 
 
 def live_errors(values: np.ndarray) -> dict[str, float]:

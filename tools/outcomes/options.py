@@ -8,7 +8,8 @@ from pathlib import Path
 class RunOptions:
     """The user's options: scenario by name or path, result folder, seed, whether to open a browser, real time or as fast as
     possible; the robot (see chosen_robot; None: the scenario's), and the speed of the arm's moves (None: the scenario's).
-    `recording`: the viewer's recording.html; `record`: recording.mcap, which `weldcal replay` plays back."""
+    `share`: the dashboard is also shown to the network,
+    read-only. `recording`: the viewer's recording.html; `record`: recording.mcap, which `weldcal replay` plays back."""
 
     scenario: str
     out: Path
@@ -20,4 +21,5 @@ class RunOptions:
     pace: float | None = None
     speed_factor: float | None = None
     recording: bool = True
+    share: bool = False
     record: bool = False

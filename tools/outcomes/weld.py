@@ -10,6 +10,7 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate
 from weldcal.models.arrays import Array
+from weldcal.models.workpieces.part import numbered
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import TORCH_ABOVE_ROOT_M, seated_tip, work_point
@@ -52,7 +53,8 @@ class WeldOutcome:
     planned: SeamCurve | None
     error: PathError | None  # torch while the arc burned
     speed: SpeedStatistics | None
-    plan_error: PathError | None
+    plan_error: PathError | None  # of the newest plan, that of the last seam
+    seams: tuple[PathError, ...] = ()  # the torch's error on each seam, where there are several
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,22 +106,24 @@ def live_calibration_error(cell: Cell[WeldJob], estimate: CalibrationEstimate) -
     return replace(off, at_work_m=float(np.linalg.norm(estimate.X_BC.multiply(corrected) - work)))
 
 
-def true_seam(truth: Truth) -> SeamCurve | None:
-    """The reference path of the torch: above the true groove's root, in B."""
+def true_seam(truth: Truth, seam: int = 0) -> SeamCurve | None:
+    """The reference path of the torch on a seam by its number: above the true groove's root, in B."""
     if truth.workpiece is None or truth.X_BP is None:
         return None
-    ups = truth.workpiece.up_P
-    line = truth.workpiece.seam_P + TORCH_ABOVE_ROOT_M * ups
+    part = numbered(truth.workpiece, seam)
+    ups = part.up_P
+    line = part.seam_P + TORCH_ABOVE_ROOT_M * ups
     R = truth.X_BP.rotation().matrix()
     return SeamCurve.from_points(line @ R.T + truth.X_BP.translation(), up=np.broadcast_to(ups, line.shape) @ R.T)
 
 
 def felt_seam(cell: Cell[WeldJob], root: Context) -> FeltSeam | None:
     """The seam points that the servo measured with the tip, against the ground truth; None where there are none."""
-    state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth)
+    number = cell.job.command(root).seam
+    state, seam = cell.job.servo_report(root).state, true_seam(cell.station.truth, number)
     if state is None or seam is None or len(state.refined) < 10:
         return None
-    seat = seated_tip(cell.station)
+    seat = seated_tip(cell.station, number)
     line = seam.raised(seat.above_m - TORCH_ABOVE_ROOT_M, seat.aside_m)
     found = path_error(state.refined.points, line)
     return FeltSeam(found.s, found.lateral, found.height)
@@ -172,20 +176,56 @@ def columns(table: dict[str, Array], name: str, axes: str = "xyz") -> Array:
 
 def weld_outcome(cell: Cell[WeldJob], root: Context) -> WeldOutcome | None:
     """Measure the weld, with its errors where the ground truth is known; None where nothing was welded."""
-    log, seam = weld_log(cell, root), true_seam(cell.station.truth)
+    number = cell.job.command(root).seam
+    log, seam = weld_log(cell, root), true_seam(cell.station.truth, number)
     if log is None:
         return None
     plan = cell.job.planned_seam(root).seam
     plan_error = None
     if plan is not None and seam is not None:
-        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seated_tip(cell.station).above_m)
+        lowered = plan.raised(TORCH_ABOVE_ROOT_M - seated_tip(cell.station, number).above_m)
         line = lowered.position(np.linspace(0.0, lowered.length, 200))
         plan_error = path_error(line, seam)
     if log.torch_on.sum() < 30:
         return WeldOutcome(log, seam, plan, None, None, plan_error)
-    speed = speed_statistics(log.time, log.p_BTorch, log.torch_on, cell.job.servo_config.weld_speed_m_s)
-    error = None if seam is None else path_error(log.p_BTorch[log.torch_on], seam)
-    return WeldOutcome(log, seam, plan, error, speed, plan_error)
+    wanted = cell.job.servo_config.weld_speed_m_s
+    parts = [part for part in welds(log) if (part & log.torch_on).sum() >= 30]
+    if not parts:
+        return WeldOutcome(log, seam, plan, None, None, plan_error)
+    speed = _together([speed_statistics(log.time[p], log.p_BTorch[p], log.torch_on[p], wanted) for p in parts])
+    if seam is None:
+        return WeldOutcome(log, seam, plan, None, speed, plan_error)
+    errors = tuple(
+        path_error(log.p_BTorch[part & log.torch_on], true)
+        for k, part in enumerate(welds(log))
+        if (part & log.torch_on).any() and (true := true_seam(cell.station.truth, k)) is not None
+    )
+    error = PathError(*(np.concatenate([getattr(e, name) for e in errors]) for name in ("s", "lateral", "height")))
+    return WeldOutcome(log, seam, plan, error, speed, plan_error, errors)
+
+
+def _together(welds: list[SpeedStatistics]) -> SpeedStatistics:
+    """The statistics of several welds, each weighted by its length."""
+    length = np.array([w.welded_m for w in welds])
+    means = np.array([w.mean for w in welds])
+    mean = float(means @ length / length.sum())
+    spread = np.array([w.cv * w.mean for w in welds]) ** 2 + (means - mean) ** 2
+    return SpeedStatistics(
+        mean,
+        min(w.least for w in welds),
+        max(w.most for w in welds),
+        float(np.sqrt(spread @ length / length.sum())) / mean,
+        sum(w.outside_m for w in welds),
+        float(length.sum()),
+        sum(w.seconds for w in welds),
+    )
+
+
+def welds(log: WeldLog) -> list[NDArray[np.bool_]]:
+    """Masks (N,) of the log's rows, one for each seam: a weld begins where the tip is brought into touch again."""
+    touching = log.telemetry["phase"] == PHASE_CODES[Phase.TOUCH]
+    number = np.cumsum(touching & ~np.concatenate([[True], touching[:-1]]))
+    return [number == k for k in range(int(number[-1]) + 1)]
 
 
 def heat_input_kJ_mm(weld: WeldOutcome, process: WeldProcess) -> Array | None:

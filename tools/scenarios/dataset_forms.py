@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -115,10 +116,10 @@ def write_bag(path: Path, poses: Array, clouds: list[Array], *, kind: str = "mca
     except ImportError:
         raise InputError(f"A ROS recording needs the package rosbags: {INSTALL}.") from None
     store = get_typestore(Stores.ROS2_HUMBLE)
-    t = store.types
+    t: Any = store.types
     pose_type, cloud_type = "geometry_msgs/msg/PoseStamped", "sensor_msgs/msg/PointCloud2"
 
-    def header(ns: int, frame: str) -> object:
+    def header(ns: int, frame: str) -> Any:
         return t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](ns // SECOND, ns % SECOND), frame)
 
     plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3

@@ -14,7 +14,7 @@ from weldcal.welding.seam.refinement import PendingPoint, RefinedSeam
 
 
 class Phase(StrEnum):
-    """The phases of one weld, in order; FAULT is latched."""
+    """The phases of one weld, in order; FAULT is latched. HELD and BACK: a person holds it, and the way back after that."""
 
     TOUCH = "TOUCH"
     TRACK = "TRACK"
@@ -22,6 +22,8 @@ class Phase(StrEnum):
     FINISH = "FINISH"
     DONE = "DONE"
     FAULT = "FAULT"
+    HELD = "HELD"
+    BACK = "BACK"
 
 
 @dataclass(frozen=True)

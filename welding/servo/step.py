@@ -49,13 +49,13 @@ def welding_step(
         2.2.2 and Algorithm 2, with the corrections of docs/weld_law.md.
     """
     if not math.isfinite(sample.time):
-        state = _fault(state, "The time of a servo tick is not a number; check the clock.")
+        state = fault(state, "The time of a servo tick is not a number; check the clock.")
         sample = replace(sample, time=state.time or 0.0)
     dt = config.period_s if state.time is None else clip(sample.time - state.time, 0.0, 0.05)
     if state.plan_fit is None and state.phase != Phase.FAULT:
         state = _begin(state, sample, plan, config)
     if not finite(sample.X_BT.translation()):
-        state = _fault(state, "The robot's pose is not a number; check the robot's connection.")
+        state = fault(state, "The robot's pose is not a number; check the robot's connection.")
     clock_stopped_s = (
         state.clock_stopped_s + config.period_s if state.time is not None and sample.time <= state.time else 0.0
     )
@@ -65,14 +65,14 @@ def welding_step(
     before = state
     if is_new:
         state = with_frame(state, sample, _frame_at_tip(state), config)
-    state = _watch(state, sample, config)
+    state = watch(state, sample, config)
     if state.phase == Phase.TOUCH:
         return _touch(before, state, sample, is_new, config, dt)
     if is_new and state.phase in _MOVING:
         state = _contact(before, state, config)
     if state.phase in _MOVING and state.torch_on and not sample.arc:
         state, V, problem = wait_for_arc(state, sample, config, dt)
-        return _answer(state, V, config, Diagnostics()) if problem is None else _rest(_fault(state, problem), config)
+        return _answer(state, V, config, Diagnostics()) if problem is None else _rest(fault(state, problem), config)
     if state.phase in _MOVING:
         return _weld(with_arc(state, sample), sample, config, dt)
     return _rest(state, config)
@@ -85,10 +85,10 @@ def _begin(state: WeldingState, sample: ServoSample, plan: SeamCurve, config: Se
         # Rest point and torch run along the tip's line, lower by the axial deflection.
         line = tip_line.raised(config.clearance_m) if config.clearance_m else tip_line
         if tip_line.length < config.touch.arc_m + config.gap.end_window_m:
-            return _fault(state, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short for the touch-on.")
+            return fault(state, f"The seam is only {1e3 * tip_line.length:.0f} mm long: too short for the touch-on.")
         check_feasible(line, tool.torch_offset_m, config.weld_speed_m_s, config.windows)
     except (InfeasibleSeam, SeamError) as problem:
-        return _fault(state, str(problem))
+        return fault(state, str(problem))
     return changed(
         state, plan_fit=PlanFit.start(tip_line), started=sample.time, s_tip=config.touch.arc_m, s_end=tip_line.length
     )
@@ -99,14 +99,14 @@ def _frame_at_tip(state: WeldingState) -> SeamFrame:
     return state.plan_fit.curve.frame(state.s_tip)
 
 
-def _fault(state: WeldingState, reason: str) -> WeldingState:
+def fault(state: WeldingState, reason: str) -> WeldingState:
     """Enter FAULT with a reason and the arc off in this tick; the first fault is kept."""
     if state.phase == Phase.FAULT:
         return state
     return changed(state, phase=Phase.FAULT, reason=reason, torch_on=False, V_stop=state.V, stopped_ticks=0)
 
 
-def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
+def watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> WeldingState:
     """Check the faults of every phase: stopped clock, deflection beyond its limit, hidden tag, frozen camera."""
     faults = config.faults
     if state.phase in (Phase.DONE, Phase.FAULT):
@@ -114,19 +114,19 @@ def _watch(state: WeldingState, sample: ServoSample, config: ServoConfig) -> Wel
     if state.clock_stopped_s > faults.hidden_s:
         # The arm may still move, and by a stopped clock no frame is ever late.
         text = f"The robot's clock has stood still for {state.clock_stopped_s:.2f} s; check the robot's connection."
-        return _fault(state, text)
+        return fault(state, text)
     if beyond_limit(state, config) and state.phase != Phase.FINISH:
         text = "The tip is pushed beyond its mechanical limit; clear the groove, or check the plan."
-        return _fault(state, text)
+        return fault(state, text)
     # Past the seam's end the tip is not used, so the tag is not needed.
     blind = sample.time - max(state.frame_time, state.started)
     if state.phase != Phase.FINISH and blind > faults.hidden_s:
         text = f"Tag hidden: the finger camera has not seen it for {blind:.2f} s; clean the tag and its window."
-        return _fault(state, text)
+        return fault(state, text)
     # Identical readings to the last bit mean one picture repeated with new times.
     if state.same_readings >= faults.frozen_frames:
         text = f"The finger camera repeats one picture ({state.same_readings} identical readings); restart the camera."
-        return _fault(state, text)
+        return fault(state, text)
     return state
 
 
@@ -143,7 +143,7 @@ def _touch(
         seam, along, ready = state.plan_fit.curve.frame(config.touch.arc_m), 0.0, False
         state, lateral, upward, problem, seated = touch_step(state, sample, is_new, seam, config)
     if problem is not None:
-        return _rest(_fault(state, problem), config)
+        return _rest(fault(state, problem), config)
     state = _slewed(state, lateral, upward, config, dt)
     speed_up = config.limits.tip_acceleration_m_s2 * dt
     state = changed(state, v_tip=clip(along, state.v_tip - speed_up, state.v_tip + speed_up))
@@ -237,7 +237,7 @@ def _weld(
     state = changed(state, s_tip=s_tip)
     if state.phase == Phase.COAST and s_tip - state.lost_at > config.gap.coast_m:
         text = f"Contact lost for {1e3 * config.gap.coast_m:.0f} mm in the middle of the seam; check the groove there."
-        return _rest(_fault(state, text), config)
+        return _rest(fault(state, text), config)
     beyond = config.gap.end_window_m if state.phase == Phase.TRACK else 0.0
     if law.guarded and state.phase != Phase.FINISH and s_tip > state.s_end + beyond:
         # Still in contact this far beyond the plan's end: the seam does not end before this point.
@@ -268,10 +268,10 @@ def _weld(
     state, problem = _advance(state, target.s, sample.time, config)
     problem = problem or _angles(sample, target, config)
     if problem is not None and (state.torch_on or state.phase == Phase.COAST):
-        return _rest(_fault(state, problem), config)
+        return _rest(fault(state, problem), config)
     if state.torch_on and error > config.faults.torch_error_m:
         text = f"The torch is {1e3 * error:.1f} mm off the seam; check the groove and the plan."
-        return _rest(_fault(state, text), config)
+        return _rest(fault(state, text), config)
     # Once started the arc burns to the end: the plan may still move back under a torch that has just passed its start.
     start = start_arc(state, curve)
     lit = state.torch_on or (target.s >= start and error < config.torch.ignition_error_m)
@@ -280,7 +280,7 @@ def _weld(
     state = changed(state, torch_on=burning, lit_at=lit_at)
     problem = _unlit(state, target.s, target.s - start, error, config)
     if problem is not None:
-        return _rest(_fault(state, problem), config)
+        return _rest(fault(state, problem), config)
     if target.s >= state.s_end:
         done = changed(state, phase=Phase.DONE, torch_on=False, V_stop=state.V, stopped_ticks=0)
         return _rest(done, config)
@@ -378,7 +378,7 @@ def _answer(
     state: WeldingState, V: Array, config: ServoConfig, diagnostics: Diagnostics
 ) -> tuple[WeldingState, WeldingCommand]:
     if not finite(V):
-        state = _fault(
+        state = fault(
             state,
             "The welding law returned a number that is not finite: this is a defect, report it with a recording.",
         )

@@ -177,7 +177,7 @@ class Motion(Job[MotionPlanned]):
             settled_goal=spine.arm.settled_goal,
             robot_status=spine.arm.status,
             record=record,
-            hold=spine.hold,
+            hold=spine.end,
         )
         calibrator, monitor = None, None
         if watched is None:

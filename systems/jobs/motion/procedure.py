@@ -100,7 +100,7 @@ class MotionProcedure(LeafSystem):
         if not robot.ready:
             return robot.fault or "The robot does not obey velocity commands."
         if self._hold.Eval(context)[0] > 0.5:
-            return f"A person held the job, in the phase '{s.phase}'."
+            return f"A person ended the job, in the phase '{s.phase}'."
         if now > self._maximum_time_s:
             return f"The job took longer than its {self._maximum_time_s:.0f} s; allow more with job.maximum_time_s."
         if s.phase in ("approach", "collect", "home") and now - s.since > self._timeout_s:

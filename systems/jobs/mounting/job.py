@@ -125,7 +125,7 @@ class Mounting(Job[MountingPlanned]):
         state = procedure.GetOutputPort("state")
         wiring.connect(calibrator, scan=wiring.out("scanner.scan"), state=state)
         wiring.connect(
-            procedure, status=calibrator.GetOutputPort("status"), hold=spine.hold, position_measured=spine.arm.position
+            procedure, status=calibrator.GetOutputPort("status"), hold=spine.end, position_measured=spine.arm.position
         )
         wiring.feed("scanner.trigger", procedure.GetOutputPort("trigger"))
         for arm, suffix in zip(spine.arms, ("", "_2"), strict=False):

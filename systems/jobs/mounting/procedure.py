@@ -90,7 +90,7 @@ class MountingProcedure(LeafSystem):
                 return replace(s, phase="held", since=now, reason=reason)
         if self._hold.Eval(context)[0] > 0.5:
             return replace(
-                s, phase="held", since=now, reason=f"A person held the job, on the way to {s.label or 'home'}."
+                s, phase="held", since=now, reason=f"A person ended the job, on the way to {s.label or 'home'}."
             )
         if now > self._maximum_time_s:
             reason = f"The job took longer than its {self._maximum_time_s:.0f} s; allow more with job.maximum_time_s."

@@ -96,7 +96,7 @@ class Profiler(Job[PlanningContext]):
             robot_status=spine.arm.status,
             profile=wiring.out("profiler.profile"),
             touch=wiring.out("torch.touch"),
-            hold=spine.hold,
+            hold=spine.end,
         )
         wiring.feed("profiler.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(

@@ -109,7 +109,7 @@ class ProfilerProcedure(LeafSystem):
             reason = status.fault or "The robot does not obey velocity commands."
             return replace(s, phase="held", since=now, reason=reason)
         if self._hold.Eval(context)[0] > 0.5:
-            reason = f"A person held the job, in the step '{s.step or 'start'}'."
+            reason = f"A person ended the job, in the step '{s.step or 'start'}'."
             return replace(s, phase="held", since=now, reason=reason)
         if now > self._planning.job.maximum_time_s:
             reason = f"The job took longer than its {self._planning.job.maximum_time_s:.0f} s; allow more with maximum_time_s."

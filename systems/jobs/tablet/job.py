@@ -109,7 +109,7 @@ class Tablet(Job[TabletPlan]):
             history=spine.arm.history,
             picture=wiring.out("wrist_camera.picture"),
             touch=wiring.out("digitizer.touch"),
-            hold=spine.hold,
+            hold=spine.end,
         )
         wiring.feed("wrist_camera.trigger", procedure.GetOutputPort("trigger"))
         ports = JobPorts(

@@ -131,7 +131,7 @@ def _why_stop(s: TabletState, seen: TabletSeen, plan: TabletPlan) -> str:
     if not seen.robot.ready:
         return seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}."
     if seen.hold:
-        return f"A person held the job, in the phase '{s.phase}'."
+        return f"A person ended the job, in the phase '{s.phase}'."
     if seen.time > plan.maximum_time_s:
         return f"The job took longer than {plan.maximum_time_s:.0f} s; allow more with job.maximum_time_s."
     if s.phase in MOVES and seen.time - s.since > plan.move_timeout_s:

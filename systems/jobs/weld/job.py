@@ -7,6 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, OutputPort
 
 from weldcal.calibration.planning.calibration_poses import PlannedPose
+from weldcal.models.workpieces.part import seam_count
 from weldcal.systems.drivers.config import FingerCameraConfig
 from weldcal.systems.jobs.job import AddedJob, Job, Phases
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import ArucoDeformationEstimator
@@ -34,6 +35,7 @@ from weldcal.systems.station import Station
 from weldcal.systems.viewer.cell_visualizer import add_visualizer
 from weldcal.systems.wiring import Wiring
 from weldcal.welding.servo.settings import ServoConfig
+from weldcal.welding.servo.state import Phase
 
 # Completed share of a run at the start of a phase, for the progress bar: calibration, planning, weld.
 SHARES = {
@@ -81,6 +83,7 @@ class WeldJob(AddedJob):
     welding: WeldingPorts
     ports: JobPorts
     maximum_time_s: float
+    seams: int = 1
 
     def calibration_status(self, root: Context) -> CalibrationStatus:
         """The calibrator's status in a context of the whole Diagram."""
@@ -100,19 +103,30 @@ class WeldJob(AddedJob):
         report: ServoReport = self.welding.report.Eval(self.welding.report.get_system().GetMyContextFromRoot(root))
         return report
 
+    def can_stand(self, root: Context) -> bool:
+        """See AddedJob: the servo turns the torch off and brings the tool to rest."""
+        if self.command(root).mode != "weld":
+            return True
+        report = self.servo_report(root)
+        over = report.phase in ("IDLE", Phase.DONE, Phase.FAULT)
+        return not over and report.interruption.at_rest(self.servo_config)
+
     def stage(self, root: Context, phases: Phases) -> tuple[str, float]:
         """See AddedJob."""
-        phase = self.command(root).phase
+        command = self.command(root)
+        phase, seams = command.phase, self.seams
         share = SHARES.get(phase, 0.05)
         if phase in ("move_to_pose", "scan_pose", "scan_verification_cloud", "move_to_verification_cloud"):
             scans = sum(1 for name, _, _ in phases if name == "scan_pose")
             share = min(0.02 + 0.03 * scans, 0.27)
         if phase == "weld":
-            begun = next((t for name, t, _ in phases if name == "weld"), root.get_time())
+            begun = next((t for name, t, _ in reversed(phases) if name == "weld"), root.get_time())
             seam_mm = self.scenario.welding.seam_length_mm
             length = WHOLE_SEAM_M if seam_mm is None else seam_mm * 1e-3
             expected = (length + 0.06) / self.servo_config.weld_speed_m_s + 5.0
             share += 0.58 * min(float(root.get_time() - begun) / expected, 1.0)
+        if seams > 1 and share > SHARES["park"]:
+            share = SHARES["park"] + (1.0 - SHARES["park"]) * (command.seam + share) / seams
         return phase.replace("_", " "), share
 
 
@@ -162,12 +176,12 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             calibration_status=status,
             planned_seam=welding.seam,
             servo_report=welding.report,
-            hold=spine.hold,
+            hold=spine.end,
             arm_stopped=spine.switch.GetOutputPort("arm_stopped"),
         )
         state = sequencer.GetOutputPort("job_state")
         if wiring.meshcat is not None:
-            shown = {
+            drawn = {
                 "job_state": state,
                 "calibration_status": status,
                 "flange_estimate": estimator.GetOutputPort("flange_estimate"),
@@ -175,7 +189,7 @@ class Weld(Job[tuple[PlannedPose, ...]]):
                 "planned_seam": welding.seam,
                 "servo_report": welding.report,
             }
-            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, config.weld_speed_m_s, shown)
+            add_visualizer(wiring, 0.5 * standard.outer_m, X_BC_guess, config.weld_speed_m_s, drawn)
         logged = dict(welding.logged)
         if logged:
             logged["torch_on"] = spine.switch.GetOutputPort("process_on")
@@ -185,9 +199,18 @@ class Weld(Job[tuple[PlannedPose, ...]]):
             "calibration_status": status,
             "planned_seam": welding.seam,
         }
-        ports = JobPorts((command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results)
+        shown = {
+            "calibration_status": status,
+            "next_pose": chooser.GetOutputPort("next_pose"),
+            "planned_seam": welding.seam,
+            "servo_report": welding.report,
+        }
+        ports = JobPorts(
+            (command,), state, welding.velocity, welding.torch_wanted, welding.margin, logged, results, shown
+        )
         return WeldJob(
-            scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports, times.maximum_time_s
+            *(scenario, plan, X_FR, config, sequencer, calibrator, monitor, welding, ports),
+            *(times.maximum_time_s, times.seams),
         )
 
 
@@ -235,7 +258,8 @@ def _add_welding(
     )
     wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
-    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config))
+    others = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
+    servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, others))
     wiring.connect(
         servo,
         planned_seam=planner.GetOutputPort("planned_seam"),
@@ -243,6 +267,7 @@ def _add_welding(
         position_measured=position,
         sample_time=out("arm.sample_time"),
         job=command,
+        hold=spine.hold,
     )
     if station.diagram.HasOutputPort("arm.arc_established"):
         wiring.connect(servo, arc_established=out("arm.arc_established"))

@@ -13,12 +13,12 @@ from pydrake.systems.framework import Context
 
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.planning.clearance import arm_bodies
-from weldcal.calibration.planning.surroundings import Surroundings
+from weldcal.calibration.planning.surroundings import Obstacle, Surroundings
 from weldcal.models.arms.inverse import nearest_solution
 from weldcal.models.arms.kinematics import ArmModel
 from weldcal.models.errors import WeldcalError
 from weldcal.models.tool import WeldingTool
-from weldcal.models.workpieces.part import WeldPart
+from weldcal.models.workpieces.part import WeldPart, numbered
 from weldcal.models.workpieces.seat import Press
 from weldcal.systems.background import Answer, Background
 from weldcal.systems.background_system import BackgroundSystem
@@ -32,6 +32,7 @@ from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.touch import touch_start_pose
 
 CHECKED_EVERY_M = 0.02  # of the seam, against the surroundings
+CLEAR_OF_PART_M = 0.002
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -73,6 +74,8 @@ class SeamPlanning:
             self.arm, self.tool, seam, self.config, self.q_near, self.clearance_m
         )
         check_weld_path(self, seam, q_start, q_above, q_retract)
+        if X_BP is not None:
+            check_moves(self, X_BP, q_above, q_retract)
         return q_start, q_above, q_retract
 
 
@@ -115,11 +118,14 @@ class SeamPlanner(BackgroundSystem):
         if X_BC is None:
             status: CalibrationStatus = self._status.Eval(context)
             X_BC, correction = status.X_BC, status.correction
-        return self.plan(scan, X_BC, correction)
+        planning = dc.replace(self._planning, workpiece=numbered(self._planning.workpiece, job.seam))
+        return self.plan(planning, scan, X_BC, correction)
 
-    def plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+    def plan(
+        self, planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
+    ) -> Answer[PlannedSeam]:
         """Start the plan from this scan."""
-        return self.background.ask(plan_seam, self._planning, scan, X_BC, correction)
+        return self.background.ask(plan_seam, planning, scan, X_BC, correction)
 
 
 def plan_seam(
@@ -193,6 +199,24 @@ def check_weld_path(
             raise SeamObstructed(
                 f"The arm or its tool would come too close to '{name}' on its way along the seam: move it or the workpiece, or "
                 "correct surroundings in the scenario."
+            )
+
+
+def check_moves(
+    planning: SeamPlanning, X_BP: RigidTransform, q_above: NDArray[np.float64], q_retract: NDArray[np.float64]
+) -> None:
+    """Check that the moves to the seam and from it, to other seams too, keep clear of the part.
+
+    Raises:
+        SeamObstructed: the arm or its tool would touch it.
+    """
+    part = Surroundings((Obstacle("part", planning.workpiece.mesh.transformed(X_BP), CLEAR_OF_PART_M),))
+    bodies = arm_bodies(planning.arm, planning.tool.capsules())
+    for way, a, b in (("to the seam", planning.q_near, q_above), ("from the seam", q_retract, planning.q_near)):
+        if part.touched_on_path(planning.arm, bodies, a, b):
+            raise SeamObstructed(
+                f"The arm or its tool would touch the part on its way {way}: set welding.clearance_mm larger than "
+                f"{1e3 * planning.clearance_m:.0f}, choose another home_deg, or turn the part."
             )
 
 
@@ -281,9 +305,11 @@ class DrawnSeamPlanner(SeamPlanner):
         - planned_seam
     """
 
-    def plan(self, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection) -> Answer[PlannedSeam]:
+    def plan(
+        self, planning: SeamPlanning, scan: Scan, X_BC: RigidTransform | None, correction: ScannerCorrection
+    ) -> Answer[PlannedSeam]:
         """Start the plan; of the scan only its number is used."""
-        return self.background.ask(plan_drawn_seam, self._planning, scan.sequence)
+        return self.background.ask(plan_drawn_seam, planning, scan.sequence)
 
 
 def plan_drawn_seam(planning: SeamPlanning, sequence: int) -> PlannedSeam:

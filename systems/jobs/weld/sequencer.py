@@ -32,6 +32,7 @@ class JobPlan:
     scan_timeout_s: float = 8.0
     move_timeout_s: float = 20.0
     maximum_time_s: float = 240.0
+    seams: int = 1
 
 
 @dc.dataclass(frozen=True, eq=False)
@@ -240,7 +241,13 @@ def _welding(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
 
 def _retracted(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     state, there = _arrived(state, seen, plan)
-    return _move(state, seen, "home", plan.q_home) if there else state
+    if not there:
+        return state
+    number = state.command.seam + 1
+    if number < plan.seams:
+        # The part is scanned again, for the seam that was welded may have moved it.
+        return _move(dc.replace(state, command=dc.replace(state.command, seam=number)), seen, "park", plan.q_home)
+    return _move(state, seen, "home", plan.q_home)
 
 
 def _home(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
@@ -280,7 +287,7 @@ def next_job_state(state: JobState, seen: Seen, plan: JobPlan) -> JobState:
     if not seen.robot.ready:
         return hold(state, seen, seen.robot.fault or f"The robot stopped: {seen.robot.safety_mode}.")
     if seen.hold_requested:
-        return hold(state, seen, f"A person held the job, in the phase '{state.command.phase}'.")
+        return hold(state, seen, f"A person ended the job, in the phase '{state.command.phase}'.")
     if seen.time > plan.maximum_time_s:
         return hold(
             state,

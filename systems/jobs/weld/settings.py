@@ -6,6 +6,7 @@ from pydrake.math import RigidTransform
 from weldcal.calibration.planning.calibration_poses import PlannedPose, PlannerConfig, plan_calibration_poses
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import FlangeStandard
+from weldcal.models.workpieces.part import numbered
 from weldcal.models.workpieces.seat import Press, Seated
 from weldcal.systems.jobs.weld.iterative_calibrator import CalibratorConfig
 from weldcal.systems.jobs.weld.sequencer import JobPlan
@@ -39,14 +40,15 @@ def feature_standard(scenario: Scenario) -> FlangeStandard:
     return scenario.feature_standard()
 
 
-def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
-    """The servo's settings from scenario and tool."""
+def servo_config(scenario: Scenario, station: Station, seam: int = 0) -> ServoConfig:
+    """The servo's settings from scenario and tool, for a seam by its number."""
     tool, welding = station.tool, scenario.welding
     if tool is None or station.cad is None:
         return ServoConfig()
     press = Press(tool.press_axial_m, tool.press_lateral_m)
-    seat = station.cad.seated(tool, press)
-    entry = station.cad.entry(tool, seat)
+    cad = numbered(station.cad, seam)
+    seat = cad.seated(tool, press)
+    entry = cad.entry(tool, seat)
     geometry = ToolGeometry(
         torch_offset_m=tool.chord_m,
         torch_height_m=tool.torch_height_m,
@@ -57,7 +59,7 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
     return ServoConfig(
         tool=geometry,
         touch=TouchConfig(zero_frames=ZERO_FRAMES, offset_m=entry.aside_m),
-        gap=GapConfig(end_window_m=station.cad.end_window_m),
+        gap=GapConfig(end_window_m=cad.end_window_m),
         weld_speed_m_s=welding.speed_mm_s * 1e-3,
         deflection=DeflectionControl(delta_d_m=press.lateral_m, axial_d_m=press.axial_m),
         law=welding.law,
@@ -65,12 +67,12 @@ def servo_config(scenario: Scenario, station: Station) -> ServoConfig:
     )
 
 
-def seated_tip(station: Station) -> Seated:
-    """Where the loaded tip rests in the drawn joint; a station with a tool and a workpiece."""
+def seated_tip(station: Station, seam: int = 0) -> Seated:
+    """Where the loaded tip rests in the drawn joint of a seam; a station with a tool and a workpiece."""
     tool, cad = station.tool, station.cad
     assert tool is not None
     assert cad is not None
-    return cad.seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
+    return numbered(cad, seam).seated(tool, Press(tool.press_axial_m, tool.press_lateral_m))
 
 
 def plan_poses(scenario: Scenario, station: Station, seed: int) -> tuple[PlannedPose, ...]:
@@ -114,8 +116,9 @@ def work_point(scenario: Scenario) -> np.ndarray:
 
 
 def job_plan(scenario: Scenario) -> JobPlan:
-    """The job's parameters; time limits are longer for slower moves."""
+    """The job's parameters; time limits are longer for slower moves and more seams."""
     c, job = scenario.calibration, scenario.job
+    seams = max(1, len(scenario.workpiece.seams)) if scenario.workpiece is not None else 1
     slower = 1.0 / job.speed_factor
     return JobPlan(
         calibrate=job.calibrate,
@@ -127,7 +130,8 @@ def job_plan(scenario: Scenario) -> JobPlan:
         required_error_m=c.required_error_mm * 1e-3,
         minimum_scans=c.minimum_scans,
         move_timeout_s=MOVE_TIMEOUT_S * slower,
-        maximum_time_s=job.maximum_time_s * slower,
+        maximum_time_s=job.maximum_time_s * slower * seams,
+        seams=seams,
     )
 
 

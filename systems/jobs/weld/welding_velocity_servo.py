@@ -1,6 +1,7 @@
 """WeldingVelocityServo: computes the tip's spatial velocity and the torch request from planned seam and tip deformation."""
 
 import dataclasses as dc
+from collections.abc import Sequence
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -11,9 +12,9 @@ from weldcal.models.arms.kinematics import ArmModel, forward_kinematics
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
 from weldcal.systems.messages import JobCommand, Message, PlannedSeam
+from weldcal.welding.servo.interruption import Interruption, interruptible_step
 from weldcal.welding.servo.settings import ServoConfig
 from weldcal.welding.servo.state import Phase, ServoSample, WeldingCommand, WeldingState
-from weldcal.welding.servo.step import welding_step
 
 TELEMETRY = (
     "phase", "torch_on", "s_tip", "s_torch", "e_t", "e_height", "n_d_dot_n_t", "conditioning", "omega",
@@ -37,6 +38,13 @@ class ServoReport(Message):
     state: WeldingState | None = None
     time: float = np.nan  # of the tick, on the robot's clock
     X_BT: RigidTransform | None = None  # measured at that tick
+    plan: int = 0  # sequence of the plan that is followed
+    interruption: Interruption = dc.field(default_factory=Interruption)  # a person's hold
+
+    @property
+    def way_back_m(self) -> float:
+        """After a hold: along the seam, to where the weld goes on, m; else 0."""
+        return self.interruption.way_back_m
 
 
 class WeldingVelocityServo(LeafSystem):
@@ -52,6 +60,7 @@ class WeldingVelocityServo(LeafSystem):
         - sample_time
         - job
         - arc_established
+        - hold
         output_ports:
         - V_BT
         - servo_report
@@ -60,18 +69,22 @@ class WeldingVelocityServo(LeafSystem):
 
     `V_BT` (6) [omega rad/s; v m/s] of the tip frame in B, zero unless the job's mode is `weld`; `telemetry` as named in TELEMETRY (SI), all of one tick; `torch_on`
     (1) is the request for the process: job and servo must both enable it, and it passes the ProcessSwitch. While it is on and
-    `arc_established` (1; unconnected: always) is 0 the tool stands.
+    `arc_established` (1; unconnected: always) is 0 the tool stands. While `hold` (1; unconnected: never) is 1 the torch is off and the
+    tool stands; it goes on from a little before that place.
     """
 
-    def __init__(self, arm: ArmModel, tool: WeldingTool, config: ServoConfig) -> None:
+    def __init__(
+        self, arm: ArmModel, tool: WeldingTool, config: ServoConfig, others: Sequence[ServoConfig] = ()
+    ) -> None:
         super().__init__()
-        self._arm, self._tool, self._config = arm, tool, config
+        self._arm, self._tool, self._configs = arm, tool, (config, *others)
         self._seam = self.DeclareAbstractInputPort("planned_seam", AbstractValue.Make(PlannedSeam()))
         self._deformation = self.DeclareAbstractInputPort("deformation", AbstractValue.Make(Deformation()))
         self._q = self.DeclareVectorInputPort("position_measured", 6)
         self._time = self.DeclareVectorInputPort("sample_time", 1)
         self._job = self.DeclareAbstractInputPort("job", AbstractValue.Make(JobCommand()))
         self._arc = self.DeclareVectorInputPort("arc_established", 1)
+        self._hold = self.DeclareVectorInputPort("hold", 1)
         self._state = self.DeclareAbstractState(AbstractValue.Make(ServoReport()))
         ticket = {self.abstract_state_ticket(self._state)}
         self.DeclareVectorOutputPort("V_BT", 6, self._velocity, ticket | {self._job.ticket()})
@@ -85,17 +98,30 @@ class WeldingVelocityServo(LeafSystem):
         old: ServoReport = context.get_abstract_state(self._state).get_value()
         planned: PlannedSeam = self._seam.Eval(context)
         if job.mode != "weld" or planned.seam is None:
-            if old.phase not in ("IDLE", Phase.DONE, Phase.FAULT):
-                report = dc.replace(old, phase="IDLE", torch_on=False, command=None)
+            if old.phase == Phase.DONE and planned.sequence > old.plan and planned.seam is not None:
+                # The next seam is planned: what is reported of the last one would end it at once.
+                state.get_mutable_abstract_state(self._state).set_value(ServoReport())
+            elif old.phase not in ("IDLE", Phase.DONE, Phase.FAULT):
+                report = dc.replace(old, phase="IDLE", torch_on=False, command=None, interruption=Interruption())
                 state.get_mutable_abstract_state(self._state).set_value(report)
             return
         X_BT = forward_kinematics(self._arm, self._q.Eval(context)) @ self._tool.X_FT
         arc = not self._arc.HasValue(context) or bool(self._arc.Eval(context)[0] > 0.5)
         sample = ServoSample(float(self._time.Eval(context)[0]), X_BT, self._deformation.Eval(context).sample, arc)
         memory = old.state if old.state is not None else WeldingState()
-        memory, command = welding_step(memory, sample, planned.seam, self._config)
+        config = self._configs[min(job.seam, len(self._configs) - 1)]
+        holds = self._hold.HasValue(context) and bool(self._hold.Eval(context)[0] > 0.5)
+        memory, held, command = interruptible_step(memory, old.interruption, sample, planned.seam, config, holds)
         report = ServoReport(
-            str(command.phase), command.torch_on, command.reason, command, memory, sample.time, sample.X_BT
+            str(command.phase),
+            command.torch_on,
+            command.reason,
+            command,
+            memory,
+            sample.time,
+            sample.X_BT,
+            planned.sequence,
+            held,
         )
         state.get_mutable_abstract_state(self._state).set_value(report)
 

@@ -136,6 +136,22 @@ def test_a_whole_job_goes_through_its_phases_in_order() -> None:
     assert [t for t, _ in world.state.log] == sorted(t for t, _ in world.state.log)
 
 
+def test_every_seam_is_scanned_planned_and_welded_in_turn() -> None:
+    world = World(dc.replace(PLAN, calibrate=False, seams=2))
+    assert world.look() == "park"
+    for number in (0, 1):
+        assert world.arrive() == "scan_workpiece"
+        assert (world.command.seam, world.command.scan_sequence) == (number, number + 1)
+        assert world.look(0.3) == "scan_workpiece", "the plan of the seam before is no plan"
+        assert world.look(0.3, seam=dc.replace(PLANNED, sequence=number + 1)) == "approach_above"
+        assert world.arrive() == "approach"
+        assert world.arrive() == "weld"
+        assert world.look(20.0, servo=ServoReport("DONE")) == "retract"
+        assert world.arrive() == ("home" if number else "park")
+        world.seen = dc.replace(world.seen, servo=ServoReport())
+    assert world.arrive() == "done"
+
+
 @pytest.mark.parametrize("calibrate", [True, False])
 def test_an_arm_that_stands_elsewhere_goes_home_first(calibrate: bool) -> None:
     world = World(dc.replace(PLAN, calibrate=calibrate))
@@ -209,7 +225,7 @@ HOLDS: dict[str, tuple[str, float, dict[str, Any], str]] = {
     ),
     "robot fault": ("park", 0.1, {"robot": UrStatus(fault="WALL: it hit a wall.")}, "^WALL: it hit a wall.$"),
     "a singular arm": ("weld", 0.1, {"arm_stopped": True}, "too near to a singular position"),
-    "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person held the job, in the phase 'weld'"),
+    "a person's wish": ("weld", 0.1, {"hold_requested": True}, "A person ended the job, in the phase 'weld'"),
     "time is up": ("weld", 241.0, {}, "took longer than its 240 s, in the phase 'weld'"),
     "goal not reached": ("move_to_pose", 21.0, {}, "did not come to rest at its goal within 20 s"),
     "cloud pose not reached": ("move_to_verification_cloud", 21.0, {}, "did not come to rest at its goal within 20 s"),

@@ -1,4 +1,4 @@
-"""A person's click holds the job for good, and a person's slider sets the pace."""
+"""The panel brings a person's wishes and the viewer's controls into the Diagram; the viewer can hold and set the pace, no more."""
 
 from __future__ import annotations
 
@@ -10,21 +10,26 @@ from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import Simulator
 
 from weldcal.systems.motion.operator_panel import HOLD_BUTTON, PACE_SLIDER, OperatorPanel
+from weldcal.systems.person import Person
 
 
 class Panel:
     """The panel alone, with what it says at any time."""
 
-    def __init__(self, pace: float = 0.0) -> None:
-        self.meshcat = Meshcat(MeshcatParams(host="localhost", port=0))
-        self.system = OperatorPanel(self.meshcat, pace)
+    def __init__(self, pace: float | None = None, *, viewer: bool = True) -> None:
+        self.person = Person()
+        if pace is not None:
+            self.person.ask_pace(pace)
+        self.meshcat = Meshcat(MeshcatParams(host="localhost", port=0)) if viewer else None
+        self.system = OperatorPanel(self.person, self.meshcat)
         self.simulator = Simulator(self.system)
 
-    def after(self, duration: float) -> tuple[float, float]:
-        """Hold and pace after some more time."""
+    def after(self, duration: float) -> tuple[float, float, float]:
+        """Hold, end and pace after some more time."""
         context = self.simulator.get_context()
         self.simulator.AdvanceTo(context.get_time() + duration)
-        return tuple(float(self.system.GetOutputPort(name).Eval(context)[0]) for name in ("hold", "pace"))  # type: ignore[return-value]
+        hold, end, pace = (float(self.system.GetOutputPort(n).Eval(context)[0]) for n in ("hold", "end", "pace"))
+        return hold, end, pace
 
     def click(self) -> None:
         """What the browser sends when the button is clicked."""
@@ -43,45 +48,67 @@ class Panel:
 
 
 def test_nobody_holds_by_default() -> None:
-    assert Panel().after(0.2) == (0.0, 0.0)
+    assert Panel().after(0.2) == (0.0, 0.0, 0.0)
 
 
-def test_a_click_holds_and_stays() -> None:
+def test_a_persons_wishes_are_in_the_diagram_within_ten_milliseconds_without_a_viewer() -> None:
+    panel = Panel(viewer=False)
+    panel.after(0.1)
+    panel.person.hold()
+    assert panel.after(0.01) == (1.0, 0.0, 0.0)
+    panel.person.go_on()
+    panel.person.ask_pace(1.5)
+    assert panel.after(0.01) == (0.0, 0.0, 1.5)
+    panel.person.end()
+    assert panel.after(0.01) == (0.0, 1.0, 1.5)
+
+
+def test_a_click_of_the_viewer_holds_until_a_person_lets_it_go_on_and_another_click_holds_again() -> None:
     panel = Panel()
     panel.after(0.1)
-    panel.click()
-    assert panel.after(0.1)[0] == 1.0
-    panel.meshcat.DeleteButton(HOLD_BUTTON)  # even the count of clicks may go
-    panel.meshcat.AddButton(HOLD_BUTTON)
-    assert panel.after(0.2)[0] == 1.0
+    for _ in range(2):
+        panel.click()
+        assert panel.after(0.1)[:2] == (1.0, 0.0)
+        assert panel.person.held_by == "the 3D view"
+        panel.person.go_on()
+        assert panel.after(0.1)[:2] == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("pace", [0.0, 1.0])
 def test_the_slider_begins_at_the_pace_that_was_asked_for_and_can_be_moved(pace: float) -> None:
     panel = Panel(pace)
-    assert panel.after(0.1)[1] == pace
+    assert panel.after(0.1)[2] == pace
     panel.meshcat.SetSliderValue(PACE_SLIDER, 2.0)
-    assert panel.after(0.1)[1] == 2.0
+    assert panel.after(0.1)[2] == 2.0
+
+
+def test_a_pace_asked_for_elsewhere_moves_the_slider() -> None:
+    panel = Panel(1.0)
+    panel.after(0.1)
+    panel.person.ask_pace(2.5)
+    assert panel.after(0.1)[2] == 2.5
+    assert panel.meshcat.GetSliderValue(PACE_SLIDER) == 2.5
 
 
 def test_a_page_may_send_any_number_and_the_pace_stays_one_that_exists() -> None:
     panel = Panel(1.0)
     panel.send({"type": "slider", "name": PACE_SLIDER, "value": 2.0})
-    assert panel.after(0.1) == (0.0, 2.0), "the message is the browser's own"
+    assert panel.after(0.1) == (0.0, 0.0, 2.0), "the message is the browser's own"
     for value in (math.nan, math.inf, -math.inf, -1.0, 3.1, 1e300):
         panel.send({"type": "slider", "name": PACE_SLIDER, "value": value})
-        assert panel.after(0.1) == (0.0, 2.0), value
+        assert panel.after(0.1) == (0.0, 0.0, 2.0), value
 
 
-def test_no_message_of_a_page_takes_a_hold_back() -> None:
+def test_no_message_of_a_page_takes_a_hold_back_or_ends_the_run() -> None:
     panel = Panel(1.0)
     panel.click()
     assert panel.after(0.1)[0] == 1.0
     for message in (
         {"type": "button", "name": HOLD_BUTTON},
         {"type": "button", "name": "Go on"},
+        {"type": "button", "name": "End"},
         {"type": "delete_control", "name": HOLD_BUTTON},
         {"type": "slider", "name": HOLD_BUTTON, "value": 0.0},
     ):
         panel.send(message)  # type: ignore[arg-type]
-        assert panel.after(0.1)[0] == 1.0
+        assert panel.after(0.1)[:2] == (1.0, 0.0)

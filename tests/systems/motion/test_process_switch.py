@@ -52,8 +52,7 @@ class Welding:
         servo.get_mutable_discrete_state_vector().SetFromVector(memory)
 
     def person_holds(self) -> None:
-        nobody = self.diagram.GetSubsystemByName("nobody_holds")
-        nobody.get_mutable_source_value(self.context("nobody_holds")).SetFromVector([1.0])
+        self.context("operator_panel").get_mutable_discrete_state_vector().SetAtIndex(0, 1.0)
 
     @property
     def process_on(self) -> bool:
@@ -122,7 +121,6 @@ class Alone:
 
 STOPS = {
     "margin": ([0.02, 1.0], [0.5, 0.0]),
-    "hold": ([1.0], [0.0]),
     "robot_status": (UrStatus(safety_mode="PROTECTIVE_STOP"), UrStatus()),
 }
 
@@ -139,6 +137,20 @@ def test_a_torch_once_turned_off_does_not_come_back_by_itself(name: str) -> None
     switch.after(0.01)
     switch.feed(job=WELD)
     assert switch.after(0.01) == (True, False), "another weld begins afresh"
+
+
+def test_a_person_who_holds_turns_the_torch_off_until_the_servo_asks_for_it_after_that() -> None:
+    switch = Alone()
+    assert switch.after(0.01) == (True, False)
+    switch.feed(hold=[1.0])
+    assert switch.after(0.0) == (False, False), "in the same look"
+    assert switch.after(0.01) == (False, False)
+    switch.feed(torch_wanted=[0.0])
+    assert switch.after(0.01) == (False, False)
+    switch.feed(hold=[0.0])
+    assert switch.after(0.01) == (False, False), "the servo is on its way back"
+    switch.feed(torch_wanted=[1.0])
+    assert switch.after(0.01) == (True, False)
 
 
 def test_a_guard_that_slows_the_arm_before_the_arc_is_no_stop() -> None:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.tools.outcomes.weld import new_ticks
+from weldcal.systems.jobs.weld.welding_velocity_servo import PHASE_CODES
+from weldcal.tools.outcomes.weld import WeldLog, new_ticks, welds
 from weldcal.welding.record.process import WeldProcess
 from weldcal.welding.record.weld_log import (
     COLUMNS,
@@ -22,6 +23,7 @@ from weldcal.welding.record.weld_log import (
     load_weld_log,
     weld_log_texts,
 )
+from weldcal.welding.servo.state import Phase
 
 N = 40
 
@@ -150,3 +152,11 @@ def test_every_column_is_in_the_document_with_its_unit_and_frame(repository: Pat
 def test_a_row_is_written_once_for_each_tick() -> None:
     ticks = np.array([np.nan, 1.0, 1.008, 1.008, np.nan, 1.016, 0.5, 1.024])
     assert new_ticks(ticks).tolist() == [False, True, True, False, False, True, False, True]
+
+
+def test_the_rows_of_several_welds_are_told_apart_by_their_touch() -> None:
+    phases = [Phase.TOUCH, Phase.TOUCH, Phase.TRACK, Phase.COAST, Phase.TRACK, Phase.FINISH, Phase.TOUCH, Phase.TRACK]
+    n, none = len(phases), np.zeros(0)
+    codes = np.array([PHASE_CODES[phase] for phase in phases])
+    log = WeldLog(np.arange(n), {"phase": codes}, np.ones(n, bool), *[none] * 6)
+    assert [part.nonzero()[0].tolist() for part in welds(log)] == [[0, 1, 2, 3, 4, 5], [6, 7]]

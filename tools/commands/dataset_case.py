@@ -1,0 +1,65 @@
+"""Makes the doctor's case of a dataset, the poses as stated and what the scans show of the flange, and writes it beside a result."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from weldcal.calibration.data.dataset import Dataset
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.readings import FEWEST
+from weldcal.calibration.doctor.record import NAME, case_of, case_text
+from weldcal.calibration.eye_on_base.observations import FlangeObservations, see_flanges
+from weldcal.models.errors import InputError, WeldcalError
+from weldcal.models.flanges import FlangeStandard
+from weldcal.models.scanners import get_scanner
+from weldcal.tools.report.render import write_atomic
+
+
+def dataset_case(data: Dataset, seen: FlangeObservations, stated: FlangeStandard, found: FlangeStandard) -> Case:
+    """What a dataset shows of the flange, as the doctor examines it."""
+    X_BC, guess = data.X_BC_guess, data.header.scanner_guess
+    try:
+        preset = get_scanner(data.header.scanner)
+        near_far = preset.near_m, preset.far_m
+    except InputError:
+        near_far = None
+    return case_of(
+        seen.observations,
+        seen.fits,
+        np.eye(4) if data.pairs else data.X_FR.GetAsMatrix4(),
+        robot=data.header.robot,
+        flange=stated.designation,
+        refused=seen.refused,
+        guess=None if X_BC is None else X_BC.GetAsMatrix4(),
+        guess_radius=0.06 if guess is None else guess.radius_m,
+        oriented=not data.pairs or all(p.has_orientation for p in data.pairs),
+        fits_flange=found.designation,
+        near_far=near_far,
+    )
+
+
+def write_case(folder: Path, case: Case) -> None:
+    """Write what was seen of the flange beside a result, for `weldcal doctor`."""
+    write_atomic(folder / NAME, case_text(case))
+
+
+@contextmanager
+def examined_where_refused(
+    out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
+) -> Iterator[None]:
+    """Writes the case to ``out`` where the block refuses the scans, and lets the error go on.
+
+    Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be wrong.
+    """
+    try:
+        yield
+    except WeldcalError:
+        if len(seen.observations) < FEWEST and data.header.scanner_guess is not None:
+            anywhere = replace(data, header=replace(data.header, scanner_guess=None))
+            seen = see_flanges(anywhere, standard, holes=False, seed=seed)
+        if seen.observations:
+            write_case(out, dataset_case(data, seen, standard, standard))
+        raise

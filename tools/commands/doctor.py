@@ -1,0 +1,134 @@
+"""`weldcal doctor`: names what disturbs a calibration or a weld, from a result, a recording or a dataset."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context
+
+from weldcal.calibration.data.clouds import CloudError
+from weldcal.calibration.data.dataset import Dataset, load_dataset
+from weldcal.calibration.doctor.case import Case
+from weldcal.calibration.doctor.diagnose import Cause, Diagnosis, diagnose
+from weldcal.calibration.doctor.record import NAME, read_case
+from weldcal.calibration.errors import DatasetError, FlangeNotFound
+from weldcal.calibration.eye_on_base.observations import see_flanges
+from weldcal.calibration.flange.fit import fit_flange
+from weldcal.models.errors import InputError
+from weldcal.models.flanges import STANDARDS, FlangeStandard, get_flange
+from weldcal.systems.cell import Cell
+from weldcal.systems.runner import Progress, no_progress
+from weldcal.tools.commands.dataset_case import dataset_case
+from weldcal.tools.commands.record import RECORDING
+from weldcal.tools.commands.replay import replay
+from weldcal.tools.commands.run_files import SCANS, SUMMARY, live_case
+from weldcal.tools.commands.weld_causes import weld_causes
+from weldcal.tools.outcomes.doctor import DoctorReport, worded
+from weldcal.welding.record.weld_log import CSV_NAME, load_weld_log
+
+CALIBRATION = "calibration.yaml"
+_LOOKED_AT = 3  # scans in which other flanges are tried
+_SEEN = 0.8  # of the edge
+
+
+def examine(path: Path, *, flange: str | None = None, seed: int = 0, progress: Progress = no_progress) -> DoctorReport:
+    """Name the causes in a result folder (or its calibration.yaml), a recording.mcap or a dataset folder; nothing is written.
+
+    Raises:
+        InputError: nothing there can be examined.
+    """
+    if not path.exists():
+        raise InputError(f"There is no '{path}': give a result folder, a recording or a dataset folder.")
+    if path.suffix == ".mcap":
+        return worded("recording", _recorded(path, progress))
+    folder = path if path.is_dir() else path.parent
+    of_weld = _of_weld(folder)
+    if (folder / NAME).is_file():
+        return worded("result", _both(diagnose(read_case(folder / NAME)), of_weld))
+    if (folder / SCANS / "dataset.yaml").is_file():
+        return worded("scans of the run", _both(diagnose_dataset(folder / SCANS, flange, seed, progress), of_weld))
+    if (folder / RECORDING).is_file():
+        return worded("recording", _both(_recorded(folder / RECORDING, progress), of_weld))
+    if (folder / CSV_NAME).is_file():
+        return worded("weld log", Diagnosis(of_weld, 0, float("nan")))
+    if (folder / CALIBRATION).is_file():
+        raise InputError(
+            f"'{folder}' was written before results kept what was seen of the flange. Calibrate again, or give the dataset's folder."
+        )
+    return worded("dataset", diagnose_dataset(folder, flange, seed, progress))
+
+
+def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Progress = no_progress) -> Diagnosis:
+    """Fit the flange in every scan of a dataset and name what disturbs them.
+
+    Raises:
+        InputError: the dataset cannot be read, and not because of its units.
+    """
+    try:
+        data = load_dataset(folder)
+    except DatasetError as refusal:
+        if not any(word in str(refusal) for word in ("millimet", "unit", "10 mm to 10 m")):
+            raise
+        return Diagnosis((Cause("unit mix", 0.9, 1e9, {}, (), str(refusal)),), 0, float("nan"))
+    standard = get_flange(flange or data.header.flange)
+    found = standard if data.pairs else _other_flange(data, standard)
+    anywhere = replace(data, header=replace(data.header, scanner_guess=None))  # a wrong pose leads the search astray
+    seen = see_flanges(anywhere, found, holes=False, seed=seed, tell=lambda share: progress("fit flanges", 0.9 * share))
+    return diagnose(dataset_case(data, seen, standard, found))
+
+
+def _other_flange(data: Dataset, stated: FlangeStandard) -> FlangeStandard:
+    """The standard flange that a few scans show where they do not show the stated one; else the stated one."""
+    ids = list(data.clouds)
+    some = [ids[k] for k in np.unique(np.linspace(0, len(ids) - 1, min(_LOOKED_AT, len(ids))).astype(int))]
+    if len(_found_in(data, some, stated)) > len(some) // 2:
+        return stated
+    best, least = stated, np.inf
+    for standard in STANDARDS.values():
+        rims = _found_in(data, some, standard)
+        if standard.designation != stated.designation and len(rims) > len(some) // 2 and np.median(rims) < least:
+            best, least = standard, float(np.median(rims))
+    return best
+
+
+def _found_in(data: Dataset, ids: Sequence[str], standard: FlangeStandard) -> list[float]:
+    """Residuals of the edges (m) in the scans that show this flange whole."""
+    rims = []
+    for id in ids:
+        try:
+            fit = fit_flange(data.cloud(id), standard)
+        except (CloudError, FlangeNotFound):
+            continue
+        if fit.coverage > _SEEN and fit.bore_radius_m is not None:
+            rims.append(fit.rim_rms_m)
+    return rims
+
+
+def _recorded(path: Path, progress: Progress) -> Diagnosis:
+    """Replay a recording, and examine what its calibration saw and its weld felt."""
+    cases: list[Case] = []
+    reasons: list[str] = []
+
+    def look(cell: Cell[Any], root: Context) -> None:
+        case = live_case(cell, root)
+        if case is not None:
+            cases.append(case)
+        reasons.append(cell.job.command(root).reason or "")
+
+    replay(path, progress, look)
+    found = diagnose(cases[0]) if cases else Diagnosis((), 0, float("nan"))
+    return _both(found, weld_causes(None, reasons[0]))
+
+
+def _of_weld(folder: Path) -> tuple[Cause, ...]:
+    """Causes that the weld log of a result shows, and the reason for which its run was held."""
+    log = load_weld_log(folder) if (folder / CSV_NAME).is_file() else None
+    summary = json.loads((folder / SUMMARY).read_text(encoding="utf-8")) if (folder / SUMMARY).is_file() else {}
+    return weld_causes(log, str(summary.get("reason") or ""))
+
+
+def _both(found: Diagnosis, more: tuple[Cause, ...]) -> Diagnosis:
+    return Diagnosis(tuple(sorted((*found.causes, *more), key=lambda c: -c.score)), found.n, found.spread_m)

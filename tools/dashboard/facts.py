@@ -1,0 +1,97 @@
+"""What does not change during a run and the dashboard shows: names, limits, the steps of the job."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from weldcal.calibration.planning.calibration_poses import PlannerConfig, predicted_sigma
+from weldcal.models.errors import WeldcalError
+from weldcal.systems.cell import Cell
+from weldcal.systems.jobs.weld.job import WeldJob
+from weldcal.systems.jobs.weld.settings import work_point
+from weldcal.systems.messages import CalibrationStatus
+from weldcal.systems.viewer.phase_labels import STEPS
+from weldcal.welding.servo.guards import ArmGuardConfig
+
+SCAN = "scan"
+# About how long steps take at speed_factor 1, s; of these the moves take longer at a lower one.
+_SCAN_S, _MOVES_S, _TOUCH_S, _WHOLE_SEAM_MM = 3.0, {"Park": 3.0, "Approach": 5.0, "Go home": 6.0}, 6.0, 300.0
+
+
+@dataclass(frozen=True, eq=False)
+class Facts:
+    """Of a run: `steps`: name and phases of each step that the job will make; lengths in mm, NaN or None where the job has none.
+
+    `band_mm`: least and largest deflection of the tip with which the seam is followed. `gain` computes the expected error after
+    the next pose from the present status. `settable_pace`: a simulation, whose pace may be chosen. `seconds`: about how long each
+    step takes, and SCAN, the scan of a pose with the way to it.
+    """
+
+    title: str = ""
+    robot: str = "simulated"
+    settable_pace: bool = True
+    steps: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    required_mm: float = math.nan
+    maximum_scans: int = 0
+    minimum_scans: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    weld_speed_mm_s: float = math.nan
+    wanted_deflection_mm: float = math.nan
+    band_mm: tuple[float, float] | None = None
+    sigma_slow: float = ArmGuardConfig().sigma_slow
+    sigma_stop: float = ArmGuardConfig().sigma_stop
+    gain: Callable[[CalibrationStatus, int], float] | None = field(default=None, repr=False)
+
+
+def facts_of(cell: Cell[Any], title: str, robot: str) -> Facts:
+    """The facts of a cell that was built and has not run yet."""
+    settable = cell.station.robot.clock is None
+    job, scenario = cell.job, cell.scenario
+    if not isinstance(job, WeldJob):
+        return Facts(title, robot, settable)
+    wanted = {"calibrate": scenario.job.calibrate, "weld": scenario.job.weld}
+    steps = tuple((name, phases) for name, needs, phases in STEPS if needs is None or wanted[needs])
+    c, servo = scenario.calibration, job.servo_config
+    slower = 1.0 / scenario.job.speed_factor
+    seam_mm = (scenario.welding.seam_length_mm or _WHOLE_SEAM_MM) + 1e3 * servo.tool.torch_offset_m
+    seconds = {SCAN: _SCAN_S * slower, "Verify": c.verification_scans * _SCAN_S * slower, "Scan the part": 2.0}
+    seconds |= {name: s * slower for name, s in _MOVES_S.items()}
+    seconds["Weld"] = _TOUCH_S + seam_mm / (1e3 * servo.weld_speed_m_s)
+    return Facts(
+        title,
+        robot,
+        settable,
+        steps,
+        c.required_error_mm if scenario.job.calibrate else math.nan,
+        c.maximum_scans,
+        c.minimum_scans,
+        seconds,
+        1e3 * servo.weld_speed_m_s,
+        1e3 * servo.deflection.delta_d_m,
+        (1e3 * servo.contact.normal_min_m, 1e3 * servo.faults.lateral_m),
+        gain=_gain_of(job),
+    )
+
+
+def _gain_of(job: WeldJob) -> Callable[[CalibrationStatus, int], float]:
+    """A function that computes the expected error m at the work point after one more planned pose; NaN where it cannot."""
+    x, y, z = (float(v) for v in work_point(job.scenario))
+    config = PlannerConfig(work_point_B=(x, y, z))
+
+    def gain(status: CalibrationStatus, index: int) -> float:
+        if status.estimate is None or index >= len(job.poses):
+            return math.nan
+        seen = [o.X_BR for o in status.observations]
+        try:
+            before = predicted_sigma(seen, status.estimate.X_BC, config)
+            after = predicted_sigma([*seen, job.poses[index].X_BR], status.estimate.X_BC, config)
+        except (WeldcalError, np.linalg.LinAlgError):
+            return math.nan
+        return status.predicted_error_m * after / before if np.isfinite(before) and before > 0.0 else math.nan
+
+    return gain

@@ -1,0 +1,145 @@
+"""DashboardSource: what the page is told of a run, and what its buttons ask of the person's wishes; used by the server's threads."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+from weldcal.systems.person import Person
+from weldcal.systems.viewer.live import LiveView
+from weldcal.tools.dashboard.facts import Facts
+from weldcal.tools.dashboard.values import (
+    DONE,
+    ENDED,
+    HELD,
+    RUNNING,
+    STARTING,
+    STOPPING,
+    left_s,
+    phase_text,
+    scan_rows,
+    scan_values,
+    steps,
+    weld_rows,
+    weld_values,
+)
+
+BY = "the dashboard"
+PACE_OVER_S = 2.0
+
+
+class DashboardSource:
+    """Reads the run's live view and the person's wishes. It never waits for the Diagram, and the Diagram never for it."""
+
+    def __init__(self, live: LiveView, person: Person, facts: Facts | None = None) -> None:
+        self.live, self.person = live, person
+        self.facts = Facts() if facts is None else facts
+        self._stage, self._share = "", 0.0
+        self._ended: tuple[str, str | None] | None = None
+        self.replays = False
+        self._paces: deque[tuple[float, float]] = deque(maxlen=50)
+
+    def stage(self, text: str, share: float) -> None:
+        """Take the present step in words and the completed share of the run, 0 to 1."""
+        if not text.startswith("held by"):  # that is for the terminal
+            self._stage, self._share = text, share
+
+    def end(self, held: bool, reason: str | None, replays: bool) -> None:
+        """Take how the run ended, and whether the 3D view repeats it from now on."""
+        self.replays = replays
+        self._ended = (HELD if held and not self.person.ends else ENDED if held else DONE, reason)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run has ended."""
+        return self._ended is not None
+
+    def act(self, what: str, value: float | None = None) -> bool:
+        """Do what a button asks: "hold", "go_on", "end" or "pace"; False where there is no such button now."""
+        person = self.person
+        if self.ended:
+            return False
+        if what == "hold":
+            person.hold(BY)
+        elif what == "go_on" and person.holds and not person.ends:
+            person.go_on()
+        elif what == "end":
+            person.end(BY)
+        elif what == "pace" and value is not None and self.facts.settable_pace:
+            person.ask_pace(value)
+        else:
+            return False
+        return True
+
+    def rows(self, weld: int, scans: int) -> dict[str, Any]:
+        """The rows of the plots from these numbers on."""
+        return {"weld": weld_rows(self.live.weld[weld:]), "scans": scan_rows(self.live.scans[scans:])}
+
+    def values(self) -> dict[str, Any]:
+        """All present values of the page."""
+        moment, facts, person = self.live.moment, self.facts, self.person
+        state, line = self._state()
+        command, weld = moment.command, weld_values(facts, moment, self.live.weld)
+        running = not self.ended
+        return {
+            "state": state,
+            "line": line,
+            "replay": self.replays,
+            "title": facts.title,
+            "robot": facts.robot,
+            "can": {
+                "hold": running and not person.holds and not person.ends,
+                "go_on": running and person.holds and not person.ends,
+                "end": running and not person.ends,
+                "pace": running and facts.settable_pace,
+            },
+            "steps": steps(facts, "done" if state == DONE else command.phase),
+            "share": round(self._share, 3) if running else 1.0,
+            "left_s": left_s(facts, moment) if running else None,
+            "time_s": round(moment.time, 1),
+            "pace": {"asked": person.pace or 0.0, "now": self._pace(moment.time)},
+            "weld": weld,
+            "calibration": scan_values(facts, moment),
+            "limits": {
+                "speed": facts.weld_speed_mm_s if weld else None,
+                "deflection": facts.wanted_deflection_mm if weld else None,
+                "band": facts.band_mm if weld else None,
+            },
+        }
+
+    def _state(self) -> tuple[str, str]:
+        """The state in large letters, and the line under it: by whom and why, or what the arm does."""
+        moment, person = self.live.moment, self.person
+        doing = phase_text(moment.command.phase) if moment.time > 0.0 else self._stage
+        if self._ended is not None:
+            state, reason = self._ended
+            return state, reason or "The job is complete."
+        if person.ends:
+            return STOPPING, f"ended by {person.ended_by}; the process goes off and the arm comes to rest"
+        if person.stands:
+            return HELD, f"by {person.held_by}, during: {doing}. {self._go_on_line()}"
+        if person.holds:
+            return STOPPING, f"held by {person.held_by}; the process goes off and the arm comes to rest"
+        report = moment.shown.get("servo_report")
+        if getattr(report, "phase", "") == "BACK":
+            return RUNNING, "on the way back along the seam; the torch is off"
+        return (RUNNING, doing) if moment.time > 0.0 else (STARTING, self._stage)
+
+    def _go_on_line(self) -> str:
+        """What Go on does."""
+        report = self.live.moment.shown.get("servo_report")
+        back = getattr(report, "way_back_m", 0.0)
+        if back > 0.0:
+            return f"Go on: {1e3 * back:.1f} mm back along the seam (violet in the 3D view), then the arc starts again."
+        return "Go on: the arm moves on along the rest of its path."
+
+    def _pace(self, simulated: float) -> float | None:
+        """Seconds of the run per second of the wall clock over the last seconds; None before they are known."""
+        now = time.monotonic()
+        if not self._paces or now - self._paces[-1][0] > 0.05:
+            self._paces.append((now, simulated))
+        while len(self._paces) > 2 and now - self._paces[0][0] > PACE_OVER_S:
+            self._paces.popleft()
+        wall = now - self._paces[0][0]
+        return round((simulated - self._paces[0][1]) / wall, 2) if wall > 0.5 else None
