@@ -73,6 +73,12 @@ def _scanner(path: Path) -> None:
 
 
 def _calibration(path: Path) -> None:
+    made = next(
+        (path.parent / n for n in ("my-calibration", "my_result") if (path.parent / n / "X_BC.json").exists()), None
+    )
+    if made is not None:
+        shutil.copytree(made, path)
+        return
     with TemporaryDirectory() as folder:
         weldcal.calibrate(write_scans(Path(folder) / "scans", 12, 0), out=path)
 
@@ -85,10 +91,18 @@ def _demo(path: Path) -> None:
     """The result of a demo on a short seam: a minute."""
     from weldcal.tools.cli.app import app
 
+    path.parent.mkdir(exist_ok=True)
     scenario = path.parents[1] / "short.yaml"
     PROPS["short.yaml"](scenario)
-    words = ["demo", "--no-browser", "--scenario", str(scenario), "--out", str(path)]
+    words = ["demo", "--no-browser", "--record", "--scenario", str(scenario), "--out", str(path)]
     assert CliRunner().invoke(app, words).exit_code == 0
+
+
+def _recording(path: Path) -> None:
+    with TemporaryDirectory() as folder:
+        result = Path(folder) / "results" / "run"
+        _demo(result)
+        shutil.copy(result / path.name, path)
 
 
 def _profiler(name: str) -> Callable[[Path], None]:
@@ -150,6 +164,7 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "short.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "short_cell.yaml": lambda path: path.write_text(f"extends: my_cell/cell.yaml\n{SHORT_JOB}", encoding="utf-8"),
     "weldcal-out/demo-s_groove-seed0": _demo,
+    "recording.mcap": _recording,
     "my_cell.yaml": lambda path: path.write_text(HELD_AFTER_3_S, encoding="utf-8"),
     "my_scenario.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "touches.csv": lambda path: write_visit(path.parent),
