@@ -15,7 +15,7 @@ from weldcal.systems.scenario.loading import load_scenario
 from weldcal.systems.scenario.schema import Scenario
 from weldcal.tools.scenarios.fields import Key, keys_of
 from weldcal.tools.scenarios.json_schema import json_schema
-from weldcal.tools.scenarios.own_part import add_part, add_tool
+from weldcal.tools.scenarios.own_part import add_part, add_tool, weldable_place
 from weldcal.tools.scenarios.values import yaml_of
 
 CELL, SCHEMA = "cell.yaml", "cell.schema.json"
@@ -56,8 +56,15 @@ def write_cell(folder: Path, base: str, part: OwnPart | None = None, tool: Path 
     if tool is not None:
         add_tool(scenario, folder, tool)
     write_atomically(folder / SCHEMA, json.dumps(json_schema(), indent=1) + "\n")
-    write_atomically(path, HEAD.format(schema=SCHEMA, path=path) + "".join(_parts(scenario)))
+    _write(path, scenario)
+    if part is not None and scenario.workpiece is not None and (place := weldable_place(load_scenario(str(path)))):
+        scenario.workpiece.pose_guess = place
+        _write(path, scenario)
     return path
+
+
+def _write(path: Path, scenario: Scenario) -> None:
+    write_atomically(path, HEAD.format(schema=SCHEMA, path=path) + "".join(_parts(scenario)))
 
 
 def _parts(scenario: Scenario) -> Iterator[str]:

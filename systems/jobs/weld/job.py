@@ -214,6 +214,26 @@ class Weld(Job[tuple[PlannedPose, ...]]):
         )
 
 
+def seam_planning(scenario: Scenario, station: Station, config: ServoConfig) -> SeamPlanning:
+    """What the seams are planned from; a station with a tool and a workpiece."""
+    spec, welding = scenario.workpiece, scenario.welding
+    assert spec is not None
+    assert station.tool is not None
+    assert station.cad is not None
+    return SeamPlanning(
+        station.arm,
+        station.tool,
+        station.cad,
+        spec.pose_guess.pose(),
+        config,
+        np.deg2rad(scenario.home_deg),
+        welding.clearance_mm * 1e-3,
+        None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
+        scenario.planning.planning_method(),
+        station.surroundings,
+    )
+
+
 def _add_welding(
     wiring: Wiring, spine: Spine, config: ServoConfig, sequencer: JobSequencer, status: OutputPort
 ) -> WeldingPorts:
@@ -230,23 +250,12 @@ def _add_welding(
             seam=wiring.constant("no_seam", PlannedSeam()), report=wiring.constant("no_servo", ServoReport())
         )
     out, command, job = wiring.out, sequencer.GetOutputPort("job"), scenario.job
-    position, welding = spine.arm.position, scenario.welding
+    position = spine.arm.position
     kind = SeamPlanner if spec.located_by == "scan" else DrawnSeamPlanner
     planner = wiring.add(
         "seam_planner",
         kind(
-            SeamPlanning(
-                station.arm,
-                tool,
-                station.cad,
-                spec.pose_guess.pose(),
-                config,
-                np.deg2rad(scenario.home_deg),
-                welding.clearance_mm * 1e-3,
-                None if welding.seam_length_mm is None else welding.seam_length_mm * 1e-3,
-                scenario.planning.planning_method(),
-                station.surroundings,
-            ),
+            seam_planning(scenario, station, config),
             None if job.calibrate or job.X_BC is None else job.X_BC.pose(),
             station.background,
         ),

@@ -1,16 +1,23 @@
 """A cell begins with a user's own part and tool: the files lie beside it, and the seam is an edge of the part."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from weldcal.models.errors import InputError
-from weldcal.models.mesh import extrude
+from weldcal.models.mesh import TriMesh, extrude
 from weldcal.models.tools.loading import WELDING
+from weldcal.models.workpieces.reading import read_shape
+from weldcal.systems.jobs.weld.job import seam_planning
+from weldcal.systems.jobs.weld.seam_planner import plan_drawn_seam
+from weldcal.systems.jobs.weld.settings import servo_config
+from weldcal.systems.messages import PlannedSeam
 from weldcal.systems.scenario.loading import load_scenario
-from weldcal.systems.scenario.schema import ToolFile
+from weldcal.systems.scenario.schema import Scenario, ToolFile
 from weldcal.systems.scenario.workpiece import part_of
+from weldcal.systems.station import make_station
 from weldcal.tools.cli.scenarios import edge_numbers
 from weldcal.tools.scenarios.new_cell import OwnPart, write_cell
 
@@ -40,6 +47,40 @@ def test_the_part_stands_on_the_table_under_the_scanner(angle: Path, tmp_path: P
     guess = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle)))).workpiece
     assert guess is not None
     assert guess.pose_guess.xyz_m == pytest.approx([0.65 - 0.04, -0.03, 0.0])
+
+
+def test_the_part_lies_elsewhere_than_guessed_so_the_scan_has_to_find_it(angle: Path, tmp_path: Path) -> None:
+    part = load_scenario(str(write_cell(tmp_path / "cell", "s_groove", OwnPart(angle)))).workpiece
+    assert part is not None
+    assert part.located_by == "scan"
+    assert part.placement_error.translation_mm > 3.0
+    assert part.placement_error.rotation_deg > 1.0
+
+
+def test_of_two_joints_the_seam_is_the_one_above(tmp_path: Path) -> None:
+    """A lap of two sheets has a corner below too, as long as the one above; the way to it leads through the part."""
+    lap = np.array([[-80, -6], [20, -6], [20, 0], [80, 0], [80, 6], [0, 6], [0, 0], [-80, 0]], dtype=float)
+    upright = extrude(lap, -70.0, 70.0)
+    path = tmp_path / "lap.obj"
+    path.write_text(TriMesh(upright.vertices[:, [2, 0, 1]], upright.triangles).to_obj())
+    scenario = load_scenario(str(write_cell(tmp_path / "above", "s_groove", OwnPart(path))))
+    assert scenario.workpiece is not None
+    assert part_of(scenario.workpiece).seam.up_P[:, 2].min() > 0.5
+    assert planned(scenario).reason is None
+    chosen = scenario.workpiece.seams[0].edges
+    below = next(edge.id for edge in read_shape(path).edges if edge.kind == "concave" and [edge.id] != chosen)
+    scenario = load_scenario(str(write_cell(tmp_path / "below", "s_groove", OwnPart(path, (below,)))))
+    assert re.search(
+        "would touch the part on its way to the seam: set welding.clearance_mm", str(planned(scenario).reason)
+    )
+
+
+def planned(scenario: Scenario) -> PlannedSeam:
+    station = make_station(scenario, 0)
+    try:
+        return plan_drawn_seam(seam_planning(scenario, station, servo_config(scenario, station)), 1)
+    finally:
+        station.close()
 
 
 def test_edges_and_joint_can_be_chosen(angle: Path, tmp_path: Path) -> None:

@@ -171,8 +171,19 @@ def tukey(r: Floats, c: float) -> Floats:
     return np.asarray(np.square(np.maximum(1.0 - np.square(r / c), 0.0)))
 
 
-def step(surface: Equations, rims: Equations | None, c: float, sigma: float, pitch: float) -> Floats | None:
-    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it; None where too few points are near."""
+def _rim_weights(rims: Equations, pitch: float, reach: float) -> Floats:
+    """Tukey's weights of the rims, those within a reach at least."""
+    c = max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual))), reach)
+    return tukey(rims.residual, c) / (RIM_SIGMA * pitch) ** 2
+
+
+def step(
+    surface: Equations, rims: Equations | None, c: float, sigma: float, pitch: float, reach: float = 0.0
+) -> Floats | None:
+    """The motion (6,) of one Gauss-Newton step, the inset of the rims estimated with it; None where too few points are near.
+
+    reach: how far off, m, rims still count: where a few of many sides are, they would be taken for others.
+    """
     if len(surface.residual) < 30:
         return None
     w = tukey(surface.residual, c) / (SURFACE_RATIO * sigma**2)
@@ -182,10 +193,7 @@ def step(surface: Equations, rims: Equations | None, c: float, sigma: float, pit
     b[:6] = (surface.rows * w[:, None]).T @ -surface.residual
     if rims is not None:
         J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
-        v = (
-            tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual)))))
-            / (RIM_SIGMA * pitch) ** 2
-        )
+        v = _rim_weights(rims, pitch, reach)
         A += (J * v[:, None]).T @ J
         b += (J * v[:, None]).T @ -rims.residual
     A[6, 6] += 1.0 / (INSET_SIGMA * pitch) ** 2
@@ -235,7 +243,8 @@ def fine_fit(scan: PreparedScan, model: PartModel, X: RigidTransform, gate: floa
             sigma = max(SIGMA_FLOOR_M, 1.4826 * float(np.median(np.abs(surface.residual))))
             # A narrower gate would only let through the rims that agree with the pose already.
             rims = rim_rows(into(X, every[beside]), edges, rim_gate, max(4.0 * sigma, 0.0004), scan, X)
-            xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch)
+            reach = rim_gate if g > 0.002 else 0.0
+            xi = step(surface, rims, max(4.0 * sigma, 0.0004), sigma, pitch, reach)
             if xi is None:
                 return None
             X = moved(X, xi)
@@ -285,10 +294,7 @@ def covariance(surface: Equations, rims: Equations | None, sigma: float, pitch: 
         middle += error**2 * (lean.T @ lean)
     if rims is not None:
         J = np.hstack([rims.rows, np.ones((len(rims.rows), 1))])
-        v = (
-            tukey(rims.residual, max(3.0 * pitch, 2.0 * float(np.median(np.abs(rims.residual)))))
-            / (RIM_SIGMA * pitch) ** 2
-        )
+        v = _rim_weights(rims, pitch, 0.0)
         H = J * v[:, None]
         A += H.T @ J
         r = np.clip(rims.residual, -2.0 * pitch, 2.0 * pitch)
