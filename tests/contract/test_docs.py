@@ -163,9 +163,12 @@ def test_the_readme_says_what_is_not_real() -> None:
 
 
 def leads_to(page: Path) -> set[Path]:
-    """The pages that a page links to."""
-    targets = re.findall(r"\]\(([^)#:]+\.md)", page.read_text())
-    return {(page.parent / target).resolve() for target in targets}
+    """The pages that a page links to, or names in the navigation of the site."""
+    text = page.read_text()
+    targets = {page.parent / target for target in re.findall(r"\]\(([^)#:]+\.md)", text)}
+    for names in re.findall(r"^```{toctree}\n(?::.*\n)*\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        targets |= {found for name in names.split() for found in page.parent.glob(f"{name}.md")}
+    return {target.resolve() for target in targets}
 
 
 def test_the_readme_leads_to_every_page_and_names_every_root_folder() -> None:

@@ -33,7 +33,7 @@ SHORT = (
     (r"^demo( s_groove| straight_groove)?$", r"demo --scenario short.yaml"),
     (r"^demo --scenario (straight_groove|s_groove)", r"demo --scenario short.yaml"),
     (r"^demo --scenario my_cell/cell\.yaml", r"demo --scenario short_cell.yaml"),
-    (r"^demo (--robot|--record|--seed)", r"demo --scenario short.yaml \1"),
+    (r"^demo (--robot|--record|--seed|--share)", r"demo --scenario short.yaml \1"),
     (r"(benchmark hand-eye) --data \S+", r"\1 --quick"),
     (r"(benchmark mountings) --runs 3", r"\1 --runs 1 --scenario eye_on_base"),
     (r"benchmark robot-faults$", "benchmark robot-faults --sequences 1 --seconds 5"),
@@ -71,7 +71,7 @@ class CommandLine:
     @property
     def elsewhere(self) -> str:
         """By what else it is executed; empty: by a check of the pages."""
-        return ELSEWHERE.get(self.words[0], "")
+        return "the tests of a Dask cluster" if "--scheduler" in self.words else ELSEWHERE.get(self.words[0], "")
 
     @property
     def server(self) -> bool:
@@ -84,7 +84,9 @@ class CommandLine:
         if self.begins("new"):
             return "--dataset" not in self.words
         if self.begins("calibrate"):
-            return "--scenario" not in self.words
+            return not {"--scenario", "--refine"} & set(self.words)
+        if self.begins("doctor"):
+            return not self.name.endswith(".mcap")
         return self.begins(*CHEAP) and not self.elsewhere
 
     @property

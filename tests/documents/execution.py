@@ -6,6 +6,7 @@ import contextlib
 import io
 import os
 import shlex
+import socket
 import subprocess
 import tempfile
 import time
@@ -21,6 +22,7 @@ from tests.documents.yaml_blocks import check_yaml
 from tests.places import ROOT, SHARED_DATA
 
 WRITTEN, SHORT, ELSEWHERE, LEFT_OUT, FAILED = "as written", "in a short form", "elsewhere", "left out", "failed"
+SCRIPT_PORT = 30002
 ANSWERS_WITHIN_S = 60.0  # of a server or an emulated robot
 LARGEST_TIME_S = 3600.0
 
@@ -88,7 +90,7 @@ class Page:
             return self.check.done[tuple(arguments)]
         lay_out(shlex.join(arguments), self.folder, made)
         if ROBOT in line.name:
-            self._emulated_robot()
+            self._emulated_robot("calibrate_only" in line.words)
         if line.server:
             self._serve(arguments)
         else:
@@ -103,11 +105,15 @@ class Page:
             self.check.done[tuple(arguments)] = how
         return how
 
-    def _emulated_robot(self) -> None:
-        """Start the emulated robot that takes the place of the real one, once for the page."""
+    def _emulated_robot(self, bare: bool) -> None:
+        """Start the emulated robot that takes the place of the real one, once for the page; a person has entered the payload."""
         if "robot" not in self.names:
             self.names["robot"] = EMULATED
             self._serve(["emulate-ur", "--host", EMULATED, "--control-port", "30091"])
+        payload = "0.0, [0.0, 0.0, 0.0]" if bare else "1.4, [0.03, 0.0, 0.05]"
+        with socket.create_connection((EMULATED, SCRIPT_PORT), timeout=ANSWERS_WITHIN_S) as pendant:
+            pendant.sendall(f"sec enter():\n  set_payload({payload})\nend\n".encode())
+            time.sleep(1.0)
 
     def _serve(self, arguments: list[str]) -> None:
         """Start a server, wait for what it says first, and end it with the page, as a person does."""

@@ -17,6 +17,7 @@ from tests.calibration.tablet.visit import write_visit
 from tests.documents.scans import write_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
+from weldcal.models.arms import ur10e
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.mesh import extrude
@@ -72,18 +73,36 @@ def _scanner(path: Path) -> None:
 
 
 def _calibration(path: Path) -> None:
+    made = next(
+        (path.parent / n for n in ("my-calibration", "my_result") if (path.parent / n / "X_BC.json").exists()), None
+    )
+    if made is not None:
+        shutil.copytree(made, path)
+        return
     with TemporaryDirectory() as folder:
         weldcal.calibrate(write_scans(Path(folder) / "scans", 12, 0), out=path)
+
+
+def _kinematics(path: Path) -> None:
+    shutil.copy(Path(ur10e.__file__).parent / "default_kinematics.yaml", path)
 
 
 def _demo(path: Path) -> None:
     """The result of a demo on a short seam: a minute."""
     from weldcal.tools.cli.app import app
 
+    path.parent.mkdir(exist_ok=True)
     scenario = path.parents[1] / "short.yaml"
     PROPS["short.yaml"](scenario)
-    words = ["demo", "--no-browser", "--scenario", str(scenario), "--out", str(path)]
+    words = ["demo", "--no-browser", "--record", "--scenario", str(scenario), "--out", str(path)]
     assert CliRunner().invoke(app, words).exit_code == 0
+
+
+def _recording(path: Path) -> None:
+    with TemporaryDirectory() as folder:
+        result = Path(folder) / "results" / "run"
+        _demo(result)
+        shutil.copy(result / path.name, path)
 
 
 def _profiler(name: str) -> Callable[[Path], None]:
@@ -134,11 +153,18 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "my_tool.yaml": lambda path: shutil.copy(WELDING, path),
     "my_scanner.yaml": _scanner,
     "my-calibration": _calibration,
+    "my-calibration/kinematics.yaml": _kinematics,
+    "kinematics.yaml": _kinematics,
+    "factory_calibration.yaml": _kinematics,
+    "cells": lambda path: [
+        write_scans(path / f"cell_{k}" / f"2026-0{m}", 6, 10 * k + m) for k in (1, 2) for m in (1, 2)
+    ],
     "my_result": _calibration,
     "my_cell": lambda path: write_cell(path, "s_groove"),
     "short.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "short_cell.yaml": lambda path: path.write_text(f"extends: my_cell/cell.yaml\n{SHORT_JOB}", encoding="utf-8"),
     "weldcal-out/demo-s_groove-seed0": _demo,
+    "recording.mcap": _recording,
     "my_cell.yaml": lambda path: path.write_text(HELD_AFTER_3_S, encoding="utf-8"),
     "my_scenario.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "touches.csv": lambda path: write_visit(path.parent),

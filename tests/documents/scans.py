@@ -10,6 +10,8 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.calibration.data.dataset import save_dataset
 from weldcal.calibration.data.header import DatasetHeader, ScannerGuess
+from weldcal.models.arms.inverse import inverse_kinematics
+from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.flanges import get_flange
 
 Floats = npt.NDArray[np.float64]
@@ -56,4 +58,14 @@ def write_scans(folder: Path, n: int, seed: int) -> Path:
     header.scanner_guess = ScannerGuess(xyz=[0.65, 0.0, 0.95], wxyz=X_BC.rotation().ToQuaternion().wxyz().tolist())
     clouds = {id: flange_scan(X_CF, rng) for id, X_CF in poses.items()}
     save_dataset(folder, header, {id: X_BC @ X_CF for id, X_CF in poses.items()}, clouds)
+    _add_joints(folder / "poses.csv", list(poses.values()))
     return folder
+
+
+def _add_joints(path: Path, poses: list[RigidTransform]) -> None:
+    """Add the columns q1 to q6 (rad) of a UR10e; the poses are within its reach."""
+    arm, (header, *rows) = load_arm("ur10e"), path.read_text().splitlines()
+    angles = [inverse_kinematics(arm, X_BC @ X_CF)[0] for X_CF in poses]
+    lines = [",".join([header, *(f"q{k}" for k in range(1, 7))])]
+    lines += [",".join([row, *(f"{angle:.9f}" for angle in q)]) for row, q in zip(rows, angles, strict=True)]
+    path.write_text("\n".join(lines) + "\n")

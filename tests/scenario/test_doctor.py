@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from tests.places import MEASURED
+from tests.places import SHARED_DATA, needs
 from weldcal.calibration.data.dataset import load_dataset
 from weldcal.tools.cli.app import app
 from weldcal.tools.commands.weld_causes import weld_causes
 from weldcal.tools.studies.fleet.made_cells import COLUMNS, HEADER, write_cell
+
+AUBO = SHARED_DATA / "flange" / "aubo_i5_phoxi_s"
 
 
 def causes(path: Path) -> list[dict[str, str]]:
@@ -67,24 +69,24 @@ def test_units_that_cannot_be_are_a_cause_and_no_error(pairs: Path) -> None:
 
 
 def test_a_held_weld_names_the_hidden_tag_or_its_own_reason() -> None:
-    hidden = weld_causes(None, "Tag hidden: the finger camera has not seen it for 0.20 s; clean the tag and its window.")
+    hidden = weld_causes(
+        None, "Tag hidden: the finger camera has not seen it for 0.20 s; clean the tag and its window."
+    )
     assert [cause.name for cause in hidden] == ["hidden tag"]
     assert [cause.name for cause in weld_causes(None, "The seam ended.")] == ["the run was held"]
     assert weld_causes(None, "") == ()
 
 
+@needs(AUBO)
 def test_real_scans_have_no_cause_and_those_of_another_flange_do(tmp_path: Path) -> None:
-    data = MEASURED / "flange" / "aubo_i5_phoxi_s"
-    if not data.is_dir():
-        pytest.skip("the measured data are not beside the project")
     few = tmp_path / "few"
     few.mkdir()
-    ids = list(load_dataset(data).clouds)[::3]
-    rows = (data / "poses.csv").read_text().splitlines()
+    ids = list(load_dataset(AUBO).clouds)[::3]
+    rows = (AUBO / "poses.csv").read_text().splitlines()
     (few / "poses.csv").write_text("\n".join([rows[0], *(r for r in rows[1:] if r.split(",")[0] in ids)]) + "\n")
-    (few / "dataset.yaml").write_text((data / "dataset.yaml").read_text())
+    (few / "dataset.yaml").write_text((AUBO / "dataset.yaml").read_text())
     (few / "clouds").mkdir()
-    for path in (data / "clouds").iterdir():
+    for path in (AUBO / "clouds").iterdir():
         if path.stem in ids:
             shutil.copy(path, few / "clouds")
     assert causes(few) == []
