@@ -17,7 +17,6 @@ _MOST = 0.34  # of the scans that may be single bad ones
 _LEAST_SEEN = 0.55  # of the edge; less is a partial view
 _REFUSED = 0.2  # of the scans without a flange
 _FLAT_M = 0.02  # rms of the centres across their longest direction that does not fix the camera
-_NEAR_M, _SAME_DEG = 0.03, 2.0  # the same, where all orientations are one
 _NOISE_FACTOR = 2.0  # between the noisiest and the quietest third, the usual growth taken off
 _NOISE_CHANCE = 1e-5
 
@@ -128,11 +127,10 @@ def too_alike(case: Case) -> Finding | None:
     R = case.X_BF[:, :3, :3]
     turn = np.degrees(np.linalg.norm(log_rotation(np.swapaxes(R[:1], 1, 2) @ R), axis=1))
     middle = float(np.max(turn))
-    flat, same = width[1] < _FLAT_M, case.oriented and middle < _SAME_DEG and width[1] < _NEAR_M
-    if not flat and not same:
+    if width[1] >= _FLAT_M:
         return None
     numbers = {"spread_mm": 1e3 * float(width[0]), "second_mm": 1e3 * float(width[1]), "turn_deg": middle}
-    return Finding("poses too alike", (60.0 if flat else 0.0) + (30.0 if same else 0.0), numbers)
+    return Finding("poses too alike", 60.0, numbers)
 
 
 def installation(case: Case, one: Fit) -> Finding | None:

@@ -20,8 +20,9 @@ def _no_note(number: int, looks: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _NotedAnswer(Answer[Found]):
-    """An answer that counts how often it was looked at in vain."""
+    """An answer that counts how often it was looked at in vain; `answer` says when it is there."""
 
+    answer: Answer[Found]
     number: int
     note: Note
     looks: list[int] = field(default_factory=lambda: [0])
@@ -29,7 +30,7 @@ class _NotedAnswer(Answer[Found]):
     @property
     def ready(self) -> bool:
         """See Answer."""
-        if not self.future.done():
+        if not self.answer.ready:
             self.looks[0] += 1
             return False
         if self.looks[0] >= 0:
@@ -73,7 +74,8 @@ class NotedBackground:
     def ask(self, function: Callable[..., Found], *arguments: Any) -> Answer[Found]:
         """See Background."""
         self.asked += 1
-        return _NotedAnswer(self.background.ask(function, *arguments).future, self.asked - 1, self._noted)
+        answer = self.background.ask(function, *arguments)
+        return _NotedAnswer(answer.future, answer, self.asked - 1, self._noted)
 
     def _noted(self, number: int, looks: int) -> None:
         self.note(number, looks)

@@ -81,7 +81,7 @@ def test_a_held_weld_names_the_hidden_tag_or_its_own_reason() -> None:
 def test_real_scans_have_no_cause_and_those_of_another_flange_do(tmp_path: Path) -> None:
     few = tmp_path / "few"
     few.mkdir()
-    ids = list(load_dataset(AUBO).clouds)[::3]
+    ids = list(load_dataset(AUBO).clouds)[:9]
     rows = (AUBO / "poses.csv").read_text().splitlines()
     (few / "poses.csv").write_text("\n".join([rows[0], *(r for r in rows[1:] if r.split(",")[0] in ids)]) + "\n")
     (few / "dataset.yaml").write_text((AUBO / "dataset.yaml").read_text())

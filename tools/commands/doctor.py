@@ -70,7 +70,7 @@ def diagnose_dataset(folder: Path, flange: str | None, seed: int, progress: Prog
     try:
         data = load_dataset(folder)
     except DatasetError as refusal:
-        if not any(word in str(refusal) for word in ("millimet", "unit", "10 mm to 10 m")):
+        if not any(words in str(refusal) for words in ("millimetres", "correct units", "10 mm to 10 m")):
             raise
         return Diagnosis((Cause("unit mix", 0.9, 1e9, {}, (), str(refusal)),), 0, float("nan"))
     standard = get_flange(flange or data.header.flange)

@@ -33,7 +33,7 @@ KNOWN = (
     f"job: {{calibrate: false, X_BC: {X_BC}}}"
 )
 HIDDEN = "finger_camera: !RenderedFingerCamera {hidden_from_s: 8.0}"
-HOLE_MM = 15.0
+HOLE_MM = 25.0
 Happens = Callable[[], object]
 
 
@@ -51,7 +51,7 @@ class Kind:
 KINDS = {
     "whole job": Kind("s_groove", f"{SHORT}\n{FEW}"),
     "weld": Kind("l_groove", f"{SHORT}\n{KNOWN}"),
-    "calibration on a controller": Kind("calibrate_only", FEW, "emulated"),
+    "calibration on a controller": Kind("s_groove", f"{FEW}\njob: {{weld: false}}", "emulated"),
     "weld on a controller": Kind("straight_groove", f"{SHORT}\n{KNOWN}", "emulated"),
     "weld by wire": Kind("", "", "wired"),
     "the tag is hidden": Kind("straight_groove", f"welding: {{seam_length_mm: 60.0}}\n{KNOWN}\n{HIDDEN}"),
