@@ -29,7 +29,7 @@ Floats = npt.NDArray[np.float64]
 
 COARSE_GATES = (0.020, 0.016, 0.012, 0.009, 0.007, 0.005)
 COARSE_TOLERANCE_M, TOLERANCE_M = 0.004, 0.0010
-COARSE_PLACES, FINE_PLACES, FINE_RIVALS = 24, 10, 5
+FINE_PLACES, FINE_RIVALS = 10, 5
 NEAR_HINT_DEG = 40.0
 LARGEST, SMALLEST = 2.5, 8.0  # size of a part: of what the scan shows, and in point distances
 ELSEWHERE = 0.85  # of the best score: a rival at another place with less is worse
@@ -124,13 +124,9 @@ def _check_size(scan: PreparedScan, model: PartModel) -> None:
 def _starts(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[RigidTransform]:
     """Poses from the search, fitted to the coarse points, best first."""
     scored: list[tuple[float, RigidTransform]] = []
-    places = [place.X_BP for place in rough_places(scan, model, config)]
-    if len(places) > COARSE_PLACES:
-        every = [agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score for X in places]
-        places = [places[k] for k in np.argsort(every)[::-1][:COARSE_PLACES]]
-    for place in places:
+    for place in rough_places(scan, model, config):
         # A flat part may slide along itself in the coarse fit, so the pose before it is compared too.
-        tried = (place, coarse_fit(scan, model, place, COARSE_GATES))
+        tried = (place.X_BP, coarse_fit(scan, model, place.X_BP, COARSE_GATES))
         some = [
             (agreement(rays_near(scan, model, X)[::3], scan, model, X, COARSE_TOLERANCE_M).score, X)
             for X in tried

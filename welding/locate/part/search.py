@@ -25,9 +25,7 @@ MOST_CELLS = 150  # along a side of the scene's map
 GROUND_M = 0.0025  # points within are on the ground, the largest plane
 SAME_HEIGHT_M = 0.007
 RING_CELLS, RING_SHARE = 3, 0.5
-PEAKS, MOST_PLACES, PLACES_A_SPOT = 6, 24, 4
-LARGE_M = 0.11  # radius of a part that is not small
-MOST_SORTED = 1500  # of one direction up
+PEAKS, MOST_PLACES = 3, 24
 GROUND_EXTENT = 2.6  # extent of the largest plane, in the part's radius, above which it is no face of the part
 _BOX = {n: np.ones((n, n), np.uint8) for n in (3, 2 * RING_CELLS + 1)}
 
@@ -48,7 +46,7 @@ def frame_with_z(z: Floats) -> Floats:
 
 
 def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> list[Place]:
-    """Rough poses of the part in the scan, best first, at most MOST_PLACES; more for a small part, which fits in more places."""
+    """Rough poses of the part in the scan, best first, at most MOST_PLACES."""
     if scan.planes:
         first = scan.planes[0]
         ups = [first.normal]
@@ -68,18 +66,10 @@ def rough_places(scan: PreparedScan, model: PartModel, config: PartConfig) -> li
         places += _places_for(scan, model, config, up, config.turn_step_rad * (1.0 if k == 0 else 1.5), ground)
     places.sort(key=lambda place: -place.score)
     kept: list[Place] = []
-    most = round(MOST_PLACES * min(6.0, max(1.0, (LARGE_M / model.radius) ** 2)))
     for place in places:
-        if len(kept) == most:
+        if len(kept) == MOST_PLACES:
             break
-        if any(_near(place.X_BP, other.X_BP, model) for other in kept):
-            continue
-        # One thing that a small part fits in many ways must not take all places.
-        middle = place.X_BP.multiply(model.center)
-        there = sum(
-            bool(np.linalg.norm(other.X_BP.multiply(model.center) - middle) < 0.5 * model.radius) for other in kept
-        )
-        if there < PLACES_A_SPOT:
+        if not any(_near(place.X_BP, other.X_BP, model) for other in kept):
             kept.append(place)
     return kept
 
@@ -157,7 +147,7 @@ def _places_for(
                 origin = R_BU @ np.array([middle[0], middle[1], lift]) - R @ model.center
                 places.append(Place(score, RigidTransform(RotationMatrix(_orthogonal(R)), origin)))
     places.sort(key=lambda place: -place.score)
-    return places[:MOST_SORTED]
+    return places[:400]
 
 
 def _orthogonal(R: Floats) -> Floats:
