@@ -20,7 +20,15 @@ from weldcal.calibration.doctor.quality import (
     sure_outliers,
     too_alike,
 )
-from weldcal.calibration.doctor.readings import FEWEST, best_reading, mixed_units
+from weldcal.calibration.doctor.readings import (
+    FEWEST,
+    LOOKS_WRONG_M,
+    LOOKS_WRONG_RAD,
+    best_reading,
+    looks_wrong,
+    mixed_units,
+)  # fmt: skip
+from weldcal.calibration.doctor.rotations import mirrored, misread_rotations, reordered, rotations_disagree
 
 THRESHOLDS = {
     "scanner moved": 20.0,
@@ -29,6 +37,7 @@ THRESHOLDS = {
     "slack flange or loose mount": 20.0,
     "wrong kinematics file": 20.0,
     "outlier scans or partial views": 20.0,
+    "scanner scale error": 20.0,
 }
 """Least difference of the criterion at which each is named; the evidence of a difference of 10 is called very strong (Raftery 1995)."""
 LEAST_EFFECT_M = {
@@ -38,10 +47,12 @@ LEAST_EFFECT_M = {
     "slack flange or loose mount": 5e-4,
     "wrong kinematics file": 1e-3,
     "outlier scans or partial views": 1e-3,
+    "scanner scale error": 8e-3,  # no length: four usual sigmas of a scanner's scale (fit.py)
 }
 """Smaller ones are what arms and scanners are off anyway."""
+UNEXPLAINED = "unexplained"
+_SURE = 1e5  # of misreadings, which explain by definition what they are named for
 CLEAR = 1.2  # factor by which a cause must bring the median residual down
-_LOOKS_WRONG_M, _LOOKS_WRONG_RAD = 3e-3, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,17 +89,22 @@ def diagnose(case: Case) -> Diagnosis:
     if case.n < FEWEST:
         if partial is not None:
             causes.append(Cause(partial.cause, 0.9, partial.score, partial.numbers, partial.where))
+        if not causes:
+            causes.append(Cause("too few scans", 0.9, 1.0, {"n": float(case.n)}))
         return Diagnosis(tuple(causes), case.n, float("nan"))
     bare, case = case, with_arm_errors(case)
     null = fit(case)
-    wrong = null.rms > _LOOKS_WRONG_M or (
-        np.isfinite(null.tilt).any() and float(np.nanmedian(null.tilt)) > _LOOKS_WRONG_RAD
-    )
+    wrong = looks_wrong(null)
     models = _ranked(case, null)
     winner = next((m for m in models if _named(m, null)), None)
     if wrong:
         plain = fit(bare)
-        reading = best_reading(bare, plain)
+        reading = (
+            best_reading(bare, plain)
+            or misread_rotations(bare, plain)
+            or mirrored(bare, plain)
+            or reordered(bare, plain)
+        )
         rival = winner.bic if winner is not None else null.bic
         if reading is not None and reading.fit.bic / reading.case.n < rival / case.n:
             causes.append(
@@ -110,7 +126,8 @@ def diagnose(case: Case) -> Diagnosis:
         numbers = winner.numbers | _residuals(null, winner.fit)
         causes.append(Cause(winner.cause, _weight(winner, models, null), null.bic - winner.bic, numbers, winner.where))
     named = {c.name for c in causes}
-    alone = winner is None or winner.cause != "scanner moved"
+    # a moved or mirrored scanner is elsewhere anyway
+    alone = named.isdisjoint({"scanner moved", "scanner axes mirrored"})
     single = sure_outliers(case, null) if winner is None else None
     findings = [partial, single, noise_growth(case), too_alike(case), installation(case, best) if alone else None]
     for found in findings:
@@ -119,8 +136,9 @@ def diagnose(case: Case) -> Diagnosis:
             causes.append(
                 Cause(found.cause, float(1.0 - np.exp(-found.score / 20.0)), found.score, found.numbers, found.where)
             )
-    if wrong and not causes:
-        causes.append(Cause("unexplained", 0.5, 0.0, {"rms_mm": 1e3 * null.rms, "usual_mm": 0.3}))
+    left = _unexplained(bare, best) if not any(c.score > _SURE for c in causes) else None
+    if left is not None:
+        causes = [left]
     causes.sort(key=lambda c: -c.score)
     return Diagnosis(tuple(causes), case.n, float(np.median(np.linalg.norm(best.e, axis=1))))
 
@@ -134,6 +152,20 @@ def _ranked(case: Case, null: Fit) -> list[Explained]:
 def _named(m: Explained, null: Fit) -> bool:
     shows = m.cause.startswith("outlier") or null.rms > CLEAR * m.fit.rms
     return shows and null.bic - m.bic > THRESHOLDS[m.cause] and m.effect_m > LEAST_EFFECT_M[m.cause]
+
+
+def _unexplained(case: Case, best: Fit) -> Cause | None:
+    """What remains after the best model and is too large for any arm and scanner; None where nothing does."""
+    turned = rotations_disagree(case)
+    tilt = float(np.degrees(np.nanmedian(best.tilt))) if np.isfinite(best.tilt).any() else 0.0
+    if turned is not None and tilt > np.degrees(LOOKS_WRONG_RAD):
+        return Cause(UNEXPLAINED, 0.5, 1.0, turned)
+    if best.rms > LOOKS_WRONG_M or tilt > np.degrees(LOOKS_WRONG_RAD):
+        r = np.linalg.norm(best.e, axis=1)
+        worst = tuple(case.ids[k] for k in np.argsort(-r)[:3])
+        numbers = {"with_mm": 1e3 * best.rms, "worst_mm": 1e3 * float(r.max()), "tilt_deg": tilt}
+        return Cause(UNEXPLAINED, 0.5, 1.0, numbers, worst)
+    return None
 
 
 def _weight(winner: Explained, models: list[Explained], null: Fit) -> float:

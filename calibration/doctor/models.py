@@ -41,7 +41,9 @@ class Explained:
 
 def explanations(case: Case, null: Fit) -> Iterator[Explained]:
     """Every model of a disturbance that these scans can bear."""
-    for one in (moved(case), tcp(case, null), drift(case, null), loose(case, null), kinematics(case, null)):
+    for one in (
+        moved(case), tcp(case, null), drift(case, null), loose(case, null), kinematics(case, null), scaled(case, null),
+    ):  # fmt: skip
         if one is not None:
             yield one
 
@@ -137,6 +139,17 @@ def _tcp_starts(case: Case, null: Fit) -> Iterator[Fit]:
         0,
         n,
     )
+
+
+def scaled(case: Case, null: Fit) -> Explained:
+    """The scanner's scale free of what is usual: least squares along the undisturbed fit, then twice by the fit itself."""
+    b, c = case.b - case.b.mean(axis=0), (case.c - case.c.mean(axis=0)) @ null.R[0].T
+    ratio = float((b * c).sum() / max(float((c * c).sum()), 1e-12))
+    for _ in range(2):
+        ratio *= 1.0 + float(fit(replace(case, c=case.c * ratio)).scanner[0])
+    one = fit(replace(case, c=case.c * ratio))
+    numbers = {"percent": 1e2 * (ratio - 1.0)}
+    return Explained("scanner scale error", one.bic + float(np.log(3.0 * case.n)), one, abs(ratio - 1.0), numbers)
 
 
 def drift(case: Case, null: Fit) -> Explained | None:

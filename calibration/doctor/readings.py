@@ -16,6 +16,7 @@ UNITS = (1e3, 1e-3, 25.4, 1.0 / 25.4, 10.0, 0.1, 100.0, 0.01)
 _WITHIN = 0.5  # of the logarithm of a unit's factor: a TCP or a quaternion's order changes spreads, too
 _REACH_M = (0.02, 9.0)
 FEWEST = 5
+LOOKS_WRONG_M, LOOKS_WRONG_RAD = 3e-3, 0.03  # residuals of no arm and scanner that work
 _LEAST_GAIN = 3.0  # a reading must bring the residuals down by this factor: nothing less is a misreading
 
 
@@ -65,8 +66,14 @@ READINGS: dict[str, tuple[str, Callable[[Case], Case]]] = {
 }  # fmt: skip
 
 
+def looks_wrong(one: Fit) -> bool:
+    """Whether residuals are larger than those of any arm and scanner that works, in the centres or in the normals."""
+    tilted = bool(np.isfinite(one.tilt).any()) and float(np.nanmedian(one.tilt)) > LOOKS_WRONG_RAD
+    return one.rms > LOOKS_WRONG_M or tilted
+
+
 def best_reading(case: Case, null: Fit) -> Reading | None:
-    """The misreading whose correction lowers the criterion most, if it also lowers the residuals by a clear factor; else None."""
+    """The misreading whose correction lowers the criterion most, if what remains looks like a working cell's; else None."""
     found: list[Reading] = []
     for words, (cause, change) in READINGS.items():
         other = change(case)
@@ -81,6 +88,7 @@ def best_reading(case: Case, null: Fit) -> Reading | None:
             # one scan fewer: compared on the same scans
             if fit(inside).bic - one.bic > 0.0:
                 found.append(Reading("scans and poses shifted by one", words, moved, one))
+    found = [r for r in found if not looks_wrong(r.fit)]
     found.sort(key=lambda r: r.fit.bic / r.case.n)
     best = found[0] if found else None
     if best is None or best.fit.bic / best.case.n >= null.bic / case.n:

@@ -12,7 +12,8 @@ CHECKED = (
     "scanner moved", "TCP set at the controller", "wrong quaternion order", "poses inverted", "wrong rotation convention",
     "scans and poses shifted by one", "robot in another installation", "wrong flange size", "unit mix", "poses too alike",
     "scanner out of focus or range", "warm-up drift", "slack flange or loose mount", "wrong kinematics file",
-    "outlier scans or partial views", "hidden tag", "soft tip worn",
+    "outlier scans or partial views", "hidden tag", "soft tip worn", "scanner axes mirrored",
+    "scans and poses in different orders", "scanner scale error", "too few scans",
 )  # fmt: skip
 
 
@@ -111,6 +112,8 @@ def _misread(c: Cause) -> tuple[str, str]:
         "wrong quaternion order": "Swap the columns, or set 'poses: {rotation: quaternion_xyzw}' (or quaternion_wxyz) in dataset.yaml.",
         "poses inverted": "Set 'poses: {frame: base_in_flange}' in dataset.yaml, or invert the poses.",
         "wrong rotation convention": "Set 'poses: {rotation: ...}' in dataset.yaml to what the robot writes.",
+        "scanner axes mirrored": "Export the clouds in a right-handed frame: x right, y down, z out of the scanner.",
+        "scans and poses in different orders": "Pair each scan with its own pose, by the same name; write numbers as 01, 02.",
         "scans and poses shifted by one": "Pair each scan with its own pose, by the same name.",
     }[c.name]
     return f"It fits if {c.words}: {_fits(c)}.", cure
@@ -225,10 +228,32 @@ def _held(c: Cause) -> tuple[str, str]:
     return c.words, "Do what the sentence says. docs/robot_faults.md lists the faults of robot and devices."
 
 
-def _unexplained(c: Cause) -> tuple[str, str]:
+def _scale(c: Cause) -> tuple[str, str]:
     return (
-        f"The scans disagree by {c.numbers['rms_mm']:.2f} mm (median), {c.numbers['usual_mm']:.1f} mm is usual, and no known cause explains it.",
-        "Look at single scans in the report, check the flange's name and the units in dataset.yaml, and record again with 12 poses or more.",
+        f"The scans are {abs(c.numbers['percent']):.2f} % too {'small' if c.numbers['percent'] > 0 else 'large'}; with that scale the centres "
+        f"fit to {c.numbers['with_mm']:.2f} mm (median).",
+        "Check the scanner's own calibration and the unit of its export; weldcal corrects small errors by itself.",
+    )
+
+
+def _few(c: Cause) -> tuple[str, str]:
+    return (
+        f"{c.numbers['n']:.0f} scans can be used, and the residuals say nothing with fewer than 5.",
+        "Take 8 to 12 poses over the working volume, tilted and turned by 20 degrees or more.",
+    )
+
+
+def _unexplained(c: Cause) -> tuple[str, str]:
+    if "normals_deg" in c.numbers:
+        return (
+            f"The centres agree to {c.numbers['centres_mm']:.2f} mm, but the faces are turned by {c.numbers['normals_deg']:.1f} degrees from "
+            "the poses' z axes (median), and no known misreading of the rotations explains it.",
+            "Compare one stated orientation with the controller's screen: its order, unit (degrees or radians) and frame.",
+        )
+    return (
+        f"After the best of all models the centres still disagree by {c.numbers['with_mm']:.1f} mm and the normals by "
+        f"{c.numbers['tilt_deg']:.1f} degrees (medians), most at {_names(c)} ({c.numbers['worst_mm']:.1f} mm). No known cause explains it.",
+        "Check by hand that each scan belongs to its pose; then record three scans at one pose: they must agree to the scanner's noise.",
     )
 
 
@@ -238,5 +263,6 @@ _WORDS: dict[str, Callable[[Cause], tuple[str, str]]] = {
     "wrong flange size": _flange, "unit mix": _units, "poses too alike": _alike, "scanner out of focus or range": _focus,
     "warm-up drift": _drift, "slack flange or loose mount": _slack, "wrong kinematics file": _kinematics,
     "outlier scans or partial views": _outliers, "hidden tag": _hidden, "soft tip worn": _worn, "the run was held": _held,
-    "unexplained": _unexplained,
+    "scanner axes mirrored": _misread, "scans and poses in different orders": _misread, "scanner scale error": _scale,
+    "too few scans": _few, "unexplained": _unexplained,
 }  # fmt: skip

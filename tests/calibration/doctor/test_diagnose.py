@@ -12,6 +12,7 @@ from weldcal.calibration.doctor.diagnose import diagnose
 from weldcal.calibration.doctor.record import case_text, read_case
 from weldcal.models.errors import InputError
 from weldcal.tools.outcomes.doctor import CHECKED, worded
+from weldcal.tools.studies.doctor.unknown import UNKNOWN
 from weldcal.tools.studies.doctor.world import CAUSES, clean
 
 SEED = 31
@@ -28,6 +29,17 @@ def test_an_injected_cause_is_named_first_with_its_evidence_and_a_next_step(caus
     assert first.next.endswith(".")
 
 
+@pytest.mark.parametrize("fault", list(UNKNOWN)[:5])
+def test_another_mistake_of_a_laboratory_is_named_too(fault: str) -> None:
+    assert worded("a set", diagnose(UNKNOWN[fault](SEED))).causes[0].name == fault
+
+
+def test_rotations_without_meaning_are_unexplained() -> None:
+    first = worded("a set", diagnose(UNKNOWN["rotations without meaning"](SEED))).causes[0]
+    assert first.name == "unexplained"
+    assert "centres agree" in first.evidence
+
+
 @pytest.mark.parametrize("seed", [41, 42])
 def test_a_good_set_has_no_cause(seed: int) -> None:
     assert diagnose(clean(seed)).causes == ()
@@ -37,7 +49,12 @@ def test_scans_that_agree_with_nothing_are_unexplained_and_not_given_a_wrong_nam
     case = clean(SEED)
     rng = np.random.default_rng(1)
     case = replace(case, c=case.c + rng.normal(0.0, 0.02, case.c.shape))
-    assert [cause.name for cause in diagnose(case).causes] == ["unexplained"]
+    (only,) = worded("a set", diagnose(case)).causes
+    assert only.name == "unexplained"
+
+
+def test_too_few_scans_are_said_to_be_too_few() -> None:
+    assert [cause.name for cause in diagnose(clean(SEED).pick(np.arange(3))).causes] == ["too few scans"]
 
 
 def test_a_table_of_observations_is_read_back_as_the_same_case(tmp_path: Path) -> None:
