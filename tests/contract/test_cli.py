@@ -64,6 +64,7 @@ def test_every_command_explains_itself_and_every_option(name: str) -> None:
     only_look = (
         "weldcal view",
         "weldcal replay",
+        "weldcal doctor",
         "weldcal check-robot",
         "weldcal check-cell",
         "weldcal robots",

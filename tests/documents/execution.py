@@ -41,11 +41,11 @@ class Executed:
 
 @dataclass(frozen=True)
 class Check:
-    """How pages are checked: nothing shortened or what is long, without the lines that `skip` names, and without executing twice
+    """How pages are checked: nothing shortened or what is long, without the lines that `omits` names, and without executing twice
     what an earlier page has executed (`done`: how, by its words) and leaves nothing for its own page."""
 
     full: bool = False
-    skip: Callable[[str], bool] = lambda _: False
+    omits: Callable[[str], bool] = lambda _: False
     done: dict[tuple[str, ...], str] = field(default_factory=dict)
 
 
@@ -82,7 +82,7 @@ class Page:
     def _command(self, line: CommandLine, made: tuple[str, ...]) -> str:
         if line.elsewhere or not is_command(line.text):
             return ELSEWHERE
-        if self.check.skip(line.name) or (needs_data(line.name) and not SHARED_DATA.exists()):
+        if self.check.omits(line.name) or (needs_data(line.name) and not SHARED_DATA.exists()):
             return LEFT_OUT
         arguments = line.arguments(full=self.check.full)
         leaves_nothing = not line.makes and not line.server

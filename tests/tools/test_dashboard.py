@@ -105,30 +105,52 @@ job: {calibrate: false, X_BC: {xyz_m: [0.65, 0.0, 0.95], rpy_deg: [180.0, 0.0, -
 
 
 @pytest.fixture
+def page_is_open() -> threading.Event:
+    """Set when the browser shows the page."""
+    return threading.Event()
+
+
+@pytest.fixture
 def run_in_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, page_is_open: threading.Event
 ) -> Callable[[], tuple[str, threading.Thread, list[JobRun]]]:
-    """Starts a run of a second, in real time; the page's address, the thread, and where its outcome comes to lie."""
+    """Starts a run of some seconds, in real time; the page's address, the thread, and where its outcome comes to lie.
+
+    The run waits for `page_is_open`: a busy computer may open the browser later than such a run ends.
+    """
 
     def start() -> tuple[str, threading.Thread, list[JobRun]]:
         addresses: queue.Queue[str] = queue.Queue()
         monkeypatch.setattr("webbrowser.open", addresses.put)
         scenario, found = load_scenario("straight_groove", MOVE_ONLY), []
-        scenario.job.weld = False
+        scenario.job.weld, scenario.job.speed_factor = False, 0.15
         options = RunOptions("straight_groove", tmp_path, browser=True, realtime=True)
-        thread = threading.Thread(target=lambda: found.append(run_job(scenario, options, lambda *_: None)), daemon=True)
-        thread.start()
-        return addresses.get(timeout=60), thread, found
 
+        def wait(*_: object) -> None:
+            if not addresses.empty() or told.is_set():
+                page_is_open.wait(60)
+
+        thread = threading.Thread(target=lambda: found.append(run_job(scenario, options, wait)), daemon=True)
+        thread.start()
+        address = addresses.get(timeout=60)
+        told.set()
+        return address, thread, found
+
+    told = threading.Event()
     return start
 
 
 def test_a_run_is_held_goes_on_when_a_person_says_so_and_is_marked_as_a_replay_when_it_is_over(
-    run_in_thread: Callable[[], tuple[str, threading.Thread, list[JobRun]]], browser: Browser, tmp_path: Path
+    run_in_thread: Callable[[], tuple[str, threading.Thread, list[JobRun]]],
+    browser: Browser,
+    tmp_path: Path,
+    page_is_open: threading.Event,
 ) -> None:
     url, thread, found = run_in_thread()
     browser.resize(*SIZES["desktop"])
-    browser.open(url, wait_for="!document.getElementById('hold').disabled")
+    browser.open(url, timeout_s=60)
+    page_is_open.set()
+    browser.wait("!document.getElementById('hold').disabled", 60)
     click(browser, "hold")
     browser.wait("document.getElementById('state').textContent === 'HELD'")
     assert "by the dashboard" in browser.text().lower()
@@ -138,7 +160,7 @@ def test_a_run_is_held_goes_on_when_a_person_says_so_and_is_marked_as_a_replay_w
     assert browser.run("return document.getElementById('clock').textContent") == held_at, "no time passes"
     assert not browser.run("return document.getElementById('replay').offsetHeight")
     click(browser, "go_on")
-    browser.wait("document.getElementById('state').textContent === 'DONE'")
+    browser.wait("document.getElementById('state').textContent === 'DONE'", 120)
     assert browser.run("return document.getElementById('replay').offsetHeight"), "an arm that moves now is a replay"
     assert browser.run("return document.getElementById('hold').disabled")
 

@@ -59,7 +59,8 @@ def calibrate_dataset(
     out) takes the scans from one id to another, in the order of the dataset. ``refine``: "local" adds a field of what the calibration
     leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
     errors fall. A cloud that cannot be used is refused and
-    reported, as long as enough remain. Without a calibration only observations.csv is written, for `weldcal doctor`.
+    reported, as long as enough remain. Where five scans or more contradict each other only
+    observations.csv is written, for `weldcal doctor`.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.

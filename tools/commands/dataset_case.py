@@ -50,7 +50,7 @@ def write_case(folder: Path, case: Case) -> None:
 def examined_where_refused(
     out: Path, data: Dataset, seen: FlangeObservations, standard: FlangeStandard, seed: int
 ) -> Iterator[None]:
-    """Writes the case to ``out`` where the block refuses the scans, and lets the error go on.
+    """Writes the case to ``out`` where the block refuses five scans or more, and lets the error go on.
 
     Where the dataset's guess of X_BC left too few scans, each scan is searched whole: the guess or the poses may be wrong.
     """
@@ -60,6 +60,6 @@ def examined_where_refused(
         if len(seen.observations) < FEWEST and data.header.scanner_guess is not None:
             anywhere = replace(data, header=replace(data.header, scanner_guess=None))
             seen = see_flanges(anywhere, standard, holes=False, seed=seed)
-        if seen.observations:
+        if len(seen.observations) >= FEWEST:
             write_case(out, dataset_case(data, seen, standard, standard))
         raise

@@ -45,7 +45,12 @@ def _vector(name: str, axes: str, unit: str, frame: str, meaning: str, suffix: s
 
 COLUMNS: tuple[Column, ...] = (
     Column("time_s", "s", "", "servo tick, on the robot's clock"),
-    Column("phase", "", "", "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT"),
+    Column(
+        "phase",
+        "",
+        "",
+        "phase of the servo: TOUCH, TRACK, COAST, FINISH or FAULT; HELD while a person holds the weld, BACK on the way back after that",
+    ),
     Column("torch_on", "", "", "process output, 1 or 0: servo, job, robot, guard and person all agree"),
     Column("s_tip_m", "m", "planned seam", "arc length beside the tip"),
     Column("s_torch_m", "m", "planned seam", "arc length beside the torch; negative before the seam"),
