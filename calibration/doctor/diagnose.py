@@ -46,7 +46,7 @@ LEAST_EFFECT_M = {
     "warm-up drift": 1.5e-4,
     "slack flange or loose mount": 5e-4,
     "wrong kinematics file": 1e-3,
-    "outlier scans or partial views": 1e-3,
+    "outlier scans or partial views": 2e-3,
     "scanner scale error": 8e-3,  # no length: four usual sigmas of a scanner's scale (fit.py)
 }
 """Smaller ones are what arms and scanners are off anyway."""

@@ -12,7 +12,7 @@ from weldcal.calibration.geometry.se3 import log_rotation
 from weldcal.models.arrays import Array
 
 _GROSS = 6.0  # spreads of a scan's distance beyond which it disagrees
-_ODD, _GROSS_M = 1e-3, 1e-3  # false alarms a set, and the least error that matters
+_ODD, _GROSS_M = 1e-3, 2e-3  # false alarms a set, and the least error that matters
 _MOST = 0.34  # of the scans that may be single bad ones
 _LEAST_SEEN = 0.55  # of the edge; less is a partial view
 _REFUSED = 0.2  # of the scans without a flange
