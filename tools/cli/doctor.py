@@ -16,7 +16,7 @@ def doctor(
 ) -> Outcome:
     """Name the causes that disturb a calibration or a weld, likeliest first, each with its evidence and the next step.
 
-    Each cause is a test on the residuals (docs/doctor.md); fewer than 1 % of good results have a cause named.
+    Each cause is a test on the residuals; docs/doctor.md says from which size on it is named.
     """
     from weldcal.tools.commands.doctor import examine
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from weldcal.calibration.doctor.diagnose import Cause, Diagnosis
 from weldcal.welding.record.signs import WORN
 
-FALSE_ALARM = 0.01
-"""Share of sets without a cause in which one is named, at most; `weldcal benchmark doctor` counts it on seeds that fixed nothing."""
 CHECKED = (
     "scanner moved", "TCP set at the controller", "wrong quaternion order", "poses inverted", "wrong rotation convention",
     "scans and poses shifted by one", "robot in another installation", "wrong flange size", "unit mix", "poses too alike",
@@ -49,7 +47,6 @@ class DoctorReport:
             "causes": [c.document() for c in self.causes],
             "spread_mm": self.spread_mm,
             "checked": list(CHECKED),
-            "false_alarm": FALSE_ALARM,
         }
 
     def text(self) -> str:

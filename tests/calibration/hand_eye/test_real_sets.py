@@ -32,10 +32,8 @@ BARS = {
     "visp_franka_eye_in_hand": (0.6432, 5.623),
 }
 MARGIN = 1.02
-FEW, FEW_MARGIN = (
-    16,
-    1.05,
-)  # the best of seven methods, picked afterwards, is lucky by so much with five folds of few poses
+# Two small sets (15 and 8 poses) miss the margin by what docs/hand_eye.md states; a third one, or more on these, is a fault.
+BEHIND = {"ros_industrial_charuco_static_camera": 1.029, "visp_franka_eye_in_hand": 1.045}
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +42,13 @@ def report() -> HandEyeBenchmark:
     return run_hand_eye_benchmark(DATA, quick=True)
 
 
-def test_no_opencv_method_is_ahead_on_any_set(report: HandEyeBenchmark) -> None:
+def test_an_opencv_method_is_ahead_on_two_small_sets_only(report: HandEyeBenchmark) -> None:
     rows = {r.name: r for r in report.rows}
-    for name, (deg, mm) in BARS.items():
-        row = rows[name]
-        margin = MARGIN if row.n > FEW else FEW_MARGIN
-        assert row.deg <= margin * deg, f"{name}: {row.deg} deg against {deg}"
-        assert row.mm <= margin * mm, f"{name}: {row.mm} mm against {mm}"
+    ratios = {name: max(rows[name].deg / deg, rows[name].mm / mm) for name, (deg, mm) in BARS.items()}
+    behind = {name: ratio for name, ratio in ratios.items() if ratio > MARGIN}
+    assert set(behind) == set(BEHIND), ratios
+    for name, ratio in behind.items():
+        assert ratio <= BEHIND[name], f"{name}: {ratio}"
 
 
 def test_opencv_reaches_the_published_bar_on_the_same_folds() -> None:
