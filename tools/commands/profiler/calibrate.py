@@ -41,6 +41,7 @@ from weldcal.models.arms.kinematics import load_arm
 from weldcal.models.errors import InputError, WeldcalError
 from weldcal.tools.commands.profiler.files import ProfilerFile
 from weldcal.tools.commands.profiler.noise import Sigmas, edge_by_noise
+from weldcal.tools.outcomes.profiler_file import middle_error_mm
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
 
@@ -71,7 +72,7 @@ def calibrate_edge(
     if side not in ("left", "right"):
         raise InputError(f"The side is left or right, not '{side}'.")
     poses = cast(FlangePoses, file.poses())
-    points, lost = _edge_points(file, feature, side)
+    points, lost = edge_points(file, feature, side)
     keep = np.asarray(np.isfinite(points).all(axis=1), bool)
     _check_number(poses, points.shape, "profile points [x, z]", (2,))
     poses, points = poses[keep], points[keep]
@@ -107,7 +108,7 @@ def calibrate_edge(
     return ProfilerRecord.of("edge, joint", e, found, file.digest), found
 
 
-def _edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
+def edge_points(file: ProfilerFile, feature: str, side: str) -> tuple[Floats, list[int]]:
     """Points (n, 2) m, not finite where a profile shows no edge, and the numbers of those."""
     if not feature:
         return file.needed(
@@ -350,14 +351,15 @@ def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, A
     poses = record.flange(cast(FlangePoses, file.poses()), file.arrays.get("q"))
     _check_number(poses, (len(file.profiles),), "profiles")
     columns = ["scan", *(f"{n}_{a}_mm" for n in ("edge_1", "root", "edge_2") for a in "xyz"), "rms_mm"]
-    rows, lost, rms = [], [], []
+    rows, lost, rms, seen = [], [], [], []
     for k, p in enumerate(file.profiles):
         try:
             f = groove_features(p)
         except FeatureNotFound:
             lost.append(k)
             continue
-        at = record.points_F(f.points) @ poses.rotation[k].T + poses.translation[k]
+        seen.append(record.points_F(f.points))
+        at = seen[-1] @ poses.rotation[k].T + poses.translation[k]
         rows.append([k, *(f"{1e3 * v:.4f}" for v in at.ravel()), f"{1e3 * f.rms_m:.4f}"])
         rms.append(f.rms_m)
     if not rms:
@@ -370,6 +372,7 @@ def map_seam(file: ProfilerFile, calibration: Path, folder: Path) -> dict[str, A
         "found": len(rms),
         "without_groove": lost,
         "rms_mm": 1e3 * float(np.median(rms)),
+        "error_95_mm": middle_error_mm(record, np.vstack(seen)),
         "method": record.method,
     }
 
