@@ -149,9 +149,30 @@ def _short(value: object) -> str:
     return ""
 
 
+def emit_text(text: str) -> None:
+    """Writes a text on stdout; lines that are wider than the terminal are wrapped between words, below their second column."""
+    wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
+    for line in text.splitlines():
+        column = re.match(r"\S.{0,14}?\s{2,}", line)
+        inner = " " * (0 if column is None else column.end())
+        lines = [line] if len(line) <= wide or any(word in line for word in WHOLE) else textwrap.wrap(
+            line, wide, subsequent_indent=inner, break_long_words=False, break_on_hyphens=False
+        )  # fmt: skip
+        typer.echo("\n".join(lines))
+
+
+def _sentence(text: str) -> str:
+    """A sentence for stderr: one line, which a terminal gets wrapped between words."""
+    line = f"weldcal: {text}"
+    if not sys.stderr.isatty():
+        return line
+    wide = min(max(shutil.get_terminal_size((100, 24)).columns, NARROW), WIDE)
+    return textwrap.fill(line, wide, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+
+
 def emit_warning(text: str) -> None:
     """Writes one sentence on stderr; the command continues."""
-    typer.secho(f"weldcal: {text}", err=True, fg=typer.colors.YELLOW)
+    typer.secho(_sentence(text), err=True, fg=typer.colors.YELLOW)
 
 
 def emit_address(name: str, url: str) -> None:
@@ -189,7 +210,7 @@ def boundary(*, json_wanted: bool, debug: bool) -> Iterator[None]:
         return
     if json_wanted:
         emit_json({"state": "failed", "reason": sentence, **details})
-    typer.secho(f"weldcal: {sentence}", err=True, fg=typer.colors.RED)
+    typer.secho(_sentence(sentence), err=True, fg=typer.colors.RED)
     raise typer.Exit(1)
 
 

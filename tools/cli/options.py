@@ -270,11 +270,12 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     summary = outcome.summary
     state = str(summary.get("state", "done"))
     if call.json:
-        console.emit_json(summary)
+        first = outcome.first
+        console.emit_json(summary if first is None else {**summary, "first_screen": first.document()})
     elif callable(outcome.text):
         outcome.text()
     elif outcome.text is not None:
-        typer.echo(outcome.text)
+        console.emit_text(outcome.text)
     else:
         rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
         if outcome.first is None:

@@ -85,7 +85,10 @@ class DemoResult:
             more["pose"] = (
                 "none was computed: X_BC is the scenario's" if not scenario.job.calibrate else "none was found"
             )
-            return FirstScreen(found, self._torch(), self._next(), (), more, self._lead())
+            none = Expected("error at the work point, 95 %", "not known", "there is no calibration")
+            return FirstScreen(
+                found, none if scenario.job.calibrate else self._torch(), self._next(), (), more, self._lead()
+            )
         work = work_point_error(estimate, work_point(scenario))
         expected, _ = work_point_expected(work)
         for v in status.verifications:

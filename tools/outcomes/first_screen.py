@@ -183,7 +183,7 @@ class FirstScreen:
         if len(every) <= MOST_CONCERNS:
             return tuple(every)
         kept = every[: MOST_CONCERNS - 1]
-        return (*kept, f"{len(every) - len(kept)} more are listed below in the report.")
+        return (*kept, f"{len(every) - len(kept)} more are listed in the report.")
 
     @property
     def nothing(self) -> str:
@@ -209,6 +209,8 @@ class FirstScreen:
         return {
             "verdict": self.verdict,
             "reason": self.reason,
+            "error": f"{self.expected.what}: {self.expected.figure}",
+            "backing": self.expected.backing,
             "tolerance": None if tolerance is None else vars(tolerance),
             "unseen": self.found.unseen,
             "could_be_wrong": list(self.concerns),
@@ -276,7 +278,8 @@ def refused_note(refused: Sequence[tuple[str, str]], n: int, what: str = "scans"
     if not refused:
         return ()
     names = ", ".join(name for name, _ in refused[:4]) + (" ..." if len(refused) > 4 else "")
-    return (f"{len(refused)} of {n} {what} were not used ({names}); the reasons are listed below.",)
+    was = "was not used ({}); the reason is" if len(refused) == 1 else "were not used ({}); the reasons are"
+    return (f"{len(refused)} of {n} {what} {was.format(names)} listed in the report.",)
 
 
 def _upper(text: str) -> str:

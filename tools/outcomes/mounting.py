@@ -17,6 +17,7 @@ from weldcal.tools.outcomes.first_screen import (
     FirstScreen,
     Next,
     Tolerance,
+    expected_error,
     point_covariance,
     refused_note,
 )
@@ -89,11 +90,10 @@ class MountingReport:
         p = np.asarray(X @ work_point(self.job.scene))
         own = 1e3 * radius_95(point_covariance(X, result.covariance["X"], p))
         _, p95, n = held_out_error(result)
-        backing = (
-            f"{n} poses, each unseen by its calibration: 95 % within {p95:.3f} mm" if n else "no unseen pose backs it"
-        )
+        expected, _ = expected_error(what, own, p95, n, "poses")
         if aside:
-            backing += f"; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
+            more = f"{expected.backing}; {len(aside)} held out by the job: at most {max(aside):.3f} mm"
+            expected = Expected(what, expected.figure, more)
         tolerance = Tolerance(
             "the expected error, one sigma,", 1e3 * status.sigma_work_m, scenario.calibration.required_error_mm,
             "calibration.required_error_mm",
@@ -107,7 +107,7 @@ class MountingReport:
             after = Next("Use the pose; calibrate again after any knock.")
         return FirstScreen(
             found,
-            Expected(what, f"{own:.3f} mm", f"of the calibration itself; {backing}"),
+            expected,
             after,
             shown_poses(result, self.mounting),
         )

@@ -9,7 +9,7 @@ matplotlib.use("Agg")
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import FuncFormatter
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
@@ -95,12 +95,13 @@ def error_field(X_BC: RigidTransform, observations: Sequence[Observation]) -> by
 def millimetres(axes: Axes) -> None:
     """Ticks of a logarithmic axis as a person writes lengths: 0.04, not 4 times ten to the minus two."""
     axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}" if _decades(axes) < 1.5 else NullFormatter())
-
-
-def _decades(axes: Axes) -> float:
     low, high = axes.get_ylim()
-    return float(np.log10(high / low))
+    digits = "123456789" if high < 2.5 * low else "235" if high < 30.0 * low else ""
+
+    def label(x: float, _: int | None) -> str:
+        return f"{x:g}" if f"{x:e}"[0] in digits else ""
+
+    axes.yaxis.set_minor_formatter(FuncFormatter(label))
 
 
 def plain(axes: Axes, x: str, y: str) -> None:
