@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from weldcal.calibration.data.results import CalibrationResult, matrix4
+from weldcal.calibration.data.results import CalibrationResult, correction_note, matrix4
 from weldcal.calibration.data.scanner_correction import ScannerCorrection
 from weldcal.calibration.eye_on_base.nested import bootstrap_interval, mean_interval
 from weldcal.calibration.eye_on_base.self_calibration import SelfCalibration
@@ -116,7 +116,7 @@ class CalibrationReport:
         tolerance = None
         if self.limit_mm is not None:
             tolerance = Tolerance("the error at the work point, 95 %,", figure, self.limit_mm, "--limit-mm")
-        notes = [*refused_note(self.refused, len(r.poses)), *said]
+        notes = [*filter(None, (correction_note(r),)), *refused_note(self.refused, len(r.poses)), *self._refined]
         found = Findings(tolerance=tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         return FirstScreen(found, expected, self._next(tolerance, concerns), (scanner_pose(r),))
 
@@ -124,8 +124,12 @@ class CalibrationReport:
     def _remarks(self) -> list[str]:
         """Those of the warnings that tell what was done, not what could be wrong."""
         applied = self.scanner is not None and self.scanner.accepted is not None
-        said = [self.scanner.sentence] if applied and self.scanner is not None else []
-        return said + ([] if self.refinement is None else [str(self.refinement["sentence"])])
+        return [*([self.scanner.sentence] if applied and self.scanner is not None else []), *self._refined]
+
+    @property
+    def _refined(self) -> list[str]:
+        """What --refine found and applied."""
+        return [] if self.refinement is None else [str(self.refinement["sentence"])]
 
     def _next(self, tolerance: Tolerance | None, concerns: Sequence[str]) -> Next:
         missed = tolerance is not None and not tolerance.met
@@ -285,7 +289,13 @@ class VerifyReport:
         tolerance = None
         if v.limit_mm is not None and len(new):
             tolerance = Tolerance("the median error of the new scans", float(np.median(new)), v.limit_mm, self.source)
-        found = Findings(tolerance=tolerance, unseen=len(new), concerns=self.warnings, settled=settled)
+        found = Findings(
+            tolerance=tolerance,
+            unseen=len(new),
+            concerns=self.warnings,
+            notes=tuple(filter(None, (correction_note(r),))),
+            settled=settled,
+        )
         if len(new):
             what = f"{len(new)} new scan{'' if len(new) == 1 else 's'}, which the calibration did not use"
             expected = Expected(

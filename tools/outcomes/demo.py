@@ -101,7 +101,13 @@ class DemoResult:
         )  # fmt: skip
         # what is not observable and matters to X_BC is among the warnings
         concerns = (*self.warnings, *estimate.warnings)
-        notes = refused_note(status.refused, self.n_scans)
+        notes = [*refused_note(status.refused, self.n_scans)]
+        if estimate.scanner is not None:
+            # as calibration.yaml says to programs that use X_BC
+            notes.insert(
+                0,
+                f"X_BC applies to corrected scanner points: multiply every point, in metres, by {estimate.scanner.formula}.",
+            )
         found = Findings(against, tolerance, unseen=work.unseen_poses, concerns=concerns, notes=notes)
         pose = ShownPose("X_BC", SCANNER["X_BC"], estimate.X_BC)
         return FirstScreen(found, expected, self._next(), (pose,), more, self._lead())

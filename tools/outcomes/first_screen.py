@@ -240,9 +240,12 @@ def expected_error(
     """
     own = None if own_mm is None or not np.isfinite(own_mm) else own_mm
     held = None if held_95_mm is None or not np.isfinite(held_95_mm) else held_95_mm
-    itself = f"of the calibration itself{f' at {place}' if place else ''}"
-    one = f"1 {of.removesuffix('s')}, unseen by its calibration,"
-    backed = f"{one if n == 1 else f'95 % of {n} {of}, each unseen by its calibration,'} within"
+    itself = f"of the calibration itself{f', at {place}' if place else ''}"
+    seen = (
+        f"of 1 {of.removesuffix('s')}, unseen by its calibration"
+        if n == 1
+        else f"within which 95 % of {n} {of} were, each unseen by its calibration"
+    )
     if own is None and held is None:
         return Expected(
             what, "not known", f"the method states no uncertainty, and none of the {of} was left out"
@@ -252,10 +255,10 @@ def expected_error(
             own or 0.0
         )
     if own is None:
-        return Expected(what, f"{held:.3f} mm", f"{backed} that; the method states no uncertainty of its own"), held
+        return Expected(what, f"{held:.3f} mm", f"{seen}; the method states no uncertainty of its own"), held
     larger = max(own, held)
     return Expected(
-        what, f"{larger:.3f} mm", f"the larger of two: {itself} {own:.3f} mm; {backed} {held:.3f} mm"
+        what, f"{larger:.3f} mm", f"the larger of two: {own:.3f} mm {itself}, and {held:.3f} mm {seen}"
     ), larger
 
 
