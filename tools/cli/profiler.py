@@ -154,9 +154,8 @@ def seam(
     limit_mm: LimitOption = None,
 ) -> Outcome:
     """Map both edges and the root of a V-groove from raw profiles into the base frame, as seam.csv."""
-    from weldcal.tools.commands.profiler.calibrate import map_seam
     from weldcal.tools.commands.profiler.files import read_profiler_file
-    from weldcal.tools.commands.profiler.results import finish_seam
+    from weldcal.tools.commands.profiler.seam import finish_seam, map_seam
     from weldcal.tools.outcomes.first_screen import check_limit
 
     check_limit(limit_mm)

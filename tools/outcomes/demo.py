@@ -92,7 +92,7 @@ class DemoResult:
         work = work_point_error(estimate, work_point(scenario))
         expected, _ = work_point_expected(work)
         for v in status.verifications:
-            limit = f"limit {c.verification_limit_mm:g}, calibration.verification_limit_mm"
+            limit = f"limit {c.verification_limit_mm:g} mm, calibration.verification_limit_mm"
             backing = f"{expected.backing}; at '{v.label}', held out by the job: {1e3 * v.error_m:.3f} mm ({limit})"
             expected = Expected(expected.what, expected.figure, backing)
         tolerance = Tolerance(

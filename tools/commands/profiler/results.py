@@ -9,14 +9,14 @@ import numpy as np
 
 from weldcal.calibration.profiler.edge.joint import edge_joint
 from weldcal.calibration.profiler.motion import FlangePoses, Floats
-from weldcal.calibration.profiler.record import ProfilerRecord, load_record
+from weldcal.calibration.profiler.record import ProfilerRecord
 from weldcal.calibration.profiler.sphere.joint import Model, leave_one_out_m
 from weldcal.calibration.profiler.sphere.model import SphereData, SphereSigmas
 from weldcal.models.errors import WeldcalError
 from weldcal.tools.commands.profiler import files
 from weldcal.tools.commands.profiler.calibrate import edge_points, write_calibration
-from weldcal.tools.outcomes.profiler_file import ProfilerFile, ProfilerSeam
-from weldcal.tools.report.profiler_file import profiler_report, seam_report
+from weldcal.tools.outcomes.profiler_file import ProfilerFile
+from weldcal.tools.report.profiler_file import profiler_report
 from weldcal.tools.report.render import write_atomic
 
 FOLDS = 5
@@ -53,17 +53,6 @@ def finish_sphere(
         used[[k for k in found.get("wrong_scans", ()) if k < len(held)]] = False
         held = held[used]
     return _finish(record, found, np.vstack(data.profiles), held, source, out, limit_mm)
-
-
-def finish_seam(
-    found: dict[str, Any], calibration: Path, source: str, out: Path, limit_mm: float | None
-) -> ProfilerSeam:
-    """Write the report of a mapped seam, from the seam.csv beside it."""
-    columns = np.genfromtxt(out / "seam.csv", delimiter=",", names=True)
-    root = np.column_stack([np.atleast_1d(columns[f"root_{a}_mm"]) for a in "xyz"])
-    seam = ProfilerSeam(load_record(calibration), found, root, source, calibration, out, limit_mm)
-    write_atomic(out / "report.html", seam_report(seam))
-    return seam
 
 
 def edge_held_out(poses: FlangePoses, points: Floats, sigmas_mm: Mapping[str, float]) -> Floats:
