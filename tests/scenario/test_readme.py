@@ -56,9 +56,9 @@ def test_the_demo_ends_done_and_leaves_the_files_that_the_readme_names(finished_
 
 def test_the_terminal_tells_the_weld_by_millimetres_of_seam(finished_demo: ShortJob) -> None:
     told = [int(mm) for mm in re.findall(r"weld, (\d+) of 30 mm", finished_demo.output)]
-    assert told[0] == 0
+    assert len(told) >= 3
     assert told == sorted(set(told))
-    assert 20 <= told[-1] <= 30
+    assert told[0] < 20 <= told[-1] <= 30
 
 
 @pytest.mark.parametrize("name", ["report.html", "recording.html"])
