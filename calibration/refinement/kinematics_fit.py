@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from weldcal.calibration.data.scanner_correction import TERMS, ScannerCorrection
 from weldcal.calibration.eye_on_base.scanner_fit import CIRCLE_OWN, CorrectionEstimate, correction_of
 from weldcal.calibration.flange.observation import Observation
-from weldcal.calibration.geometry.se3 import exp_rotation, inverse, skew
+from weldcal.calibration.geometry.se3 import exp_rotation, inverse, pose, skew
 from weldcal.calibration.hand_eye.joints import flange_poses
 from weldcal.models.arms.chain import Chain
 from weldcal.models.arrays import Array
@@ -116,6 +116,13 @@ class KinematicsFit:
             return self.sigma_considered * self.errors.scale
         k = len(self.u)
         return np.asarray(np.sqrt(np.diag(self.covariance)[-k:]) * self.errors.scale)
+
+    def corrected_stack(self) -> Array:
+        """The arm's link transforms (n, 4, 4) with the errors found: m, rad."""
+        errors = self.errors.errors(self.u)
+        return np.array(
+            [X @ pose(exp_rotation(e[:3]), e[3:]) for X, e in zip(self.errors.arm.stack, errors, strict=True)]
+        )
 
     def applied(self, observations: Sequence[Observation], q: Array) -> list[Observation]:
         """Observations with corrected centres and normals and with the poses that the corrected arm reaches."""

@@ -335,7 +335,13 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
     },
     PicturePoses: {"body_poses": list, "frame_poses": FramePoseVector},
     KnockedStand: {"frame_poses": FramePoseVector},
-    ArucoDeformationEstimator: {"image": Image, "history": PoseHistory, "deformation": Deformation, "deflection": 5},
+    ArucoDeformationEstimator: {
+        "image": Image,
+        "history": PoseHistory,
+        "calibration_status": CalibrationStatus,
+        "deformation": Deformation,
+        "deflection": 5,
+    },
     WeldingVelocityServo: {
         "planned_seam": PlannedSeam,
         "deformation": Deformation,
@@ -344,6 +350,7 @@ KINDS: dict[type[LeafSystem], dict[str, int | type]] = {
         "job": JobCommand,
         "arc_established": 1,
         "hold": 1,
+        "calibration_status": CalibrationStatus,
         "V_BT": 6,
         "servo_report": ServoReport,
         "telemetry": len(TELEMETRY),

@@ -21,12 +21,13 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.refined import KINEMATICS_FILE, REFINEMENTS, Plain, Refined
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
-from weldcal.tools.commands.refine import KINEMATICS_FILE, REFINEMENTS, Refinable, Refined, refine_calibration
+from weldcal.tools.commands.refine import Refinable, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.report.calibration import calibration_report
@@ -101,15 +102,17 @@ def calibrate_dataset(
             refine,
             Refinable(
                 data,
-                observations,
-                seen.patterns,
-                estimate,
-                tuple(corrected),
-                scanner,
+                Plain(
+                    observations,
+                    tuple(corrected),
+                    seen.patterns,
+                    estimate,
+                    None if scanner is None else scanner.accepted,
+                    correct_scanner and not few,
+                ),
                 robot or data.header.robot,
                 kinematics,
             ),
-            correct_scanner=correct_scanner and not few,
             seed=seed,
         )
         estimate, corrected = refined.estimate, list(refined.observations)
