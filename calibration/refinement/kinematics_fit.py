@@ -239,11 +239,18 @@ def _field(data: _Data) -> tuple[float, float, float, float]:
     return float(x.min()) - _FACE_M, float(x.max()) + _FACE_M, float(y.min()) - _FACE_M, float(y.max()) + _FACE_M
 
 
+def usual_scanner(terms: int, corrected: bool) -> Array:
+    """Standard deviations (K,) of a scanner's factors before it is asked; next to nothing where none is estimated."""
+    if not corrected:
+        return np.full(terms, 1e-9)
+    return np.concatenate([_USUAL_SCANNER, np.full(max(terms - 3, 0), _BEND_PRIOR)])[:terms]
+
+
 def _scanner_prior(terms: int, holes: CorrectionEstimate | None, fixed: bool, start: Array) -> tuple[Array, Array]:
     """Mean (K,) and information (K, K) of the factors' change before the robot is asked."""
-    sigma = np.concatenate([_USUAL_SCANNER, np.full(max(terms - 3, 0), _BEND_PRIOR)])[:terms]
+    sigma = usual_scanner(terms, not fixed)
     if fixed:
-        return start, np.diag(np.full(terms, 1e18))
+        return start, np.diag(1.0 / sigma**2)
     information, pull = np.diag(1.0 / sigma**2), np.zeros(terms)
     if holes is not None:
         seen = np.linalg.inv(holes.covariance[:3, :3] + np.diag(CIRCLE_OWN**2))

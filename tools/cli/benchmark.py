@@ -107,6 +107,17 @@ def hand_eye_cells(
     return Outcome(summary, text=table)
 
 
+@command("benchmark touch", options=FARM)
+def touch(
+    call: Call,
+    runs: Annotated[int, option("--runs", "N", "Number of light worlds, of six touches each.", min=1)] = 500,
+) -> Outcome:
+    """Measure how often points touched by the robot lie in the 95 % region that their calibration states."""
+    from weldcal.tools.studies.touch.coverage import run_touch_study
+
+    return Outcome(run_touch_study(call.farm(call.folder("benchmark", "touch")), runs, call.seed))
+
+
 @command("benchmark mountings", options=FARM)
 def mountings(
     call: Call,
@@ -303,6 +314,7 @@ COMMANDS = (
     part_registration,
     hand_eye,
     hand_eye_cells,
+    touch,
     mountings,
     profiler,
     cell,

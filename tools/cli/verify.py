@@ -12,7 +12,17 @@ from weldcal.tools.cli.options import Call, CorrectionOption, FlangeOption, Outc
 def verify(
     call: Call,
     result: Annotated[Path, typer.Argument(help="A result folder, or its calibration.yaml.")],
-    dataset: Annotated[Path, typer.Argument(help="A folder with poses and clouds, or pairs.csv (docs/datasets.md).")],
+    dataset: Annotated[
+        Path | None, typer.Argument(help="A folder with poses and clouds, or pairs.csv (docs/datasets.md).")
+    ] = None,
+    touch: Annotated[
+        Path | None,
+        option(
+            "--touch",
+            "CSV",
+            "Points that the robot's tip touched and the scanner measured (docs/datasets.md), in place of scans.",
+        ),
+    ] = None,
     flange: FlangeOption = None,
     scanner_correction: CorrectionOption = True,
     limit_mm: Annotated[
@@ -27,8 +37,13 @@ def verify(
 ) -> Outcome:
     """Verify a calibration on scans that it did not use: a verdict, position error and tilt per pose, at the flange.
 
-    The exit code is 1 where the verdict is "do not use".
+    With --touch: by points that the tip touched, each against the stated 95 % region. The exit code is 1 where the verdict is "do not use".
     """
+    if (dataset is None) == (touch is None):
+        raise typer.BadParameter("give either a folder of new scans, or touched points with --touch FILE")
+    if touch is not None or dataset is None:
+        assert touch is not None
+        return _by_touch(call, result, touch)
     from weldcal.tools.commands.verify import verify_dataset
     from weldcal.tools.outcomes.calibration import DO_NOT
     from weldcal.tools.outcomes.poses import pose_rows
@@ -48,5 +63,18 @@ def verify(
         summary,
         values={"verdict": verdict.verdict, "because": verdict.reason, **summary},
         rows=report.interval_rows | pose_rows(report.result.X_BC),
+        problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
+    )
+
+
+def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
+    from weldcal.tools.commands.touch import verify_touches
+    from weldcal.tools.outcomes.calibration import DO_NOT
+
+    report = verify_touches(result, touches, call.folder("verify", touches.resolve().stem))
+    verdict = report.verdict
+    return Outcome(
+        report.summary(),
+        rows=report.rows,
         problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
@@ -21,7 +21,10 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.joint_angles import joint_angles
 from weldcal.calibration.refinement.refined import KINEMATICS_FILE, REFINEMENTS, Plain, Refined
+from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
@@ -176,7 +179,12 @@ def calibrate_dataset(
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
-        orientations=orientations_of(inliers) if not data.pairs or all(p.has_orientation for p in data.pairs) else None,
+        orientations=orientations_of(inliers, None if data.pairs else data.X_FR)
+        if not data.pairs or all(p.has_orientation for p in data.pairs)
+        else None,
+        observed=observed_document(inliers, RigidTransform() if data.pairs else data.X_FR, _angles(data, inliers))
+        if not data.pairs or all(p.has_orientation for p in data.pairs)
+        else None,
         arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
@@ -213,6 +221,15 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
+    """Joint angles (n, joints) rad of the poses; none where the table has none."""
+    for joints in (7, 6):
+        q = joint_angles(data, [o.id for o in inliers], joints)
+        if q is not None:
+            return list(q)
+    return []
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:

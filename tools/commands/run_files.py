@@ -12,7 +12,9 @@ from weldcal.calibration.data.results import CalibrationResult, PoseRecord, expo
 from weldcal.calibration.doctor.case import Case
 from weldcal.calibration.doctor.record import case_of
 from weldcal.calibration.eye_on_base.solve import CalibrationEstimate
+from weldcal.calibration.eye_on_base.stated_error import orientations_of
 from weldcal.calibration.refinement.refined import KINEMATICS_FILE
+from weldcal.calibration.touch.arm_prior import observed_document
 from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import feature_standard
@@ -36,6 +38,7 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
     estimate, refinement = status.estimate, status.refinement
     if estimate is None:
         return None
+    inliers = [o for o, keep in zip(status.observations, estimate.inliers, strict=True) if keep]
     scanner = cell.scenario.scanner_config()
     records = [_record(observation.id, estimate, k) for k, observation in enumerate(status.observations)]
     records += [PoseRecord(id=label, used=False, reason=reason) for label, reason in status.refused]
@@ -55,6 +58,10 @@ def live_result(cell: Cell[WeldJob], status: CalibrationStatus, seed: int) -> Ca
         seed=seed,
         scanner_correction=None if estimate.scanner is None else estimate.scanner.document(),
         joint_covariance=estimate.joint,
+        orientations=orientations_of(inliers, cell.job.X_FR),
+        observed=observed_document(
+            inliers, cell.job.X_FR, [q for q, keep in zip(status.joints, estimate.inliers, strict=False) if keep]
+        ),
         local_field=None if refinement is None or refinement.local_field is None else refinement.local_field.document(),
         arm_errors=None if refinement is None else refinement.arm_errors,
         kinematics_file=KINEMATICS_FILE if refinement is not None and refinement.kinematics else "",
