@@ -11,14 +11,14 @@ _STEPS = 20
 _TUKEY = 4.685
 
 
-def around(points_C: Array, p_C: Array, within_m: float, name: str) -> Array:
-    """Points (n, 3) m of a cloud at most ``within_m`` from a place (3,) m. Raises InputError for fewer than thirty."""
+def around(points_C: Array, p_C: Array, within_m: float, name: str, least: int = LEAST_POINTS) -> Array:
+    """Points (n, 3) m of a cloud at most ``within_m`` from a place (3,) m. Raises InputError for fewer than ``least``."""
     p = np.asarray(points_C, dtype=float).reshape(-1, 3)
     near: Array = p[np.linalg.norm(np.nan_to_num(p, nan=np.inf) - p_C, axis=1) <= within_m]
-    if len(near) < LEAST_POINTS:
+    if len(near) < least:
         raise InputError(
             f"Touch '{name}': the cloud has {len(near)} points within {1e3 * within_m:.0f} mm of camera_x, camera_y, camera_z, and "
-            f"{LEAST_POINTS} are needed. Correct the place, or raise `within`."
+            f"{least} are needed. Correct the place, or raise `within`."
         )
     return np.asarray(near)
 

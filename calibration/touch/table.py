@@ -1,6 +1,7 @@
 """Reads touches.csv: one row for each touch, metres and unit quaternions, with a feature's numbers or the cloud that shows it."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +53,25 @@ def read_touches(path: Path, correction: ScannerCorrection | None = None) -> tup
     check_reach(np.array([t.p_C for t in touches]), path, "m", "scanner")
     require_touches(touches)
     return touches
+
+
+def touches_text(touches: Sequence[Touch]) -> str:
+    """The table of touches, which read_touches reads."""
+    joints = max((len(t.q) for t in touches if t.q is not None), default=0)
+    names = [*REQUIRED, *DIRECTION, "feature_radius", "sigma_tip", "sigma_radius", "sigma_scan"]
+    names += [f"q{i + 1}" for i in range(joints)]
+    lines = [",".join(names)]
+    for t in touches:
+        numbers = [*t.X_BF.translation(), *t.X_BF.rotation().ToQuaternion().wxyz(), *t.p_FT, t.radius, *t.p_C]
+        direction = ["", "", ""] if t.direction_C is None else [repr(float(v)) for v in t.direction_C]
+        own = [t.feature_radius, t.sigma_tip, t.sigma_radius, t.sigma_scan]
+        q = [""] * joints if t.q is None else [repr(float(v)) for v in t.q]
+        lines.append(
+            ",".join(
+                [t.id, t.feature, *(repr(float(v)) for v in numbers), *direction, *(repr(float(v)) for v in own), *q]
+            )
+        )
+    return "\n".join(lines) + "\n"
 
 
 def _touch(row: dict[str, str], path: Path, correction: ScannerCorrection | None) -> Touch:

@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 
 from weldcal.calibration.touch.judge import judge_touches
+from weldcal.systems.runner import no_progress
+from weldcal.tools.commands.demo import run_calibration_live
+from weldcal.tools.commands.touch_live import run_touches, touching
 from weldcal.tools.farm.run import Farm
 from weldcal.tools.farm.work import FAILED
+from weldcal.tools.outcomes.options import RunOptions
 from weldcal.tools.report.files import write_json
 from weldcal.tools.studies.touch.world import touch_world
 
@@ -38,6 +42,48 @@ def run_touch_study(farm: Farm, runs: int, seed: int = 0) -> dict[str, object]:
     rows: list[Any] = [row for r in results.values() if r.get("state") != FAILED for row in r["rows"]]
     summary = _summary(rows, runs)
     write_json(Path(farm.folder) / "touch.json", summary)
+    return summary
+
+
+def touch_cell(scenario: str, seed: int, points: int, folder: str) -> Mapping[str, object]:
+    """Calibrate a whole simulated cell, let its soft tip touch the part, and judge: the JSON object of `verify --scenario`."""
+    calibrated = run_calibration_live(
+        RunOptions(scenario=scenario, out=Path(folder) / f"cell{seed}", seed=seed, browser=False, recording=False)
+    )
+    options = RunOptions(
+        scenario=scenario, out=Path(folder) / f"touch{seed}", seed=seed, browser=False, recording=False
+    )
+    found = run_touches(touching(scenario, calibrated.folder, points), options, no_progress).summary()
+    return {k: found.get(k) for k in ("state", "reason", "n_touches", "inside", "error_mm", "relative_mm", "touches")}
+
+
+def run_touch_cells(farm: Farm, scenario: str, runs: int, points: int, seed: int = 0) -> dict[str, object]:
+    """``runs`` whole cells from ``seed`` on, ``points`` touches each; cells.json in the folder."""
+    folder = str(Path(farm.folder).absolute())
+    tasks = {
+        f"{scenario} {k}": {"scenario": scenario, "seed": k, "points": points, "folder": folder}
+        for k in range(seed, seed + runs)
+    }
+    done = [r for r in farm.run(touch_cell, tasks).values() if r.get("state") == "done"]
+    touches = [t for r in done for t in r["touches"]]
+    error = np.array([abs(t["error_mm"]) for t in touches])
+    summary: dict[str, object] = {
+        "state": "done",
+        "cells": len(done),
+        "failed": runs - len(done),
+        "touches": len(touches),
+    }
+    if touches:
+        summary |= {
+            "inside_percent": 100.0 * float(np.mean([t["inside"] for t in touches])),
+            "error_mm": {
+                "median": float(np.median(error)),
+                "p95": float(np.percentile(error, 95)),
+                "max": float(error.max()),
+            },
+            "limit_mm": {"median": float(np.median([t["limit_mm"] for t in touches]))},
+        }
+    write_json(Path(farm.folder) / "cells.json", summary)
     return summary
 
 
