@@ -10,7 +10,6 @@ from pydrake.common.yaml import yaml_load_file
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from weldcal.models.arms.kinematics import ArmModel, known_arms, load_arm
-from weldcal.models.arms.urdf_file import read_urdf_chain
 from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 
@@ -64,6 +63,8 @@ def load_chain(name: str, kinematics: Path | None = None) -> Chain:
     if is_urdf(name):
         if not Path(name).is_file():
             raise InputError(f"There is no file '{name}' of an arm.")
+        from weldcal.models.arms.urdf_file import read_urdf_chain  # Drake's parser takes a third of a second to import
+
         return Chain(Path(name).name, *read_urdf_chain(Path(name)))
     if name in known_arms():
         return chain_of(load_arm(name, kinematics))
