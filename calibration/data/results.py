@@ -60,7 +60,7 @@ class CalibrationResult:
     ``axis_turn_deg`` how far the hole pattern is turned about the flange's axis, and its spread over the scans; ``local_field``: document of
     what --refine local found, ``kinematics_file``: name of the file beside it with what --refine joints or links found,
     ``arm_errors`` the document of it (values, sigmas, covariance with X_BC and the correction). ``orientations``: mean (quaternion wxyz) of
-    the flange's in the base, and how far they lie from it at most (deg)."""
+    the flange's in the base, and how far they lie from it at most (deg). ``observed``: the poses used, for what a touch of the arm states."""
 
     X_BC: RigidTransform
     covariance: Array
@@ -89,6 +89,7 @@ class CalibrationResult:
     kinematics_file: str = ""
     arm_errors: dict[str, Any] | None = None
     orientations: dict[str, Any] | None = None
+    observed: dict[str, Any] | None = None
 
     @property
     def symbol(self) -> str:
@@ -164,6 +165,7 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         **({} if result.local_field is None else {"local_field": result.local_field}),
         **({} if not result.kinematics_file else {"kinematics_file": result.kinematics_file}),
         **({} if result.orientations is None else {"orientations": result.orientations}),
+        **({} if result.observed is None else {"observed": result.observed}),
         **({} if result.arm_errors is None else {"arm_errors": result.arm_errors}),
         "held_out_mm": {k: v if np.isfinite(v) else None for k, v in result.held_out_mm.items()},
         "tilt_deg": result.tilt_deg,
@@ -242,6 +244,7 @@ def load_result(path: Path) -> CalibrationResult:
         kinematics_file=d.text("kinematics_file"),
         arm_errors=d.values.get("arm_errors"),
         orientations=d.values.get("orientations"),
+        observed=d.values.get("observed"),
         clock=clock_from_document(d.values.get("clock"), path.name),
         clock_covariance=_covariance(d, "clock_covariance", len(d.section("clock_covariance").items("matrix")))
         if d.has("clock_covariance")

@@ -68,7 +68,11 @@ def run_scenario(scenario: Scenario, options: RunOptions, progress: Progress = n
 def measure(run: Run[WeldJob], options: RunOptions, robot: str = "simulated") -> DemoResult:
     """Compare the run with the ground truth of its simulation."""
     cell, status = run.cell, run.cell.job.calibration_status(run.root)
-    error = None if status.estimate is None else live_calibration_error(cell, status.estimate)
+    error = (
+        None
+        if status.estimate is None
+        else live_calibration_error(cell, status.estimate, status.arm_or(cell.station.arm))
+    )
     return DemoResult(options, run, status, error, weld_outcome(cell, run.root), robot)
 
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import chi2
 
 from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.geometry.quantiles import chi2_quantile
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 
@@ -64,7 +64,7 @@ def work_point_error(estimate: CalibrationEstimate, p_BQ: Array) -> WorkPoint:
     S = point_error_covariance(estimate, p_BQ)
     mean, square = float(np.trace(S)), float(np.trace(S @ S))
     freedom = mean**2 / square if square > 0.0 else 3.0
-    radius = float(np.sqrt(chi2.ppf(0.95, freedom) * mean / freedom))
+    radius = float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))
     held = estimate.held_out.position_m[estimate.inliers]
     held = 1e3 * held[np.isfinite(held)]
     x, y, z = (float(1e3 * v) for v in p_BQ)
