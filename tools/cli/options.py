@@ -15,6 +15,7 @@ from weldcal.tools import console
 
 if TYPE_CHECKING:
     from weldcal.tools.farm.run import Farm
+    from weldcal.tools.outcomes.first_screen import FirstScreen
 
 
 def option(name: str, metavar: str, help: str, **settings: Any) -> Any:
@@ -50,6 +51,15 @@ _ADDRESS = "Loopback address 127.x.y.z of the emulated controller."
 _PACE = "Emulated controller only: speed relative to real time, 0.05 to 1."
 _SLOWER = "Slow the arm's moves down: 0.05 to 1. The welding speed does not change."
 _RECORD = "Also write recording.mcap, which weldcal replay plays back."
+LimitOption = Annotated[
+    float | None,
+    option(
+        "--limit-mm",
+        "MM",
+        "The error that your job allows, at 95 %: the verdict is measured against it.",
+        show_default="not stated: use with care at best",
+    ),
+]
 _WORKERS = "Processes on this computer."
 _SCHEDULER = "Address of a Dask scheduler; its workers compute, with the same numbers."
 _OUT = "Output folder; default: a new one in weldcal-out."
@@ -92,6 +102,7 @@ class Outcome:
         values: printed as rows instead of the summary; {} for none.
         rows: printed below them.
         text: printed, or called to print, instead of all rows.
+        first: the first screen of its report, printed below the rows with the report's path.
         problem: a sentence for stderr, with exit code 1; None: taken from the summary, "": none.
     """
 
@@ -100,6 +111,7 @@ class Outcome:
     rows: Mapping[str, str] = field(default_factory=dict)
     text: str | Callable[[], object] | None = None
     problem: str | None = None
+    first: "FirstScreen | None" = None
 
 
 class Call:
@@ -240,6 +252,15 @@ def check_writable(folder: Path) -> None:
         ) from problem
 
 
+def _emit_first(first: "FirstScreen", written: Path | None) -> None:
+    """Prints the same as the first screen of the report, and the report's path."""
+    rows = first.rows()
+    if written is not None:
+        rows |= {"written to": str(written), "report": str(written / "report.html")}
+    typer.echo("")
+    console.emit_summary("In short", rows)
+
+
 def report(title: str, outcome: Outcome, call: Call) -> None:
     """Prints the outcome (with --json as JSON) and ends with exit code 1 where there is a problem.
 
@@ -249,15 +270,19 @@ def report(title: str, outcome: Outcome, call: Call) -> None:
     summary = outcome.summary
     state = str(summary.get("state", "done"))
     if call.json:
-        console.emit_json(summary)
+        first = outcome.first
+        console.emit_json(summary if first is None else {**summary, "first_screen": first.document()})
     elif callable(outcome.text):
         outcome.text()
     elif outcome.text is not None:
-        typer.echo(outcome.text)
+        console.emit_text(outcome.text)
     else:
         rows = console.rows(summary if outcome.values is None else outcome.values) | dict(outcome.rows)
-        rows |= {} if call.written is None else {"written to": str(call.written)}
+        if outcome.first is None:
+            rows |= {} if call.written is None else {"written to": str(call.written)}
         console.emit_summary(f"{title}: {state}", rows)
+    if outcome.first is not None and not call.json:
+        _emit_first(outcome.first, call.written)
     problem = outcome.problem
     if problem is None and state != "done":
         problem = str(summary.get("reason") or f"The {title} ended {state}; see the report for the reason.")
