@@ -9,8 +9,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from weldcal.models.errors import InputError
 
 UNFINISHED: Final = "UNFINISHED"
@@ -35,6 +33,8 @@ def write_atomic(path: Path, content: str | bytes) -> None:
 
 def write_npz(path: Path, **arrays: Any) -> None:
     """Write arrays as a compressed NPZ file, as ``write_atomic`` does."""
+    import numpy as np  # the command line's help does without it
+
     data = io.BytesIO()
     np.savez_compressed(data, **arrays)
     write_atomic(path, data.getvalue())
