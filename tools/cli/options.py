@@ -1,6 +1,7 @@
 """What all commands share: their common options, the folder of a result, progress, errors and the printed outcome."""
 
 import inspect
+import os
 import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
@@ -11,11 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import whole_result
 from weldcal.tools import console
 
 if TYPE_CHECKING:
     from weldcal.tools.farm.run import Farm
     from weldcal.tools.outcomes.first_screen import FirstScreen
+
+
+LEAST_BYTES = 1 << 20
+"""Bytes that must fit on the disk of a result before the work begins."""
 
 
 def option(name: str, metavar: str, help: str, **settings: Any) -> Any:
@@ -140,6 +146,7 @@ class Call:
         """
         self.written = self.out or fresh_folder(command, name, self.seed)
         check_writable(self.written)
+        self._stack.enter_context(whole_result(self.written))
         return self.written
 
     def farm(self, folder: Path) -> "Farm":
@@ -206,6 +213,7 @@ def command(
                 call = Call(title, shared, stack)
                 if call.out is not None:
                     check_writable(call.out)
+                    stack.enter_context(whole_result(call.out))
                 outcome = body(call, **given)
             if outcome is not None:
                 report(title, outcome if isinstance(outcome, Outcome) else Outcome(outcome), call)
@@ -244,8 +252,10 @@ def check_writable(folder: Path) -> None:
     there = next((one for one in (folder, *folder.absolute().parents) if one.exists()), folder)
     try:
         # the only test that holds for every file system, and for root
-        with tempfile.TemporaryFile(dir=there):
-            pass
+        with tempfile.TemporaryFile(dir=there) as file:
+            file.write(bytes(LEAST_BYTES))
+            file.flush()
+            os.fsync(file.fileno())  # a full disk refuses the bytes, not the name
     except OSError as problem:
         raise InputError(
             f"Nothing can be written to '{folder}' ({problem.strerror or problem}). Give another folder with --out."

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from pydrake.math import RigidTransform
 
-from weldcal.calibration.data.dataset import load_dataset
+from weldcal.calibration.data.dataset import Dataset, load_dataset
 from weldcal.calibration.data.results import CalibrationResult, PoseRecord, export_all, save_result, software_version
 from weldcal.calibration.errors import TooFewPoses
 from weldcal.calibration.eye_on_base.advice import sampling_advice
@@ -21,12 +21,16 @@ from weldcal.calibration.eye_on_base.validation import convergence, k_fold
 from weldcal.calibration.flange.holes import HolePattern
 from weldcal.calibration.flange.observation import Observation
 from weldcal.calibration.planning.observability import turn_deg
+from weldcal.calibration.refinement.joint_angles import joint_angles
+from weldcal.calibration.refinement.refined import KINEMATICS_FILE, REFINEMENTS, Plain, Refined
+from weldcal.calibration.touch.arm_prior import observed_document
+from weldcal.models.arrays import Array
 from weldcal.models.errors import InputError
 from weldcal.models.flanges import get_flange
 from weldcal.tools.commands.algorithm1_comparison import compare_algorithm1
 from weldcal.tools.commands.contradictions import estimate_consistent
 from weldcal.tools.commands.dataset_case import dataset_case, examined_where_refused, write_case
-from weldcal.tools.commands.refine import KINEMATICS_FILE, REFINEMENTS, Refinable, Refined, refine_calibration
+from weldcal.tools.commands.refine import Refinable, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
 from weldcal.tools.outcomes.first_screen import check_limit
@@ -104,15 +108,17 @@ def calibrate_dataset(
             refine,
             Refinable(
                 data,
-                observations,
-                seen.patterns,
-                estimate,
-                tuple(corrected),
-                scanner,
+                Plain(
+                    observations,
+                    tuple(corrected),
+                    seen.patterns,
+                    estimate,
+                    None if scanner is None else scanner.accepted,
+                    correct_scanner and not few,
+                ),
                 robot or data.header.robot,
                 kinematics,
             ),
-            correct_scanner=correct_scanner and not few,
             seed=seed,
         )
         estimate, corrected = refined.estimate, list(refined.observations)
@@ -176,7 +182,12 @@ def calibrate_dataset(
         joint_covariance=estimate.joint,
         axis_turn_deg=_axis_turn(inliers, seen.patterns, rigid.X_BC) if axis_turn_deg is None else None,
         local_field=None if refined is None or refined.field is None else refined.field.document(),
-        orientations=orientations_of(inliers) if not data.pairs or all(p.has_orientation for p in data.pairs) else None,
+        orientations=orientations_of(inliers, None if data.pairs else data.X_FR)
+        if not data.pairs or all(p.has_orientation for p in data.pairs)
+        else None,
+        observed=observed_document(inliers, RigidTransform() if data.pairs else data.X_FR, _angles(data, inliers))
+        if not data.pairs or all(p.has_orientation for p in data.pairs)
+        else None,
         arm_errors=None if refined is None else refined.arm,
         kinematics_file=KINEMATICS_FILE if refined is not None and refined.kinematics else "",
         software=software_version(),
@@ -214,6 +225,15 @@ def calibrate_dataset(
     report = replace(report, seconds=time.monotonic() - started)
     tell("done", 1.0)
     return report
+
+
+def _angles(data: Dataset, inliers: list[Observation]) -> list[Array]:
+    """Joint angles (n, joints) rad of the poses; none where the table has none."""
+    for joints in (7, 6):
+        q = joint_angles(data, [o.id for o in inliers], joints)
+        if q is not None:
+            return list(q)
+    return []
 
 
 def _enough(observations: list[Observation], refused: list[tuple[str, str]]) -> None:

@@ -20,7 +20,7 @@ from weldcal.calibration.hand_eye.mountings import get_mounting
 from weldcal.calibration.hand_eye.opencv_methods import METHODS, most_compared, opencv_held_out
 from weldcal.calibration.hand_eye.problem import Problem, full_problem
 from weldcal.calibration.hand_eye.solve import HandEyeConfig, HandEyeResult, solve_ax_xb, solve_problem
-from weldcal.calibration.motion.pose_streams import is_stream_file, read_streams, synchronise
+from weldcal.calibration.motion.stream_file import is_stream_file
 from weldcal.calibration.planning.next_pose import next_pose
 from weldcal.calibration.planning.view import View, view_of
 from weldcal.models.arms.chain import Chain, load_chain
@@ -76,6 +76,8 @@ def run_hand_eye(
     if is_stream_file(file):
         if unit not in (None, "m") or motions:
             raise InputError("Two streams of poses are in metres; omit --unit and --motions.")
+        from weldcal.calibration.motion.pose_streams import read_streams, synchronise
+
         streams = synchronise(read_streams(file), mounting=mounting or "eye_in_hand", source=file.name)
         say(streams.sentence)
     pairs = read_pairs(file, mounting=mounting, length=unit) if streams is None else streams.pairs

@@ -14,6 +14,7 @@ from weldcal.tools.commands.motion_live import run_motion_live
 from weldcal.tools.commands.mounting_live import run_mounting_live
 from weldcal.tools.commands.profiler.live import run_profiler_live
 from weldcal.tools.commands.tablet.demo import run_tablet_demo
+from weldcal.tools.commands.touch_live import run_touches
 from weldcal.tools.outcomes.first_screen import FirstScreen
 from weldcal.tools.outcomes.options import RunOptions
 
@@ -36,6 +37,7 @@ RUNNERS: dict[str, Runner] = {
     "mounting": run_mounting_live,
     "motion": run_motion_live,
     "profiler_job": run_profiler_live,
+    "touch": run_touches,
 }
 
 

@@ -167,6 +167,13 @@ class DemoResult:
             found["work_point"] = work_point_error(self.status.estimate, work_point(self.run.cell.scenario)).document()
             found["expected_error_mm"] = 1e3 * self.status.predicted_error_m
             found["held_out_mm"] = live_errors(1e3 * self.status.estimate.held_out.position_m)
+            if self.status.refinement is not None:
+                refinement = self.status.refinement
+                found["refinement"] = refinement.document or {
+                    "kind": refinement.kind,
+                    "accepted": False,
+                    "sentence": refinement.sentence,
+                }
             found["verification_mm"] = [1e3 * v.error_m for v in self.status.verifications]
         found["n_scans"] = self.n_scans
         found["refused"] = [{"id": id, "reason": reason} for id, reason in self.status.refused]

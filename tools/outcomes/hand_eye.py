@@ -1,7 +1,10 @@
 """The result of `weldcal hand-eye`: poses with their uncertainty, the comparison of methods, the next pose."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,10 +12,12 @@ from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.hand_eye.mountings import Mounting
 from weldcal.calibration.hand_eye.opencv_methods import most_compared
 from weldcal.calibration.hand_eye.solve import HandEyeHeldOut, HandEyeResult
-from weldcal.calibration.motion.pose_streams import Synchronised
 from weldcal.calibration.planning.next_pose import NextPose
 from weldcal.models.arrays import Array
 from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, ShownPose, Tolerance
+
+if TYPE_CHECKING:
+    from weldcal.calibration.motion.pose_streams import Synchronised
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.math import RigidTransform, RotationMatrix
-from scipy.stats import chi2
 
 from weldcal.calibration.data.results import export_ur_pose
 from weldcal.calibration.eye_on_base.estimate import CalibrationEstimate, point_error_covariance
+from weldcal.calibration.geometry.quantiles import chi2_quantile
 from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 
@@ -65,7 +65,7 @@ def radius_95(S: Array) -> float:
     """
     mean, square = float(np.trace(S)), float(np.trace(S @ S))
     freedom = mean**2 / square if square > 0.0 else 3.0
-    return float(np.sqrt(chi2.ppf(0.95, freedom) * mean / freedom))
+    return float(np.sqrt(chi2_quantile(0.95, freedom) * mean / freedom))
 
 
 def work_point_error(estimate: CalibrationEstimate, p_BQ: Array) -> WorkPoint:

@@ -1,19 +1,16 @@
-"""Renders report templates to self-contained HTML, formats numbers, and writes files atomically."""
+"""Renders report templates to self-contained HTML, and formats numbers."""
 
 import base64
-import contextlib
 import hashlib
 import math
-import os
 import re
-import tempfile
 from collections.abc import Iterable
-from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_environment
 from markupsafe import Markup, escape
 
 from weldcal.calibration.data.results import software_version
+from weldcal.models.result_files import write_atomic as write_atomic
 from weldcal.tools.report.inline_svg import inline_svg
 
 _MEDIA_TYPES = ((b"\x89PNG", "image/png"), (b"\xff\xd8\xff", "image/jpeg"), (b"<svg", "image/svg+xml"))
@@ -75,25 +72,6 @@ def fixed(value: float | None, digits: int = 2) -> str:
 def fixed_row(values: Iterable[float], digits: int = 2) -> str:
     """Numbers as ``fixed`` writes them, in one row."""
     return "  ".join(fixed(float(value), digits) for value in values)
-
-
-def write_atomic(path: Path, content: str | bytes) -> None:
-    """Writes a file and creates its folder: another process sees the old content or the new, never a part of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        Path(temporary).chmod(0o666 & ~umask)  # mkstemp makes it private; a result is for everybody
-        Path(temporary).replace(path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            Path(temporary).unlink()
-        raise
 
 
 def environment() -> Environment:

@@ -266,7 +266,7 @@ def _add_welding(
         "deformation_estimator",
         ArucoDeformationEstimator(station.arm, tool, scenario.finger_camera.camera(), station.background),
     )
-    wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history)
+    wiring.connect(finger, image=out("finger_camera.image"), history=spine.arm.history, calibration_status=status)
     wiring.feed("finger_camera.streaming", sequencer.GetOutputPort("streaming"))
     others = [servo_config(scenario, station, k) for k in range(1, seam_count(station.cad))]
     servo = wiring.add("welding_servo", WeldingVelocityServo(station.arm, tool, config, others))
@@ -278,6 +278,7 @@ def _add_welding(
         sample_time=out("arm.sample_time"),
         job=command,
         hold=spine.hold,
+        calibration_status=status,
     )
     if station.diagram.HasOutputPort("arm.arc_established"):
         wiring.connect(servo, arc_established=out("arm.arc_established"))
