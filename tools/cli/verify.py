@@ -91,7 +91,9 @@ def _by_touch(call: Call, result: Path, touches: Path) -> Outcome:
     verdict = report.verdict
     return Outcome(
         report.summary(),
-        rows=report.rows,
+        values={},
+        rows={name: text for name, text in report.rows.items() if name != "verdict"},
+        first=report.first,
         problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )
 
@@ -110,4 +112,9 @@ def _touched_live(call: Call, result: Path, scenario: str, robot: str, points: i
         problem = found.reason
     elif report is not None and report.verdict.verdict == DO_NOT:
         problem = f"The verdict is: {DO_NOT}. {report.verdict.reason}"
-    return Outcome(found.summary(), rows={} if report is None else report.rows, problem=problem)
+    return Outcome(
+        found.summary(),
+        rows={} if report is None else report.rows,
+        problem=problem,
+        first=None if report is None else report.first,
+    )

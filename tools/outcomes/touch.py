@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from weldcal.calibration.data.results import CalibrationResult
 from weldcal.calibration.touch.judge import LEVEL, TouchErrors
-from weldcal.tools.outcomes.calibration import CARE, DO_NOT, USE, Verdict, error_summary
+from weldcal.tools.outcomes.calibration import CARE, DO_NOT, USE, Verdict, error_summary, scanner_pose
+from weldcal.tools.outcomes.first_screen import Expected, Findings, FirstScreen, Next, Tolerance
 
 ENOUGH = 4
 """Touches from which on the verdict may be "use"."""
@@ -18,6 +20,29 @@ class TouchReport:
 
     found: TouchErrors
     folder: Path
+    result: CalibrationResult | None = None
+
+    @property
+    def first(self) -> FirstScreen:
+        """The first screen; its verdict is this command's own, by the touches outside their stated regions."""
+        v, f = self.verdict, self.found
+        errors = 1e3 * np.abs(f.error_m)
+        tolerance = Tolerance(
+            "touches outside their region", float(f.outside), float(f.most_outside), "99 % of good cells", ""
+        )
+        found = Findings(tolerance=tolerance, unseen=len(f.ids), settled=(v.verdict, v.reason))
+        expected = Expected(
+            "touched less scanned, 95 %",
+            f"{np.percentile(errors, 95):.3f} mm",
+            f"of {len(errors)} touches, which the calibration did not use; median {np.median(errors):.3f} mm",
+        )
+        if v.verdict == USE:
+            after = Next("Use X_BC. Touch again after any knock, and after work at the robot or the scanner.")
+        elif v.verdict == DO_NOT:
+            after = Next("Check the tip's place on the flange, then calibrate again.")
+        else:
+            after = Next("Touch more points across the work space, with joint angles.")
+        return FirstScreen(found, expected, after, () if self.result is None else (scanner_pose(self.result),))
 
     @property
     def verdict(self) -> Verdict:
