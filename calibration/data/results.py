@@ -1,8 +1,6 @@
 """Reads and writes calibration.yaml, and exports X_BC to URDF, ROS 2, URScript and JSON."""
 
 import json
-import os
-import tempfile
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,6 +17,7 @@ from weldcal.calibration.geometry.se3 import rotation_vector
 from weldcal.models.arrays import Array
 from weldcal.models.documents import Section, read_document, shown
 from weldcal.models.errors import InputError
+from weldcal.models.result_files import require_whole, write_atomic
 
 ON_BASE = "eye_on_base"
 RESULT_FILE = "calibration.yaml"
@@ -110,22 +109,6 @@ def matrix4(X: RigidTransform) -> list[list[float]]:
     return [[float(v) for v in row] for row in X.GetAsMatrix4()]
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file atomically: a reader sees the old file or the complete new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        Path(name).chmod(0o644)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-
-
 def save_result(result: CalibrationResult, folder: Path) -> Path:
     """Write ``calibration.yaml`` in ``folder``; returns its path."""
     q = result.X_BC.rotation().ToQuaternion().wxyz()
@@ -179,7 +162,7 @@ def save_result(result: CalibrationResult, folder: Path) -> Path:
         "data_sha256": dict(result.data_hashes),
     }
     path = folder / RESULT_FILE
-    write_atomically(path, yaml_dump(document))
+    write_atomic(path, yaml_dump(document))
     return path
 
 
@@ -196,6 +179,7 @@ def load_result(path: Path) -> CalibrationResult:
     """
     path = Path(path)
     path = path / RESULT_FILE if path.is_dir() else path
+    require_whole(path)
     if not path.exists():
         raise InputError(f"There is no calibration at '{path}'; give a folder written by 'weldcal calibrate'.")
     document = read_document(path)
@@ -373,7 +357,7 @@ def export_all(result: CalibrationResult, folder: Path) -> tuple[Path, ...]:
         f"{result.symbol}.json": export_json(result),
     }
     for name, text in files.items():
-        write_atomically(folder / name, text)
+        write_atomic(folder / name, text)
     return tuple(folder / name for name in files)
 
 

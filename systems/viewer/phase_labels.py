@@ -7,50 +7,13 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from weldcal.systems.bodies.textured_board import textured_board
+from weldcal.systems.phase_words import STEPS, TEXT
+
+__all__ = ["HEIGHT_M", "STEPS", "TEXT", "WIDTH_M", "X_WS", "add_phase_label", "label_image"]
 
 WIDTH_M, HEIGHT_M = 0.72, 0.09
 # Above and behind the cell, facing a viewer in front of the robot (+x) who looks towards it.
 X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.deg2rad(65.0)), [-0.25, -0.38, 1.0])
-TEXT = {
-    "start": "ready",
-    "move_home": "to home",
-    "move_to_verification_cloud": "calibrate: to the verification pose",
-    "scan_verification_cloud": "calibrate: scan for verification",
-    "move_to_pose": "calibrate: to the next pose",
-    "scan_pose": "calibrate: scan the ring",
-    "move_to_verify": "verify: to a held-out pose",
-    "scan_verify": "verify: scan the ring",
-    "park": "park",
-    "scan_workpiece": "scan the workpiece",
-    "approach_above": "approach",
-    "approach": "approach",
-    "weld": "track the seam and weld",
-    "retract": "retract",
-    "home": "home",
-    "done": "done",
-    "held": "HELD: see the report",
-}
-STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
-    (
-        "Calibrate",
-        "calibrate",
-        (
-            "start",
-            "move_home",
-            "move_to_verification_cloud",
-            "scan_verification_cloud",
-            "move_to_pose",
-            "scan_pose",
-        ),
-    ),
-    ("Verify", "calibrate", ("move_to_verify", "scan_verify")),
-    ("Park", None, ("start", "move_home", "park")),
-    ("Scan the part", "weld", ("scan_workpiece",)),
-    ("Approach", "weld", ("approach_above", "approach")),
-    ("Weld", "weld", ("weld",)),
-    ("Go home", "weld", ("retract", "home")),
-)
-"""Steps of the weld job: name, the part of the job that it belongs to (None: both), and its phases."""
 
 
 def label_image(text: str) -> NDArray[np.uint8]:

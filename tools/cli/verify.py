@@ -62,7 +62,6 @@ def verify(
         return _by_touch(call, result, touch)
     from weldcal.tools.commands.verify import verify_dataset
     from weldcal.tools.outcomes.calibration import DO_NOT
-    from weldcal.tools.outcomes.poses import pose_rows
 
     report = verify_dataset(
         result,
@@ -77,8 +76,9 @@ def verify(
     verdict, summary = report.verdict, report.summary()
     return Outcome(
         summary,
-        values={"verdict": verdict.verdict, "because": verdict.reason, **summary},
-        rows=report.interval_rows | pose_rows(report.result.X_BC),
+        values={key: value for key, value in summary.items() if key not in ("verdict", "reason")},
+        rows=report.interval_rows,
+        first=report.first,
         problem=f"The verdict is: {verdict.verdict}. {verdict.reason}" if verdict.verdict == DO_NOT else "",
     )
 

@@ -33,6 +33,7 @@ from weldcal.tools.commands.dataset_case import dataset_case, examined_where_ref
 from weldcal.tools.commands.refine import Refinable, refine_calibration
 from weldcal.tools.console import Progress
 from weldcal.tools.outcomes.calibration import CalibrationReport, error_summary
+from weldcal.tools.outcomes.first_screen import check_limit
 from weldcal.tools.report.calibration import calibration_report
 from weldcal.tools.report.files import csv_text
 from weldcal.tools.report.render import write_atomic
@@ -54,6 +55,7 @@ def calibrate_dataset(
     poses: str | None = None,
     refine: str | None = None,
     kinematics: Path | None = None,
+    limit_mm: float | None = None,
 ) -> CalibrationReport:
     """Calibrate from a dataset folder and write ``calibration.yaml``, exports and ``report.html`` to ``out``.
 
@@ -64,12 +66,13 @@ def calibrate_dataset(
     leaves, "joints" or "links" errors of the arm (beyond its factory calibration ``kinematics``), each applied where nested held-out
     errors fall. A cloud that cannot be used is refused and
     reported, as long as enough remain. Where five scans or more contradict each other only
-    observations.csv is written, for `weldcal doctor`.
+    observations.csv is written, for `weldcal doctor`. ``limit_mm`` is the error, at 95 %, that the job allows.
 
     Raises:
         InputError: the data cannot be used; TooFewPoses: too few scans can be used.
     """
     started = time.monotonic()
+    check_limit(limit_mm)
     if refine is not None and refine not in REFINEMENTS:
         raise InputError(f"There is no refinement '{refine}'. Choose one of {', '.join(REFINEMENTS)}.")
     tell: Progress = progress or (lambda stage, fraction: None)
@@ -206,6 +209,7 @@ def calibrate_dataset(
         seen.patterns,
         data.notes,
         None if refined is None else refined.document(refine or ""),
+        limit_mm,
     )
     tell("writing the report", 0.95)
     html = calibration_report(report, dataset=Path(folder).name)

@@ -15,7 +15,7 @@ from weldcal.systems.cell import Cell
 from weldcal.systems.jobs.weld.job import WeldJob
 from weldcal.systems.jobs.weld.settings import work_point
 from weldcal.systems.messages import CalibrationStatus
-from weldcal.systems.viewer.phase_labels import STEPS
+from weldcal.systems.phase_words import STEPS
 from weldcal.welding.servo.guards import ArmGuardConfig
 
 SCAN = "scan"

@@ -7,6 +7,7 @@ from collections import deque
 from typing import Any
 
 from weldcal.systems.person import Person
+from weldcal.systems.phase_words import phase_words
 from weldcal.systems.viewer.live import LiveView
 from weldcal.tools.dashboard.facts import Facts
 from weldcal.tools.dashboard.values import (
@@ -17,7 +18,6 @@ from weldcal.tools.dashboard.values import (
     STARTING,
     STOPPING,
     left_s,
-    phase_text,
     scan_rows,
     scan_values,
     steps,
@@ -111,7 +111,7 @@ class DashboardSource:
     def _state(self) -> tuple[str, str]:
         """The state in large letters, and the line under it: by whom and why, or what the arm does."""
         moment, person = self.live.moment, self.person
-        doing = phase_text(moment.command.phase) if moment.time > 0.0 else self._stage
+        doing = phase_words(moment.command.phase) if moment.time > 0.0 else self._stage
         if self._ended is not None:
             state, reason = self._ended
             return state, reason or "The job is complete."

@@ -1,0 +1,68 @@
+"""The words for the phases of every job: one list, for the terminal, the dashboard, the 3D view and the report."""
+
+TEXT = {
+    "start": "ready",
+    "move_home": "to home",
+    "move_to_verification_cloud": "calibrate: to the verification pose",
+    "scan_verification_cloud": "calibrate: scan for verification",
+    "move_to_pose": "calibrate: to the next pose",
+    "scan_pose": "calibrate: scan the ring",
+    "move_to_verify": "verify: to a held-out pose",
+    "scan_verify": "verify: scan the ring",
+    "park": "park",
+    "scan_workpiece": "scan the workpiece",
+    "approach_above": "approach",
+    "approach": "approach",
+    "weld": "track the seam and weld",
+    "retract": "retract",
+    "home": "home",
+    "done": "done",
+    "held": "HELD: see the report",
+}
+"""The phases of the weld job."""
+OTHERS = {
+    "to_start": "home",
+    "to_look": "to the look",
+    "look": "look at the tablet",
+    "to_above": "touch the landmarks",
+    "descend": "touch the landmarks",
+    "lift": "touch the landmarks",
+    "to_home": "home",
+    "move": "to the next pose",
+    "scan": "scan",
+    "collect": "stream scans in motion",
+    "calibrate": "calibrate",
+    "compute": "compute",
+    "dwell": "come to rest",
+    "await": "wait for the scan",
+    "run": "move along the seam",
+}
+"""The phases of the other jobs that the weld job does not have."""
+
+STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
+    (
+        "Calibrate",
+        "calibrate",
+        (
+            "start",
+            "move_home",
+            "move_to_verification_cloud",
+            "scan_verification_cloud",
+            "move_to_pose",
+            "scan_pose",
+        ),
+    ),
+    ("Verify", "calibrate", ("move_to_verify", "scan_verify")),
+    ("Park", None, ("start", "move_home", "park")),
+    ("Scan the part", "weld", ("scan_workpiece",)),
+    ("Approach", "weld", ("approach_above", "approach")),
+    ("Weld", "weld", ("weld",)),
+    ("Go home", "weld", ("retract", "home")),
+)
+"""Steps of the weld job: name, the part of the job that it belongs to (None: both), and its phases."""
+
+
+def phase_words(phase: str, detail: str = "") -> str:
+    """A phase in words, with a detail after a comma; a phase that is not listed (of an installed job) as it is written."""
+    words = TEXT.get(phase) or OTHERS.get(phase) or phase.replace("_", " ")
+    return f"{words}, {detail}" if detail else words
