@@ -42,6 +42,7 @@ SHORT = (
     (r"(benchmark flange-honesty) --runs 500", r"\1 --runs 10"),
     (r"benchmark seam-planning --runs 5", "benchmark seam-planning --runs 1 --preset phoxi_m --no-troubles"),
     (r"reproduce flange (\S+)", r"reproduce flange \1 --quick"),
+    (r"reproduce flange-sphere$", "reproduce flange-sphere --scans 20 --draws 3"),
     (r"reproduce profiler$", "reproduce profiler --quick"),
     (r"reproduce profiler-seeds$", "reproduce profiler-seeds --seeds 2"),
     (r"reproduce tablet$", "reproduce tablet --trials 4"),
@@ -85,6 +86,8 @@ class CommandLine:
             return "--dataset" not in self.words
         if self.begins("calibrate"):
             return not {"--scenario", "--refine"} & set(self.words)
+        if self.begins("verify"):
+            return "--scenario" not in self.words
         if self.begins("doctor"):
             return not self.name.endswith(".mcap")
         return self.begins(*CHEAP) and not self.elsewhere

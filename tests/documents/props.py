@@ -17,12 +17,15 @@ from tests.calibration.tablet.visit import write_visit
 from tests.documents.scans import write_scans
 from tests.places import ROOT, SHARED_DATA
 from tests.short_job import SHORT_JOB
+from weldcal.calibration.data.results import save_result
+from weldcal.calibration.touch.table import touches_text
 from weldcal.models.arms import ur10e
 from weldcal.models.arms.kinematics import forward_kinematics, load_arm
 from weldcal.models.arms.urdf import arm_urdf
 from weldcal.models.mesh import extrude
 from weldcal.models.tools.loading import WELDING
 from weldcal.tools.scenarios.new_cell import write_cell
+from weldcal.tools.studies.touch.world import touch_world
 
 # An angle bracket of plates 10 mm thick; lengths in mm. Its inner corner is the longest concave edge.
 ANGLE = np.array([[0.0, 0.0], [80.0, 0.0], [80.0, 10.0], [10.0, 10.0], [10.0, 60.0], [0.0, 60.0]])
@@ -168,6 +171,8 @@ PROPS: dict[str, Callable[[Path], object]] = {
     "my_cell.yaml": lambda path: path.write_text(HELD_AFTER_3_S, encoding="utf-8"),
     "my_scenario.yaml": lambda path: path.write_text(f"extends: s_groove\n{SHORT_JOB}", encoding="utf-8"),
     "touches.csv": lambda path: write_visit(path.parent),
+    "touched_points.csv": lambda path: path.write_text(touches_text(touch_world(20).touches), encoding="utf-8"),
+    "touched-calibration": lambda path: save_result(touch_world(20).result, path),
     "edge.npz": _profiler("edge"),
     "sphere.npz": _profiler("sphere"),
     "groove.npz": _profiler("groove"),

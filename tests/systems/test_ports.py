@@ -188,7 +188,7 @@ MAKERS: dict[type[LeafSystem], Callable[[], LeafSystem]] = {
     TouchPlanner: lambda: TouchPlanner(
         TouchPlanning(cast("SeamPlanning", None), X, ScannerCorrection(), TouchConfig())
     ),
-    TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TouchMotion(Q_HOME, 3e-3, 1e-3, 7.0, 20.0, 240.0)),
+    TouchProcedure: lambda: TouchProcedure(the_arm(), TOOL, TouchMotion(Q_HOME, 3e-3, 1e-3, 6e-3, 20.0, 240.0)),
     WristCamera: lambda: WristCamera(RenderedWristCamera(), 0),
     MountingProcedure: lambda: MountingProcedure((), 0, 0, (Q_HOME, None)),
     MountingCalibrator: lambda: MountingCalibrator(

@@ -141,7 +141,21 @@ def cell(
     return _compared(study, text=partial(print_cell_study, study))
 
 
-COMMANDS = (tablet, flange, profiler_seeds, weld, profiler, cell)
+@command("reproduce flange-sphere")
+def flange_sphere(
+    call: Call,
+    scans: Annotated[int, option("--scans", "N", "Scans of the flange with a sphere on it.", min=20)] = 48,
+    draws: Annotated[int, option("--draws", "N", "Random draws of 4 and of 16 of them.", min=1)] = 40,
+) -> Outcome:
+    """Repeat Table 2 of the flange paper in a simulated cell: a calibration sphere beside the flange, in the same scans; and the false
+    segmentations of Table 1."""
+    from weldcal.tools.studies.flange.published.sphere import run_sphere_study, sphere_rows
+
+    summary = run_sphere_study(call.folder("reproduce", "flange-sphere"), scans, draws, call.seed, call.progress)
+    return Outcome(summary, rows=sphere_rows(summary))
+
+
+COMMANDS = (tablet, flange, flange_sphere, profiler_seeds, weld, profiler, cell)
 
 
 def _compared(

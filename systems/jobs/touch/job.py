@@ -101,7 +101,7 @@ class TouchJob(Job[TouchPlanning]):
             np.deg2rad(scenario.home_deg),
             1e-3 * config.descent_mm_s,
             1e-3 * config.press_mm,
-            (config.clearance_mm + config.deepest_mm + config.press_mm) / config.descent_mm_s,
+            1e-3 * (config.deepest_mm + config.press_mm),
             MOVE_TIMEOUT_S * slower,
             scenario.job.maximum_time_s * slower,
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import BasicVector, Context, LeafSystem, State
 
-from weldcal.models.arms.kinematics import ArmModel, jacobian
+from weldcal.models.arms.kinematics import ArmModel, forward_kinematics, jacobian
 from weldcal.models.tool import WeldingTool
 from weldcal.systems.jobs.touch.planner import Place, PlannedTouches
 from weldcal.systems.jobs.weld.aruco_deformation_estimator import Deformation
@@ -22,6 +22,7 @@ FRAMES = 10  # of the free tip, and of the pressed one
 FREE_M = 0.3e-3  # that a free tip may read
 _FRAMES_TIMEOUT_S = 4.0
 _MODES = {**dict.fromkeys(MOVES, "move"), "descend": "weld"}
+_LONGEST_DESCENT_S = 120.0  # also on a computer that is late, which slows the arm
 _SLOWEST_FRAME_S = 0.3  # a descent without a newer frame stops
 
 Vector = NDArray[np.float64]
@@ -34,7 +35,7 @@ class TouchMotion:
     q_home: Vector
     descent_m_s: float
     press_m: float
-    longest_descent_s: float
+    deepest_m: float  # of the tip at rest below the scanned face, where a descent is given up
     move_timeout_s: float
     maximum_time_s: float
 
@@ -83,6 +84,7 @@ class TouchSeen:
     hold: bool
     plan: PlannedTouches
     finger: Deformation
+    height: float = np.inf  # of the ball, free, over the scanned face at the present place, m
 
 
 def next_touch_state(s: TouchState, seen: TouchSeen, motion: TouchMotion) -> TouchState:
@@ -116,7 +118,7 @@ def next_touch_state(s: TouchState, seen: TouchSeen, motion: TouchMotion) -> Tou
     if s.phase == "descend":
         if s.frames and float((s.frames[-1] - s.zero)[2]) >= motion.press_m:
             return replace(s, phase="press", since=seen.time, frames=())
-        if seen.time - s.since > motion.longest_descent_s:
+        if seen.height < -motion.deepest_m:
             return _give_up(
                 s,
                 seen,
@@ -171,6 +173,8 @@ def _why_stop(s: TouchState, seen: TouchSeen, motion: TouchMotion) -> str:
         return f"No plan arrived within {SCAN_TIMEOUT_S:.0f} s of the scan's trigger."
     if s.phase in ("zero", "press") and elapsed > _FRAMES_TIMEOUT_S:
         return "The finger camera does not see the tip's tag: check its light and focus."
+    if s.phase == "descend" and elapsed > _LONGEST_DESCENT_S:
+        return f"A descent took longer than {_LONGEST_DESCENT_S:.0f} s."
     if s.phase == "descend" and seen.time - s.seen_at > _SLOWEST_FRAME_S:
         return "The finger camera lost the tip's tag during a descent."
     return ""
@@ -204,6 +208,7 @@ class TouchProcedure(LeafSystem):
     def __init__(self, arm: ArmModel, tool: WeldingTool, motion: TouchMotion, period_s: float = 0.004) -> None:
         super().__init__()
         self._arm, self._p_FT, self._motion = arm, np.asarray(tool.X_FT.translation()), motion
+        self._radius_m = tool.tip_radius_m
         self._position = self.DeclareVectorInputPort("position_measured", 6)
         self._settled = self.DeclareVectorInputPort("settled_goal", 1)
         self._status = self.DeclareAbstractInputPort("robot_status", AbstractValue.Make(UrStatus()))
@@ -235,6 +240,7 @@ class TouchProcedure(LeafSystem):
             hold=bool(self._hold.Eval(context)[0] > 0.5),
             plan=self._plan.Eval(context),
             finger=self._finger.Eval(context),
+            height=self._height(old, np.array(self._position.Eval(context))),
         )
         new = next_touch_state(old, seen, self._motion)
         if new is not old:
@@ -244,6 +250,14 @@ class TouchProcedure(LeafSystem):
             twist = np.concatenate([np.zeros(3), -self._motion.descent_m_s * new.places[new.index].n_B])
             velocity = np.linalg.solve(jacobian(self._arm, seen.q, self._p_FT), twist)
         state.get_mutable_discrete_state().set_value(velocity)
+
+    def _height(self, s: TouchState, q: Vector) -> float:
+        """Height (m) of the free ball over the face at the present place; infinite where there is none."""
+        if s.index >= len(s.places):
+            return np.inf
+        place = s.places[s.index]
+        p_BT = forward_kinematics(self._arm, q).multiply(self._p_FT)
+        return float((p_BT - place.p_B) @ place.n_B) - self._radius_m
 
     def _job(self, context: Context, output: Any) -> None:
         s = self.touch_state(context)

@@ -28,7 +28,7 @@ from weldcal.systems.messages import Scan, UrStatus
 from weldcal.systems.scenario.checks import check_scenario
 from weldcal.welding.servo.state import DeflectionSample
 
-MOTION = TouchMotion(Q_HOME, 3e-3, 1e-3, 6.0, 20.0, 500.0)
+MOTION = TouchMotion(Q_HOME, 3e-3, 1e-3, 6e-3, 20.0, 500.0)
 FACE_Z = 0.02
 
 
@@ -77,9 +77,8 @@ class Bench:
             self.frame += int(not self.blind)
             deflection = np.array([0.0, 0.0, max(self.face_m - self.height, 0.0) + 1e-4])
             sample = DeflectionSample(self.time, RigidTransform(), deflection, True)
-            seen = TouchSeen(
-                self.time, Q_HOME, self.state.goal_id, UrStatus(), self.hold, self.plan, Deformation(self.frame, sample)
-            )
+            felt = Deformation(self.frame, sample)
+            seen = TouchSeen(self.time, Q_HOME, self.state.goal_id, UrStatus(), self.hold, self.plan, felt, self.height)
             self.state = next_touch_state(self.state, seen, MOTION)
             if self.state.finished or (until and self.state.phase == until):
                 break

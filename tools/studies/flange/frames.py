@@ -63,6 +63,21 @@ def flange_frame(
     return Frame(_scan([*bodies, *before], scanner, rng), X_CR)
 
 
+def sphere_frame(
+    scanner: ScannerPreset,
+    standard: FlangeStandard,
+    rng: np.random.Generator,
+    X_CF: RigidTransform,
+    p_FS: Array,
+    radius_m: float,
+) -> Array:
+    """A scan (H, W, 3) m of a flange at X_CF on its wrist that carries a ball of this radius at p_FS (3,) m, over a table."""
+    ball = _ball(radius_m, 121).transformed(X_CF @ RigidTransform(p_FS))
+    bodies = [m.transformed(X_CF) for m in (flange_mesh(standard, _THICK_M), *_wrist(standard, rng))]
+    bodies += _surroundings(scanner, standard, rng, 0, clear_of=X_CF)
+    return _scan([*bodies, ball], scanner, rng)
+
+
 def empty_frame(scanner: ScannerPreset, standard: FlangeStandard, rng: np.random.Generator) -> Frame:
     """A frame without the flange: a table, things, and lookalikes (discs, rings and flanges of other sizes, tube ends)."""
     bodies = _surroundings(scanner, standard, rng, 9, clear_of=None)
@@ -138,11 +153,11 @@ def _solid(outline: list[tuple[float, float]]) -> TriMesh:
     return revolve(np.array(profile), _SEGMENTS)
 
 
-def _ball(radius: float) -> TriMesh:
-    a = np.linspace(0.5 * np.pi, -0.5 * np.pi, 25)
+def _ball(radius: float, rings: int = 25) -> TriMesh:
+    a = np.linspace(0.5 * np.pi, -0.5 * np.pi, rings)
     profile = np.column_stack([radius * np.cos(a), radius * np.sin(a)])
     profile[[0, -1], 0] = 0.0
-    return revolve(profile, _SEGMENTS)
+    return revolve(profile, max(_SEGMENTS, 2 * rings))
 
 
 def _scan(bodies: list[TriMesh], scanner: ScannerPreset, rng: np.random.Generator) -> Array:
