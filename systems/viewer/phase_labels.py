@@ -1,16 +1,5 @@
-"""Labels of the job's phases in the viewer: one textured board per phase, shown during the phase."""
+"""The phases of the weld job in words, and its steps: one list for the 3D view, the dashboard and the reports."""
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-from pydrake.geometry import Meshcat
-from pydrake.math import RigidTransform, RollPitchYaw
-
-from weldcal.systems.bodies.textured_board import textured_board
-
-WIDTH_M, HEIGHT_M = 0.72, 0.09
-# Above and behind the cell, facing a viewer in front of the robot (+x) who looks towards it.
-X_WS = RigidTransform(RollPitchYaw(np.pi / 2, 0.0, np.deg2rad(65.0)), [-0.25, -0.38, 1.0])
 TEXT = {
     "start": "ready",
     "move_home": "to home",
@@ -52,17 +41,29 @@ STEPS: tuple[tuple[str, str | None, tuple[str, ...]], ...] = (
 )
 """Steps of the weld job: name, the part of the job that it belongs to (None: both), and its phases."""
 
-
-def label_image(text: str) -> NDArray[np.uint8]:
-    """Draw a (128, 1024, 3) uint8 BGR image with the text."""
-    board = np.full((128, 1024, 3), (46, 38, 33), dtype=np.uint8)
-    (width, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_DUPLEX, 1.6, 2)
-    cv2.putText(board, text, ((1024 - width) // 2, 82), cv2.FONT_HERSHEY_DUPLEX, 1.6, (240, 240, 240), 2, cv2.LINE_AA)
-    return board
-
-
-def add_phase_label(meshcat: Meshcat, path: str, phase: str) -> None:
-    """Add the board of a phase at the Meshcat path `path`."""
-    board = textured_board(f"phase_{phase}", WIDTH_M, HEIGHT_M, label_image(TEXT.get(phase, phase)))
-    meshcat.SetObject(path, board)
-    meshcat.SetTransform(path, X_WS)
+Steps = tuple[tuple[str, tuple[str, ...]], ...]
+MOUNTING_STEPS: Steps = (("Calibrate", ("start", "calibrate")), ("Verify", ("verify",)), ("Go home", ("home",)))
+MOTION_STEPS: Steps = (
+    ("Approach", ("start", "approach")),
+    ("Collect frames", ("collect",)),
+    ("Go home", ("home",)),
+    ("Calibrate", ("calibrate",)),
+)
+WATCH_STEPS: Steps = (("Approach", ("start", "approach")), ("Watch", ("collect",)), ("Go home", ("home",)))
+TABLET_STEPS: Steps = (
+    ("Look", ("start", "to_start", "to_look", "look")),
+    ("Touch", ("to_above", "descend", "lift")),
+    ("Go home", ("to_home",)),
+)
+PROFILER_STEPS = {
+    "start": "Get ready",
+    "edge": "Scan the edge",
+    "sphere": "Scan the sphere",
+    "touch": "Touch the sphere",
+    "pass": "Scan the seam",
+    "torch": "Move along the seam",
+    "home": "Go home",
+}
+"""Steps of the other jobs: name, and the keys of the step (see the dashboard's `stage_of`)."""
+CAMERAS = {"follow": "Follow the job", "cell": "Cell", "scanner": "Scanner's eye", "seam": "Seam"}
+"""The cameras of the 3D view in words."""
