@@ -32,16 +32,11 @@ VIEW_OF_PHASE = {
 """Which camera shows a phase; the others: the cell."""
 ZOOM = {CELL: 1.0, SCANNER: 1.7, SEAM: 1.0}
 PERIOD_S = 0.1
-MOVED_M, STEP_M = (
-    0.01,
-    0.002,
-)  # farther than this from where it was put: a person moved it; the seam's camera moves by such steps
+MOVED_M, STEP_M = 0.01, 0.002
+"""Farther than this from where it was put, a person has moved it; the seam's camera moves by such steps."""
 SEAM_VIEW_M = 0.17  # of the seam's camera from what it looks at
-_EYE_M, _LOOKS_M, _ASIDE_M = (
-    0.12,
-    0.75,
-    0.03,
-)  # along the scanner's axis: in front of its drawn axes, and where it looks
+_EYE_M, _LOOKS_M = 0.12, 0.75  # along the scanner's axis: in front of its drawn axes, and where it looks
+_LEAN = 0.05  # off a vertical axis, which a viewer cannot look along
 _PLACES = 40  # remembered: a browser answers late
 
 
@@ -169,9 +164,12 @@ class CameraDirector(LeafSystem):
 def scanner_view(X_BC: RigidTransform) -> tuple[Array, Array]:
     """Eye and target (3,) m in B of the scanner's own view; a little aside, so that the picture's upper edge
     is up: a viewer cannot look straight down."""
-    up = -X_BC.rotation().matrix()[:, 1] * np.array([1.0, 1.0, 0.0])
-    aside = up / max(float(np.linalg.norm(up)), 1e-9) if abs(X_BC.rotation().matrix()[2, 2]) > 0.95 else np.zeros(3)
-    return X_BC @ np.array([0.0, 0.0, _EYE_M]) - _ASIDE_M * aside, X_BC @ np.array([0.0, 0.0, _LOOKS_M])
+    R, target = X_BC.rotation().matrix(), np.asarray(X_BC @ np.array([0.0, 0.0, _LOOKS_M]))
+    along = R[:, 2]
+    if abs(along[2]) > 0.95:
+        up = -R[:, 1] * np.array([1.0, 1.0, 0.0])
+        along = _LEAN * up / float(np.linalg.norm(up)) + np.array([0.0, 0.0, np.sign(along[2])])
+    return target - (_LOOKS_M - _EYE_M) * along / float(np.linalg.norm(along)), target
 
 
 def seam_view(seam: SeamCurve | None, at: Array | None, work_B: Array) -> tuple[Array, Array]:

@@ -45,7 +45,7 @@ WITH_SCANS = (f"{SEEN}/scan", f"{SEEN}/cone")
 """Groups that are shown while the flange is scanned, and while anything is."""
 FADES = (("new", 1.0, 0), ("recent", 0.45, 1), ("old", 0.18, 4))
 """Of the circles: name, opacity, and the least number of newer circles."""
-_FACE_POINTS, _SIGN_M = 4000, 0.026
+_FACE_POINTS, _SIGN_M = 4000, 0.030
 _CONE_PAST_M = 0.05  # the cone ends behind the work point
 _CIRCLE_SIGN, _CAMERA_SIGN = (88, 25, 215), (60, 52, 46)  # BGR
 

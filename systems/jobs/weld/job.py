@@ -107,7 +107,7 @@ class WeldJob(AddedJob):
 
     def view(self) -> tuple[Array, Array]:
         """See AddedJob: from the scanner down to the workpiece."""
-        return np.array([1.28, -0.56, 0.74]), np.array([0.48, 0.0, 0.46])
+        return np.array([1.36, -0.62, 0.84]), np.array([0.46, 0.0, 0.52])
 
     def can_stand(self, root: Context) -> bool:
         """See AddedJob: the servo turns the torch off and brings the tool to rest."""
